@@ -108,6 +108,14 @@ def test_the_core_has_no_name_for_a_joint():
             )
 
 
+def test_the_core_and_inference_do_not_speak_of_motion():
+    motion = re.compile(r"skeleton|\bmotion\b|zero velocity|multimodal_|\bADE\b", re.IGNORECASE)
+    core = ("factorization", "distributions", "networks", "data", "program", "inference")
+    for module, path in sources().items():
+        if module.startswith(tuple(f"dvae.{part}" for part in core)):
+            assert not motion.findall(path.read_text(encoding="utf-8")), module
+
+
 def test_registries_alone_name_motion():
     """The one exception: what is known by name is imported when its name is given."""
     naming = {

@@ -12,8 +12,8 @@ import tyro
 from matplotlib.figure import Figure
 
 import dvae
-from dvae.inference.evaluation.metrics import average_displacement_error
 from dvae.motion.drawing.plot import futures
+from dvae.motion.scoring.metrics import average_displacement_error
 
 from .pages import DOCS
 

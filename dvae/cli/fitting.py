@@ -131,14 +131,14 @@ class DataOptions(ColumnOptions):
         """
         kinds = {method.fitted_on: method.name for method in methods}
         if len(kinds) > 1:
-            said = " and ".join(f"{name} on {kind}" for kind, name in kinds.items())
+            said = " and ".join(f"{name} on {SAID.get(kind, kind)}" for kind, name in kinds.items())
             raise UsageError(f"methods are fitted on data of their kind, {said}; give those of one kind")
         ((kind, name),) = kinds.items()
         given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
         told = [option for option in OF_KINDS["panel"] if option in given]
-        if kind == "motion" and (is_table(self.data) or told):
-            kind = "panel"
-            if self.data == SIMULATED:
+        if kind == "windows":
+            kind = "panel" if is_table(self.data) or told else "motion"
+            if kind == "panel" and self.data == SIMULATED:
                 raise UsageError(f"--{told[0]} is about tables; name one by --data")
         for other, options in OF_KINDS.items():
             if other != kind and (strange := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
@@ -288,7 +288,7 @@ def sweep(
             + "\n".join(map(str, failed))
         )
     then = f"score them with: dvae evaluate {out}/*"
-    if fitted[0].fitted_on == "motion":
+    if fitted[0].fitted_on == "windows":
         then += f", and bounds, where all have one: dvae compare {out}/*"
     OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
 

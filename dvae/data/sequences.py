@@ -79,7 +79,7 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
 
     @property
     def protocol(self) -> Any:
-        """A dataclass with `observed` (frames), and for multimodal truths `multimodal_threshold`.
+        """A dataclass with `observed` (frames).
 
         `observed` is None of whole sequences, of which there are bounds, and no forecasts.
         """
@@ -484,7 +484,6 @@ class ArrayProtocol:
     """How plain arrays are split into observed and predicted frames."""
 
     observed: int
-    multimodal_threshold: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,7 +493,6 @@ class ArrayWindows:
     Args:
         x: `(N, T, D)`, tensor or numpy array, which may be mapped, or masked (`numpy.ma`).
         observed: frames the model sees; the other T - observed are predicted.
-        multimodal_threshold: distance below which two last observed frames are alike, in the unit of x.
         clips: name of the clip each window was cut from; without it the windows count as independent.
         mask: `(N, T, D)`, True where an entry was observed, where some are missing.
         columns: {name: unit} of the D coordinates, "" for no unit; tables print them.
@@ -513,7 +511,6 @@ class ArrayWindows:
 
     x: Tensor | np.ndarray
     observed: int
-    multimodal_threshold: float = 0.5
     clips: Sequence[str] | None = None
     mask: Tensor | np.ndarray | None = None
     columns: Mapping[str, str] | None = None
@@ -543,8 +540,8 @@ class ArrayWindows:
 
     @property
     def protocol(self) -> ArrayProtocol:
-        """Observed frames and multimodal threshold."""
-        return ArrayProtocol(self.observed, self.multimodal_threshold)
+        """Number of observed frames."""
+        return ArrayProtocol(self.observed)
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:

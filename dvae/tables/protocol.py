@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..options import Delay, Frames, Positive, Share, check
+from ..options import Delay, Frames, Share, check
 from .panel import Panel
 
 
@@ -26,7 +26,6 @@ class Cut:
         validation, test: shares of them.
         seed: of the division of sequences or groups.
         season: period of the data in steps, such as 7 of days, which the reference "seasonal" repeats.
-        multimodal_threshold: distance below which two last observed steps are alike, in deviations.
 
     Raises:
         ValueError: steps without a horizon, or the other way round; shares that leave nothing to train on.
@@ -40,7 +39,6 @@ class Cut:
     test: Share = 0.2
     seed: Delay = 0
     season: Frames | None = None
-    multimodal_threshold: Positive = 0.5
 
     def __post_init__(self) -> None:
         check(self)

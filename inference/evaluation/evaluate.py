@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ...data.sequences import HeldOutWindows, called, columns_of
+from ...data.sequences import HeldOutWindows, called
 from ...options import Count, Delay, require
 from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting, Forecasting
@@ -30,7 +30,7 @@ from ..bounds.elbo import SequenceELBO, importance_bound
 from ..bounds.predictive import predictive_bound
 from .evaluation import Evaluation, Row
 from .held import Held, hold, on_device_of, plain, refuse_non_finite, reproducibly
-from .references import OF_TABLES, USUAL, Forecaster, References
+from .references import Forecaster, References
 from .result import progress_bar
 from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clip_means, proper
 
@@ -290,8 +290,7 @@ def _references(
         measure.truth: (1, lambda part: futures[part][None]) for measure in measures if measure.truth
     }
     if isinstance(asked, bool):
-        usual = OF_TABLES if columns_of(known.held.windows) else USUAL
-        asked = [name for name in usual if not known.lacking(name)] if asked else []
+        asked = known.usual if asked else []
         truths = truths if asked else {}
     return truths | {name: known[name] for name in asked}
 

@@ -75,7 +75,7 @@ class Row:
 class Evaluation(Result):
     """Scores of several methods on the same windows, with all that is needed to say what was measured.
 
-    Indexing gives the scores of a method: `evaluation["srnn"]["ADE"].mean`.
+    Indexing gives the scores of a method: `evaluation["srnn"]["CRPS"].mean`.
 
     Attributes:
         rows: `{method: Row}`.
@@ -97,8 +97,8 @@ class Evaluation(Result):
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
         >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=4)
         >>> scores = dvae.evaluate(model, windows, samples=5, progress=False)
-        >>> list(scores.rows), scores.difference("model", "zero velocity", "CRPS").mean < 0
-        (['zero velocity', 'model'], True)
+        >>> list(scores.rows), scores.difference("model", "last value", "CRPS").mean < 0
+        (['last value', 'model'], True)
     """
 
     rows: dict[str, Row]

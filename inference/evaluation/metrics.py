@@ -1,12 +1,8 @@
 """Scores of stochastic forecasts, as pure functions on arrays.
 
-The motion errors follow the evaluation code of DLow (Yuan and Kitani 2020, arXiv:2003.08386) and GSPS (Mao,
-Liu and Salzmann 2021, arXiv:2108.08422); the median versions are those of HiT-DVAE (Bie et al. 2022,
-arXiv:2204.01565). They reward the best (or the median) of K samples and are not proper: a forecaster gains by
-spreading its samples. The energy score (Gneiting and Raftery 2007, section 4.3), the variogram score
-(Scheuerer and Hamill 2015) and the CRPS stand beside them; and what asks for as much diversity and motion as there
-really is, the APDE and CMD of BeLFusion (Barquero, Escalera and Palmero 2023, arXiv:2211.14304). The Fréchet distance
-compares two sets of motions by features of them, and has shapes of its own.
+The energy score (Gneiting and Raftery 2007, section 4.3), the variogram score (Scheuerer and Hamill 2015) and the CRPS
+are proper: no forecaster gains by spreading its samples. The Fréchet distance compares two sets of features and has
+shapes of its own. Applications add errors of their own, such as those of the best of K samples.
 
 Calibration (coverage, PIT) rests on where each number of the truth lies among the K numbers of the samples. Of
 calibrated forecasts the truth is exchangeable with the samples, so that its rank, at random among ties, is uniform on
@@ -14,14 +10,11 @@ calibrated forecasts the truth is exchangeable with the samples, so that its ran
 on 0 to 1 for every K, of discrete data too (Czado, Gneiting and Held 2009). Shares and moments are expectations over
 V, so that nothing is drawn, and what they are of calibrated forecasts is exact for every K.
 
-Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`,
-or `(..., M, T, D)` where M futures are admissible; the result has the leading shape `(...)`. Torch tensors
-and numpy arrays are accepted, a tensor comes back. A displacement is the Euclidean norm over *all* D
-coordinates of a frame, in the unit of the data (metres); it is not a mean over joints. What is NaN in a truth
-was not observed: it counts nowhere, nor does a frame of which nothing was observed (the final one is then the
-last of which something was). The value for a data set is the plain mean over its windows. Every function
-raises ValueError for shapes that do not fit. Windows are scored one after another, so that memory does not grow
-with their number.
+Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`; the
+result has the leading shape `(...)`. Functions accept torch tensors and numpy arrays and return a tensor. NaN in a
+truth was not observed and does not count, nor does a frame in which nothing was observed. The value for a data set is
+the plain mean over its windows. Every function raises ValueError for shapes that do not fit. Windows are scored one
+after another, so that memory does not grow with their number.
 """
 
 import math
@@ -47,119 +40,8 @@ def average_pairwise_distance(samples: Array) -> Tensor:
     Returns:
         `(...)`, in the unit of the data.
     """
-    samples = _samples(samples)
-    return _per_window(_pairwise, samples)
-
-
-def average_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """ADE: displacement averaged over the T frames, of the best of the K samples.
-
-    Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`.
-
-    Returns:
-        `(...)`, in the unit of the data.
-    """
-    return _per_window(_observed(lambda x, y: _displacement(x, y).mean(-1).amin()), *_paired(samples, truth))
-
-
-def final_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """FDE: displacement at the last frame, of the sample that is best there. Shapes as in ADE."""
-    return _per_window(_observed(lambda x, y: _displacement(x[:, -1], y[-1]).amin()), *_paired(samples, truth))
-
-
-def median_average_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """ADEm: median over the K samples of the mean displacement (even K: mean of the middle two)."""
-    return _per_window(_observed(lambda x, y: _median(_displacement(x, y).mean(-1))), *_paired(samples, truth))
-
-
-def median_final_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """FDEm: median over the K samples of the final displacement (even K: mean of the middle two)."""
-    return _per_window(_observed(lambda x, y: _median(_displacement(x[:, -1], y[-1]))), *_paired(samples, truth))
-
-
-def multimodal_errors(samples: Array, truths: Array) -> Tensor:
-    """MMADE, MMFDE, MMADEm and MMFDEm at once: errors to each of M admissible futures, averaged over them.
-
-    Args:
-        samples: `(..., K, T, D)`.
-        truths: `(..., M, T, D)`, the futures that `references.multimodal_truths` finds, the true one among them.
-
-    Returns:
-        `(..., 4)`, in the unit of the data.
-    """
-
-    def errors(x: Tensor, y: Tensor) -> Tensor:
-        apart = _cross(x, y)
-        return torch.cat([apart.amin(1), _median(apart, 1)]).mean(-1)
-
-    samples, truths = _multimodal(samples, truths)
-    return _per_window(errors, samples, truths)
-
-
-def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMADE: the ADE to each of the admissible futures, averaged over them: `(...)`, see `multimodal_errors`."""
-    return multimodal_errors(samples, truths)[..., 0]
-
-
-def multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMFDE: the FDE to each of the admissible futures, averaged over them. Shapes as in MMADE."""
-    return multimodal_errors(samples, truths)[..., 1]
-
-
-def median_multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMADEm: the ADEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
-    return multimodal_errors(samples, truths)[..., 2]
-
-
-def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMFDEm: the FDEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
-    return multimodal_errors(samples, truths)[..., 3]
-
-
-def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
-    """APDE: |APD of the samples - APD of the M admissible futures| (BeLFusion).
-
-    Where the true future alone is admissible there is no diversity to compare with; paper and public code leave such
-    windows out of the mean, and the value is NaN.
-
-    Args:
-        samples: `(..., K, T, D)`.
-        truths: `(..., M, T, D)`, as for MMADE.
-
-    Returns:
-        `(...)`, in the unit of the data; NaN for M = 1, and where no two truths have a number in common.
-    """
-
-    def score(x: Tensor, y: Tensor) -> Tensor:
-        return (_pairwise(x) - _pairwise(y)).abs() if len(y) > 1 else x.new_tensor(torch.nan)
-
-    return _per_window(score, *_multimodal(samples, truths))
-
-
-def cumulative_motion_distance(motion: Array, real: Array) -> Tensor:
-    """CMD, the area between cumulative motion as forecast and at its real pace: sum_{t=1}^{T-1} (T - t) |M_t - M|.
-
-    M_t is what joints move by from frame t to t + 1 of the T predicted ones, the mean over joints, samples and windows,
-    and M the mean of true motion over frames too. It is sum_i sum_{t<=i} |M_t - M| (BeLFusion): what goes wrong early
-    counts in all later frames. True motion itself, which has no steady pace, is not at 0.
-
-    Args:
-        motion: `(..., T - 1)`, M_1 to M_{T-1}.
-        real: `(...)`, M.
-
-    Returns:
-        `(...)`, in the unit of the data.
-    """
-    motion, real = torch.as_tensor(motion), torch.as_tensor(real)
-    if motion.ndim != real.ndim + 1 or motion.shape[:-1] != real.shape or not motion.numel():
-        raise ValueError(
-            "motion (..., T - 1), T at least 2, needs a pace (...) of true motion, not "
-            f"{_shape(motion)} and {_shape(real)}"
-        )
-    frames = torch.arange(motion.shape[-1], 0, -1, device=motion.device)
-    return (frames * (motion - real[..., None]).abs()).sum(-1)
+    samples = as_samples(samples)
+    return per_window(mean_pairwise_distance, samples)
 
 
 def energy_score(samples: Array, truth: Array, diversity: Array | None = None) -> Tensor:
@@ -180,10 +62,10 @@ def energy_score(samples: Array, truth: Array, diversity: Array | None = None) -
     """
 
     def score(x: Tensor, y: Tensor) -> Tensor:
-        distance = _displacement(x.flatten(1), y.flatten()).mean()
-        return distance - _pairwise(x) / 2 if diversity is None else distance
+        distance = displacement(x.flatten(1), y.flatten()).mean()
+        return distance - mean_pairwise_distance(x) / 2 if diversity is None else distance
 
-    found = _per_window(_observed(score), *_paired(samples, truth))
+    found = per_window(over_observed(score), *as_pair(samples, truth))
     return found if diversity is None else found - torch.as_tensor(diversity) / 2
 
 
@@ -210,7 +92,7 @@ def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
         apart = (signs @ errors.sort(0).values).mean() / max(1, count * (count - 1) / 2)
         return errors.abs().mean() - apart / 2
 
-    return _per_window(score, *_paired(samples, truth))
+    return per_window(score, *as_pair(samples, truth))
 
 
 def probability_integral_transform(samples: Array, truth: Array, uniform: Array) -> Tensor:
@@ -229,12 +111,12 @@ def probability_integral_transform(samples: Array, truth: Array, uniform: Array)
     Raises:
         ValueError: draws of another shape than the truth, or beyond 0 and 1.
     """
-    samples, truth = _paired(samples, truth)
+    samples, truth = as_pair(samples, truth)
     uniform = torch.as_tensor(uniform, device=truth.device).double()
     if uniform.shape != truth.shape or not ((uniform >= 0) & (uniform <= 1)).all():
         raise ValueError(
-            f"a truth of shape {_shape(truth)} needs as many uniform draws, from 0 to 1; given are {_shape(uniform)} "
-            f"from {uniform.min():g} to {uniform.max():g}"
+            f"a truth of shape {shape_of(truth)} needs as many uniform draws, from 0 to 1; given are "
+            f"{shape_of(uniform)} from {uniform.min():g} to {uniform.max():g}"
         )
     low, ties = _places(samples, truth)
     return (low + uniform * ties) / (samples.shape[-3] + 1)
@@ -250,7 +132,7 @@ def pit_mean(samples: Array, truth: Array) -> Tensor:
     Returns:
         `(...)`, in double precision.
     """
-    samples, truth = _paired(samples, truth)
+    samples, truth = as_pair(samples, truth)
     low, ties = _places(samples, truth)
     return mean_of_known(low + ties / 2, (-2, -1)) / (samples.shape[-3] + 1)
 
@@ -262,7 +144,7 @@ def pit_variance(samples: Array, truth: Array) -> Tensor:
     K = 1 it is 1 whatever is forecast; at its largest, the truth always beyond all samples, it is
     3 - 6 / (K + 1) + 4 / (K + 1)^2. Shapes as in `pit_mean`.
     """
-    samples, truth = _paired(samples, truth)
+    samples, truth = as_pair(samples, truth)
     low, ties = _places(samples, truth)
     count = samples.shape[-3] + 1
     return mean_of_known(12 * (low + ties / 2 - count / 2).square() + ties.square(), (-2, -1)) / count**2
@@ -279,7 +161,7 @@ def pit_histogram(samples: Array, truth: Array, bins: int = 20) -> Tensor:
     Returns:
         `(..., bins)`, in double precision, which add up to 1.
     """
-    samples, truth = _paired(samples, truth)
+    samples, truth = as_pair(samples, truth)
     if bins < 1:
         raise ValueError(f"a histogram has at least 1 bin, not {bins}")
     low, ties = _places(samples, truth)
@@ -306,7 +188,7 @@ def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 2
     Returns:
         `(..., bins)`, in double precision, which add up to 1.
     """
-    samples, truth = _paired(samples, truth)
+    samples, truth = as_pair(samples, truth)
     reference, missing = torch.as_tensor(reference).to(truth), truth.isnan()
 
     def distance(values: Tensor, point: Tensor, gaps: Tensor) -> Tensor:
@@ -340,7 +222,7 @@ def coverage(samples: Array, truth: Array, level: float) -> Tensor:
     Raises:
         ValueError: a level that is not between 0 and 1.
     """
-    samples, truth = _paired(samples, truth)
+    samples, truth = as_pair(samples, truth)
     end, count = _beyond(samples, level), samples.shape[-3] + 1
     low, ties = _places(samples, truth)
     inside = ((low + ties).clamp(max=count - end) - low.clamp(min=end)).clamp(min=0) / ties
@@ -363,7 +245,7 @@ def interval_width(samples: Array, level: float) -> Tensor:
     Raises:
         ValueError: a level that is not between 0 and 1.
     """
-    samples = _samples(samples)
+    samples = as_samples(samples)
     end = max(_beyond(samples, level), 1.0) - 1  # from 0
     first, ordered = int(end), samples.sort(-3).values
     spread = ordered.flip(-3) - ordered
@@ -396,7 +278,7 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     if not order > 0:
         raise ValueError(f"the order of a variogram must be positive, but is {order}")
 
-    samples, truth = _paired(samples, truth)
+    samples, truth = as_pair(samples, truth)
     *lead, steps, size = truth.shape
     count, scores = samples.shape[-3], []
     windows = samples.reshape(-1, count, steps, size), truth.reshape(-1, steps, size)
@@ -435,7 +317,7 @@ def frechet_distance(features: Array, other: Array) -> Tensor:
     if any(each.ndim != 2 or len(each) < 2 for each in sets) or sets[0].shape[1] != sets[1].shape[1]:
         raise ValueError(
             "the Fréchet distance needs features (N, F) and (M, F), N and M at least 2, not "
-            f"{_shape(sets[0])} and {_shape(sets[1])}"
+            f"{shape_of(sets[0])} and {shape_of(sets[1])}"
         )
     moments = [moment for each in sets for moment in (each.mean(0), each.T.cov().reshape(2 * [each.shape[1]]))]
     return gaussian_frechet_distance(*moments)
@@ -472,7 +354,7 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
     """The Fréchet distance between features of true and generated windows, as a jackknife pseudo-value of each clip.
 
-    See `_pseudo_values`.
+    See `jackknife_pseudo_values`.
 
     Args:
         real: `(N, F)`, of the true futures.
@@ -482,34 +364,10 @@ def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tu
     centre = real.mean(0)  # far from 0, second moments would cancel
     sets = _moments_without_clips(real[:, None] - centre, places), _moments_without_clips(generated - centre, places)
     distance = gaussian_frechet_distance(*sets[0], *sets[1])
-    return _pseudo_values(distance[0], distance[1:], places)
+    return jackknife_pseudo_values(distance[0], distance[1:], places)
 
 
-def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: Tensor) -> tuple[float, ...]:
-    """The CMD of a set of windows, as a jackknife pseudo-value of each clip (see `_pseudo_values`).
-
-    It is computed for each class of motion, and averaged with the classes' shares of the windows.
-
-    Args:
-        motion: `(N, T - 1)`, what joints move by in the forecasts of each window; NaN where that cannot be compared. A
-            step of which no window tells counts as one at the true pace.
-        real: `(N,)`, and in its true future, over all frames.
-        classes: `(N,)`, whole numbers.
-        places: `(N,)`, the clip of every window, from 0 to C - 1.
-    """
-
-    def distance(kept: Tensor) -> Tensor:
-        groups = [kept & (classes == number) for number in classes[kept].unique()]
-        paces = [(rows.sum(), mean_of_known(motion[rows], 0), mean_of_known(real[rows], 0)) for rows in groups]
-        found = [n * cumulative_motion_distance(steps.where(~steps.isnan(), pace), pace) for n, steps, pace in paces]
-        return torch.stack(found).sum() / kept.sum()
-
-    clips = range(int(places.max()) + 1)
-    without = [distance(places != clip) for clip in clips] if len(clips) > 1 else []
-    return _pseudo_values(distance(places >= 0), torch.stack(without) if without else places.new_empty(0), places)
-
-
-def _pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
+def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
     """A distance of a whole set of windows as a jackknife pseudo-value of each clip.
 
     d + (1/w - 1) (d - d'), d' the distance without the clip and w the clip's share of the windows (Busing, Meijer and
@@ -560,7 +418,7 @@ def _beyond(samples: Tensor, level: float) -> float:
     return float(round(found)) if math.isclose(found, round(found)) else found
 
 
-def _observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
+def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
     """A score of distances over what there is of a truth (T, D): frames that have something, 0 where they have not."""
 
     def counted(samples: Tensor, truth: Tensor) -> Tensor:
@@ -573,11 +431,12 @@ def _observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Te
     return counted
 
 
-def _displacement(samples: Tensor, truth: Tensor) -> Tensor:
+def displacement(samples: Tensor, truth: Tensor) -> Tensor:
+    """Return the Euclidean distance over the coordinates of each frame."""
     return torch.linalg.vector_norm(samples - truth, dim=-1)
 
 
-def _pairwise(samples: Tensor) -> Tensor:
+def mean_pairwise_distance(samples: Tensor) -> Tensor:
     """Mean distance over pairs of (K, T, D), each a vector of T * D numbers."""
     rows = samples.flatten(1)
     if rows.isnan().any():  # the mean square of what both have stands for all; NaN where no two share anything
@@ -586,74 +445,47 @@ def _pairwise(samples: Tensor) -> Tensor:
     return torch.pdist(rows).mean() if len(rows) > 1 else samples.new_zeros(())
 
 
-def _cross(samples: Tensor, truths: Tensor) -> Tensor:
-    """Displacement of each of (K, T, D) from each of (M, T, D), averaged over frames, and at the last: (2, K, M)."""
-
-    def both(apart: Tensor) -> Tensor:
-        return torch.stack([apart.mean(0), apart[-1]])
-
-    centre = truths.mean(0)
-    if centre.isnan().any():
-        each = _observed(lambda x, y: both(_displacement(x, y).T))
-        return torch.stack([each(samples, truth) for truth in truths], -1)
-    # |x - y|^2 as products, as cdist has it but for its copies; about the centre the cancellation is harmless.
-    x, y = ((frames - centre).transpose(0, 1) for frames in (samples, truths))
-    squares = x.square().sum(-1)[:, :, None] + y.square().sum(-1)[:, None]
-    return both(squares.baddbmm_(x, y.mT, alpha=-2).clamp_(min=0).sqrt_())
-
-
-def _median(errors: Tensor, dim: int = 0) -> Tensor:
-    return errors.quantile(0.5, dim=dim)
-
-
-def _per_window(score: Callable[..., Tensor], samples: Tensor, *truth: Tensor) -> Tensor:
+def per_window(score: Callable[..., Tensor], samples: Tensor, *truth: Tensor) -> Tensor:
+    """Apply a score to each window and restore the leading shape."""
     lead = samples.shape[:-3]
     windows = [part.reshape(-1, *part.shape[len(lead) :]) for part in (samples, *truth)]
     found = torch.stack([score(*window) for window in zip(*windows, strict=True)])
     return found.reshape((*lead, *found.shape[1:]))
 
 
-def _samples(samples: Array) -> Tensor:
+def as_samples(samples: Array) -> Tensor:
+    """Return samples as a floating-point tensor; ValueError unless they are `(..., K, T, D)`."""
     samples = torch.as_tensor(samples)
     if samples.ndim < 3:
         raise ValueError(
-            f"samples must be (..., K, T, D), but have shape {_shape(samples)}; "
+            f"samples must be (..., K, T, D), but have shape {shape_of(samples)}; "
             "one forecast (T, D) needs an axis for K = 1"
         )
     if not samples.numel():
-        raise ValueError(f"there is nothing to score: samples (..., K, T, D) have shape {_shape(samples)}")
+        raise ValueError(f"there is nothing to score: samples (..., K, T, D) have shape {shape_of(samples)}")
     return samples if samples.is_floating_point() else samples.double()
 
 
-def _paired(samples: Array, truth: Array) -> tuple[Tensor, Tensor]:
-    samples = _samples(samples)
+def as_pair(samples: Array, truth: Array) -> tuple[Tensor, Tensor]:
+    """Return samples and truth as tensors of one type; ValueError unless their shapes fit."""
+    samples = as_samples(samples)
     truth = torch.as_tensor(truth, device=samples.device)
     expected = samples.shape[:-3] + samples.shape[-2:]
     if truth.shape != expected:
         raise ValueError(
-            f"samples (..., K, T, D) of shape {_shape(samples)} need a truth (..., T, D) of shape "
-            f"{tuple(expected)}, not {_shape(truth)}; a model's forecasts (K, B, T, D) need "
+            f"samples (..., K, T, D) of shape {shape_of(samples)} need a truth (..., T, D) of shape "
+            f"{tuple(expected)}, not {shape_of(truth)}; a model's forecasts (K, B, T, D) need "
             "samples.movedim(0, 1) first"
         )
-    return _same_type(samples, truth)
+    return as_same_type(samples, truth)
 
 
-def _multimodal(samples: Array, truths: Array) -> tuple[Tensor, Tensor]:
-    samples = _samples(samples)
-    truths = torch.as_tensor(truths, device=samples.device)
-    without_count = truths.shape[:-3] + truths.shape[-2:]
-    if truths.ndim < 3 or without_count != samples.shape[:-3] + samples.shape[-2:] or not truths.numel():
-        raise ValueError(
-            f"samples (..., K, T, D) of shape {_shape(samples)} need truths (..., M, T, D) that differ "
-            f"from them in M alone, M at least 1, not {_shape(truths)}"
-        )
-    return _same_type(samples, truths)
-
-
-def _same_type(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+def as_same_type(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both in the wider of their types."""
     dtype = torch.promote_types(samples.dtype, truth.dtype)
     return samples.to(dtype), truth.to(dtype)
 
 
-def _shape(array: Tensor) -> tuple[int, ...]:
+def shape_of(array: Tensor) -> tuple[int, ...]:
+    """Return the shape as a plain tuple, for messages."""
     return tuple(array.shape)

@@ -1,70 +1,38 @@
-"""References for forecasts of any sequences: what needs no model, and which other futures were possible."""
+"""Reference forecasts of any sequences, which need no model."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from ...data.sequences import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known, sequences, take_split
+from ...data.sequences import (
+    Batch,
+    HeldOutWindows,
+    bridged,
+    columns_of,
+    gapped,
+    mask_of,
+    mean_of_known,
+    sequences,
+    take_split,
+)
 from ...options import nearest
 from .held import Held
 
 Forecaster = Callable[[slice], Tensor]
 """Which windows to (K, B, H, D)."""
-USUAL = ("zero velocity", "nearest neighbours")
-"""Reference rows of motion and of bare arrays."""
+OF_ARRAYS = ("last value", "nearest neighbours")
+"""Reference rows of windows without named columns."""
 OF_TABLES = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
-"""Those of windows that name their columns."""
+"""Reference rows of windows that name their columns."""
 
 _EXACT = "donot_use_mm_for_euclid_dist"
 
 
-def multimodal_truths(windows: HeldOutWindows, threshold: float | None = None, itself: bool = True) -> list[Tensor]:
-    """Multimodal ground truth: for every window, those that were in almost the same pose when their future began.
-
-    Two windows belong together when their last observed poses are at a Euclidean distance *below* the threshold, over
-    all coordinates; where some are missing, see `distances`. By default as in the evaluation of DLow (Yuan and Kitani
-    2020): a window belongs to itself, and one that nobody joins keeps its single truth and is scored like the others,
-    as every evaluation here does. (GSPS leaves such windows out of every metric, so that its published numbers are on a
-    subset.)
-
-    Args:
-        windows: N windows; the protocol says what is observed.
-        threshold: largest distance (exclusive), in the unit of the data; by default the protocol's, 0.5 m in the
-            papers.
-        itself: whether a window is among its own truths. Without, it may have none, and its multimodal errors are
-            undefined.
-
-    Returns:
-        N index tensors `(M_n,)`, ascending; `futures[truths[n]]` are the truths `(M_n, T, D)` of window n.
-
-    Raises:
-        ValueError: a threshold that is not positive.
-    """
-    observed = windows.protocol.observed
-    threshold = windows.protocol.multimodal_threshold if threshold is None else threshold
-    if not threshold > 0:
-        raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
-    poses, seen = last_places(windows.all(), observed)
-    poses = poses.double()
-    found: list[Tensor] = []
-    for rows in torch.arange(len(poses)).split(512):
-        close = distances(poses[rows], poses, None if seen is None else seen[rows], seen) < threshold
-        close[torch.arange(len(rows)), rows] = itself
-        found += [row.nonzero()[:, 0] for row in close]
-    return found
-
-
-def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:
-    """How multimodal errors are to be read, for the caption of a table."""
-    closer = f"all windows whose last poses are closer than {threshold:g} m{', itself included' if itself else ''}"
-    return f"MM: over the futures of {closer}; {alone} of {windows} have no other"
-
-
 def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
-    """The last observed pose `(B, D)`, and which of its coordinates were observed at all, None for all of them.
+    """The last observed frame `(B, D)`, and which of its coordinates were observed at all, None for all of them.
 
     Where a coordinate is missing in the last frame it is where it was last, and 0 if it was nowhere.
 
@@ -104,8 +72,8 @@ def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: T
     return torch.where(shared > 0, found, torch.inf).to(first)
 
 
-def zero_velocity(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Tensor:
-    """The last pose repeated: the forecast that any method should beat.
+def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Tensor:
+    """Repeat the last observed frame: the forecast that any method should beat.
 
     Args:
         observed: `(B, O, D)`.
@@ -204,12 +172,14 @@ class References:
 
     | name | forecasts | needs |
     |---|---|---|
-    | zero velocity | the last pose repeated: what motion calls the next | |
     | last value | the last frame repeated | |
     | seasonal | the last period repeated | a season that was observed |
     | mean | of every column in the training windows, at all frames | training windows |
     | climatology | K futures of training windows, drawn at random for each window | training windows |
     | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
+
+    Windows may give names of their own to some of them: `windows.references`, {name: one of these}, which then are the
+    usual rows.
 
     All but the last two are points: their energy score is a distance, their CRPS an absolute error, and intervals they
     have none. Climatology is the distribution of what is forecast, by one who knows the data and not the past.
@@ -237,9 +207,11 @@ class References:
         Raises:
             ValueError: no such reference.
         """
+        name = self._names.get(name, name)
         if name not in self._makers:
             raise ValueError(
-                f"no reference row {name!r}{nearest(name, self._makers)}; there are {', '.join(self._makers)}"
+                f"no reference row {name!r}{nearest(name, [*self._names, *self._makers])}; there are "
+                f"{', '.join({**self._names, **self._makers})}"
             )
         if name in ("mean", "climatology", "nearest neighbours"):
             return "" if self.training is not None else "training windows"
@@ -251,12 +223,22 @@ class References:
     def __getitem__(self, name: str) -> tuple[int, Forecaster]:
         if needed := self.lacking(name):
             raise ValueError(f"the reference row {name!r} needs {needed}")
-        return self._makers[name]()
+        return self._makers[self._names.get(name, name)]()
+
+    @property
+    def usual(self) -> list[str]:
+        """The rows that an evaluation shows: those of the windows, or else of their kind, where they can be had."""
+        names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
+        return [name for name in names if not self.lacking(name)]
+
+    @property
+    def _names(self) -> Mapping[str, str]:
+        """Names that the windows give to references."""
+        return getattr(self.held.windows, "references", {})
 
     @property
     def _makers(self) -> dict[str, Callable[[], tuple[int, Forecaster]]]:
         return {
-            "zero velocity": self._last,
             "last value": self._last,
             "seasonal": self._seasonal,
             "mean": self._mean,
@@ -265,7 +247,7 @@ class References:
         }
 
     def _last(self) -> tuple[int, Forecaster]:
-        return 1, lambda part: zero_velocity(*self._past(part))
+        return 1, lambda part: last_value(*self._past(part))
 
     def _seasonal(self) -> tuple[int, Forecaster]:
         def again(part: slice) -> Tensor:

@@ -89,8 +89,8 @@ class Trainable:
 
     name: ClassVar[str]
     source: ClassVar[str]
-    fitted_on: ClassVar[str] = "motion"
-    """The kind of its data, by the name that runs know it by (`dvae.runs.kinds.DATA`)."""
+    fitted_on: ClassVar[str] = "windows"
+    """What it is fitted on: "windows" of any kind of data, or the name of one kind (`dvae.runs.kinds.DATA`)."""
     trainings: ClassVar[Mapping[str, Training]] = {"": Training(decay=0.5)}
     """How it is fitted where nothing else is said, by the preset of data (`Schema.preset`), and "" for all others."""
 

@@ -68,7 +68,6 @@ def test_a_schema_comes_back_from_toml_and_from_json(columns):
         validation=st.floats(0, 0.4),
         test=st.floats(0, 0.5),
         seed=st.integers(0, 9),
-        multimodal_threshold=st.floats(0.1, 2),
     )
     | st.just(Cut()),
 )

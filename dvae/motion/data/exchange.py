@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from math import inf
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -90,6 +90,8 @@ class Exchanged:
                 f"{self.threshold:g} m; the nearest two are {nearest:.3g} m apart"
             )
         return torch.tensor(kept), torch.tensor(partners)
+
+    references: ClassVar = Windows.references
 
     @property
     def description(self) -> dict[str, Any]:

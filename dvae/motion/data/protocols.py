@@ -556,6 +556,9 @@ class Windows:
             return None
         return tuple(name for name, given in zip(self.joints, self._given.tolist(), strict=True) if given)
 
+    references: ClassVar = {"zero velocity": "last value", "nearest neighbours": "nearest neighbours"}
+    """Reference forecasts, by the names that motion papers give them (`inference.evaluation.references`)."""
+
     @property
     def description(self) -> dict[str, Any]:
         """What a record says of these windows: joints, and those whose paths are given."""

@@ -48,7 +48,7 @@ from ...data.sequences import Batch
 from ...data.units import Units
 from ...inference.evaluation.estimates import Crossed, Estimate
 from ...inference.evaluation.held import Held, clip_places, hold, on_device_of, plain, refuse_non_finite, reproducibly
-from ...inference.evaluation.references import zero_velocity
+from ...inference.evaluation.references import last_value
 from ...inference.evaluation.result import Result, Table, progress_bar
 from ...inference.evaluation.scores import clip_means
 from ...inference.training.options import Stage
@@ -326,7 +326,7 @@ def quality(
     known = Held(train, drawn, held.observed, [(train.split, "drawn", n) for n in range(examples)])
     rows: dict[str, dict[str, np.ndarray]] = {}
     forecasters = {name: _forecaster(model, held.futures.shape[1], forecast or {}) for name, model in models.items()}
-    forecasters |= {STILL: lambda past: zero_velocity(past["x"], held.futures.shape[1])[0]} if references else {}
+    forecasters |= {STILL: lambda past: last_value(past["x"], held.futures.shape[1])[0]} if references else {}
     for name, futures in forecasters.items():
         with reproducibly(models[name], seed) if name in models else nullcontext():
             learned, judged = (_examples(name, futures, each, progress) for each in (known, held))

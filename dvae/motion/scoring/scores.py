@@ -1,7 +1,7 @@
 """Scores of forecast motion, for `dvae.evaluate(models, windows, scores=dvae.motion.scores)`.
 
 The motion papers compare K futures with the true one in metres (`displacements`; definitions in
-`dvae.inference.evaluation.metrics`). Their futures are means of the emission. Forecasts are therefore means by default
+`dvae.motion.scoring.metrics`). Their futures are means of the emission. Forecasts are therefore means by default
 (`Measure.of_means`), and the table says "mean emission"; `draw_emission=True` adds the noise of the emission. Where
 windows move through space (a protocol with root="relative"), these are of poses relative to their own root, as in
 TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are in the world. Where the same
@@ -10,7 +10,7 @@ futures.
 
 Two scores ask for as much diversity and motion as there really is (BeLFusion: Barquero, Escalera and Palmero 2023,
 arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, the mean over windows that share
-their last pose with another one. *CMD* (`metrics.cumulative_motion_distance`) is of what joints move by from frame to
+their last pose with another one. *CMD* (`cumulative_motion_distance`) is of what joints move by from frame to
 frame, for each class of motion and averaged by the classes' shares of the windows, as in the public code. A class is
 the label "content" of a clip; where clips have none, all windows are one class. The pace of a class is that of the true
 futures of the windows at hand, in the public code a constant for each of its data sets. CMD is a number of the whole
@@ -52,12 +52,21 @@ from ...constants import indices
 from ...data.sequences import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known
 from ...inference.evaluation import metrics
 from ...inference.evaluation.held import clip_places, on_device_of, reproducibly
-from ...inference.evaluation.references import multimodal_note, multimodal_truths
 from ...inference.evaluation.scores import ENERGY, VARIOGRAM, Measure, means_of_those_that_count, paired
 from ..data.exchange import Exchanged
 from ..data.protocols import Windows
 from ..geometry.skeleton import SHORTEST, Skeleton
 from .energies import pose_prior_energy
+from .metrics import (
+    average_displacement_error,
+    final_displacement_error,
+    median_average_displacement_error,
+    median_final_displacement_error,
+    motion_pseudo_values,
+    multimodal_errors,
+    multimodal_note,
+    multimodal_truths,
+)
 
 SEAM = 3
 """Observed frames of which the jerk of a future is, too, so that it has that of the seam."""
@@ -109,23 +118,27 @@ def scores(
     return [replace(measure, of_means=True) for measure in found]
 
 
-_ADE = Measure("ADE", paired(metrics.average_displacement_error), "m", headline=True)
-_FDE = Measure("FDE", paired(metrics.final_displacement_error), "m", headline=True)
+_ADE = Measure("ADE", paired(average_displacement_error), "m", headline=True)
+_FDE = Measure("FDE", paired(final_displacement_error), "m", headline=True)
 _MEDIAN = (
-    Measure("ADEm", paired(metrics.median_average_displacement_error), "m"),
-    Measure("FDEm", paired(metrics.median_final_displacement_error), "m"),
+    Measure("ADEm", paired(median_average_displacement_error), "m"),
+    Measure("FDEm", paired(median_final_displacement_error), "m"),
 )
 _MULTIMODAL = ("MMADE", "MMFDE", "MMADEm", "MMFDEm")
-"""In the order of `metrics.multimodal_errors`."""
+"""In the order of `multimodal_errors`."""
 
 
-def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x) -> list[Measure]:
+def displacements(
+    windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x, threshold: float | None = None
+) -> list[Measure]:
     """Diversity, errors of the best and of the median future, and proper scores, in metres; of arrays, too.
 
     Args:
         windows: among which multimodal ground truth is found, unless poses were exchanged: windows that begin like
             such a pose go on from others.
         body: what of frames (..., T, D) is compared.
+        threshold: distance below which last observed frames are alike, in the unit of the data; by default the
+            protocol's `multimodal_threshold`, or 0.5 where it has none, as in the papers.
     """
 
     def of_body(measure: Measure) -> Measure:
@@ -140,25 +153,29 @@ def displacements(windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = la
         return metrics.energy_score(forecasts, truth, None if truth.isnan().any() else diversity(forecasts))
 
     apd = Measure("APD", lambda forecasts, *_: diversity(forecasts), "m", "higher")
-    several = [] if isinstance(windows, Exchanged) else _multimodal(windows, body, diversity)
+    several = [] if isinstance(windows, Exchanged) else _multimodal(windows, body, diversity, threshold)
     proper = [replace(ENERGY, function=energy), VARIOGRAM]
     return list(map(of_body, [apd, _ADE, _FDE, *several[:2], *_MEDIAN, *several[2:], *proper]))
 
 
 def _multimodal(
-    windows: HeldOutWindows, body: Callable[[Tensor], Tensor], diversity: Callable[[Tensor], Tensor]
+    windows: HeldOutWindows,
+    body: Callable[[Tensor], Tensor],
+    diversity: Callable[[Tensor], Tensor],
+    threshold: float | None,
 ) -> list[Measure]:
     """Errors averaged over the futures of all windows in almost the same pose, and the APDE."""
-    truths = multimodal_truths(windows)
+    threshold = getattr(windows.protocol, "multimodal_threshold", 0.5) if threshold is None else threshold
+    truths = multimodal_truths(windows, threshold)
     futures = body(gapped(windows.all())[:, windows.protocol.observed :])
     lonely = sum(len(found) == 1 for found in truths)
-    said = {"threshold": windows.protocol.multimodal_threshold, "itself": True, "alone": lonely}
+    said: dict[str, Any] = {"threshold": threshold, "itself": True, "alone": lonely}
     shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
 
     @lru_cache(maxsize=1)  # for all scores of a batch
     def errors(forecasts: Tensor, index: Tensor) -> Tensor:
         pairs = zip(forecasts, index.tolist(), strict=True)
-        return torch.stack([metrics.multimodal_errors(window, futures[truths[n]]) for window, n in pairs])
+        return torch.stack([multimodal_errors(window, futures[truths[n]]) for window, n in pairs])
 
     def error(place: int) -> Callable[..., Tensor]:
         return lambda forecasts, truth, past, index: errors(forecasts, index)[:, place]
@@ -335,7 +352,7 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
         function,
         "m",
         partial=windows.missing,
-        pool=lambda motion, clips: metrics.motion_pseudo_values(motion, real, classes, clips),
+        pool=lambda motion, clips: motion_pseudo_values(motion, real, classes, clips),
         note=f"CMD: {what}, against the pace of their true futures",
         basis={"CMD": {"label": label, "classes": names}},
     )

@@ -148,5 +148,5 @@ def test_an_evaluation_has_it_in_nats_a_predicted_frame():
     assert list(result.metrics) == ["energy score", "variogram score", "CRPS", "log score", "ELBO", "KL z"]
     assert (result.metrics["log score"].unit, result.metrics["log score"].better) == ("nats/frame", "higher")
     assert result.log_score_particles == 7
-    assert "log score" not in result["zero velocity"]
+    assert "log score" not in result["last value"]
     assert "log score" not in evaluate({"dkf": model}, windows, **options).metrics

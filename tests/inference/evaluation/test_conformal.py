@@ -184,18 +184,18 @@ def test_windows_of_sequences_divided_by_time_are_refused():
 
 def test_points_have_the_spread_of_their_residuals(fitted):
     _, kept, new = fitted
-    tubes = conformal("zero velocity", kept, residuals=kept, progress=False)
+    tubes = conformal("last value", kept, residuals=kept, progress=False)
     assert tubes.samples == 1
     whole = replace(kept, mask=None)
     x = whole.all()["x"]
-    spread = conformal("zero velocity", whole, residuals=whole, progress=False).spread
+    spread = conformal("last value", whole, residuals=whole, progress=False).spread
     np.testing.assert_allclose(spread, (x[:, 2:] - x[:, 1:2]).square().mean(0).sqrt())
-    judged = tubes.coverage("zero velocity", new, progress=False)["zero velocity"]
+    judged = tubes.coverage("last value", new, progress=False)["last value"]
     assert not any(name.startswith("said") for name in judged)
     held = judged["held 90 %, future"]
     assert abs(held.mean - 0.9) < 4 * math.sqrt(2) * held.standard_error
     with pytest.raises(ValueError, match="no spread where they miss the future"):
-        conformal("zero velocity", kept, progress=False)
+        conformal("last value", kept, progress=False)
 
 
 def test_one_frame_of_one_column_has_one_factor():

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -19,8 +20,10 @@ from dvae.inference.bounds.elbo import SequenceELBO
 from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.evaluate import evaluate
 from dvae.inference.evaluation.evaluation import Evaluation, Row, Score
-from dvae.inference.evaluation.references import multimodal_truths, nearest_neighbours, zero_velocity
+from dvae.inference.evaluation.references import last_value, nearest_neighbours
 from dvae.inference.evaluation.scores import proper
+from dvae.motion.scoring import metrics as errors
+from dvae.motion.scoring.metrics import multimodal_truths
 from dvae.program.model import DynamicalVAE
 
 OBSERVED, FRAMES, SIZE = 4, 9, 3
@@ -80,7 +83,7 @@ def free_running(forecaster, windows, **options):
 
 def test_zero_velocity_repeats_the_last_pose():
     observed = draw(2, 4, 3)
-    forecast = zero_velocity(observed, 5)
+    forecast = last_value(observed, 5)
     assert forecast.shape == (1, 2, 5, 3)
     assert (forecast == observed[:, -1:]).all()
 
@@ -123,7 +126,7 @@ def test_training_windows_that_do_not_fit_are_refused(training, message):
 def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_frame(model):
     windows = array_windows()
     result = run({"dkf": model}, windows, batch_size=12, training_windows=array_windows(20), seed=3)
-    assert list(result.rows) == ["zero velocity", "nearest neighbours", "dkf"]
+    assert list(result.rows) == ["last value", "nearest neighbours", "dkf"]
     assert [row.samples for row in result.rows.values()] == [1, 5, 5]
     x = windows.all()["x"]
     with torch.random.fork_rng(), torch.no_grad():
@@ -131,11 +134,11 @@ def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_frame(model):
         forecasts = model.forecast({"x": x[:, :OBSERVED]}, FRAMES - OBSERVED, 5, draw_emission=False)["x"].movedim(0, 1)
         torch.manual_seed(3)
         bound = SequenceELBO().terms(model, {"x": x}).bound / FRAMES
-    ade = metrics.average_displacement_error(forecasts, x[:, OBSERVED:])
+    ade = errors.average_displacement_error(forecasts, x[:, OBSERVED:])
     assert result["dkf"]["ADE"].mean == pytest.approx(ade.mean().item())
     assert result["dkf"]["ELBO"].mean == pytest.approx(bound.mean().item())
     assert {"KL z", "ELBO"} <= result["dkf"].keys()
-    assert not {"KL z", "ELBO"} & result["zero velocity"].keys()
+    assert not {"KL z", "ELBO"} & result["last value"].keys()
 
 
 def test_scores_depend_on_the_seed_and_not_on_the_company(model):
@@ -171,10 +174,11 @@ def test_importance_bound_is_above_the_elbo_and_its_diagnosis_beside_it(model):
 
 
 def test_a_perfect_forecast_has_no_error_and_a_lone_window_keeps_its_own_truth():
-    windows = array_windows(multimodal_threshold=1e-9)
+    windows = array_windows()
     truth = iter(windows.all()["x"][:, OBSERVED:].split(5))
     perfect = Forecaster(lambda x, horizon, samples: next(truth).expand(samples, -1, -1, -1))
-    scores = free_running(perfect, windows, batch_size=5)
+    alone = partial(motion.displacements, threshold=1e-9)
+    scores = free_running(perfect, windows, batch_size=5, scores=alone)
     for name in ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "MMFDEm", "energy score", "variogram score", "APD"):
         assert scores[name].mean == pytest.approx(0, abs=1e-6), name
 
@@ -182,9 +186,9 @@ def test_a_perfect_forecast_has_no_error_and_a_lone_window_keeps_its_own_truth()
 def test_multimodal_errors_average_over_every_window_in_the_same_pose():
     x = draw(6, FRAMES, SIZE)
     x[:3, OBSERVED - 1] = x[0, OBSERVED - 1]
-    windows = ArrayWindows(x, OBSERVED, multimodal_threshold=1e-6)
-    still = run({}, windows)["zero velocity"]
-    forecast = zero_velocity(x[:, :OBSERVED], FRAMES - OBSERVED)[0]
+    windows = ArrayWindows(x, OBSERVED)
+    still = run({}, windows, scores=partial(motion.displacements, threshold=1e-6))["last value"]
+    forecast = last_value(x[:, :OBSERVED], FRAMES - OBSERVED)[0]
     errors = (forecast[:, None] - x[None, :, OBSERVED:]).norm(dim=-1).mean(-1)
     expected = (3 * errors[:3, :3].mean() + errors.diagonal()[3:].sum()) / 6
     assert still["MMADE"].mean == pytest.approx(expected.item(), abs=1e-6)
@@ -239,21 +243,21 @@ def evaluation(values, clips):
 
 def test_independent_windows_have_the_standard_error_of_a_mean():
     values = draw(30).abs()
-    score = evaluation(values, None)["zero velocity"]["FDE"]
+    score = evaluation(values, None)["last value"]["FDE"]
     assert score.mean == pytest.approx(values.mean().item())
     assert score.standard_error == pytest.approx((values.std() / math.sqrt(30)).item())
 
 
 def test_copies_of_windows_in_a_clip_add_no_certainty():
     values = draw(10).abs()
-    once = evaluation(values, [str(i) for i in range(10)])["zero velocity"]["FDE"]
-    thrice = evaluation(values.repeat(3), [str(i) for i in range(10)] * 3)["zero velocity"]["FDE"]
+    once = evaluation(values, [str(i) for i in range(10)])["last value"]["FDE"]
+    thrice = evaluation(values.repeat(3), [str(i) for i in range(10)] * 3)["last value"]["FDE"]
     assert thrice.mean == pytest.approx(once.mean)
     assert thrice.standard_error == pytest.approx(once.standard_error)
 
 
 def test_the_mean_is_over_windows_where_clips_differ_in_number():
-    score = evaluation([1.0, 1.0, 1.0, 5.0], ["a", "a", "a", "b"])["zero velocity"]["FDE"]
+    score = evaluation([1.0, 1.0, 1.0, 5.0], ["a", "a", "a", "b"])["last value"]["FDE"]
     assert score.mean == pytest.approx(2)
 
 
@@ -271,17 +275,17 @@ def test_clustered_error_is_the_spread_of_the_mean_where_windows_of_a_clip_agree
 
 
 def test_one_clip_has_no_standard_error():
-    assert math.isnan(evaluation([1.0, 2.0], ["a", "a"])["zero velocity"]["FDE"].standard_error)
+    assert math.isnan(evaluation([1.0, 2.0], ["a", "a"])["last value"]["FDE"].standard_error)
 
 
 def test_differences_are_paired(model):
     result = run({"a": model, "b": model}, array_windows())
     assert result.difference("a", "b", "ADE") == Score(0, 0)
-    paired = result.difference("a", "zero velocity", "ADE")
-    assert paired.mean == pytest.approx(result["a"]["ADE"].mean - result["zero velocity"]["ADE"].mean)
-    with pytest.raises(KeyError, match="'zero velocity' has no score 'ELBO'"):
-        result.difference("a", "zero velocity", "ELBO")
-    with pytest.raises(KeyError, match=r"no method 'c' .* it has zero velocity, a, b"):
+    paired = result.difference("a", "last value", "ADE")
+    assert paired.mean == pytest.approx(result["a"]["ADE"].mean - result["last value"]["ADE"].mean)
+    with pytest.raises(KeyError, match="'last value' has no score 'ELBO'"):
+        result.difference("a", "last value", "ELBO")
+    with pytest.raises(KeyError, match=r"no method 'c' .* it has last value, a, b"):
         result["c"]
 
 
@@ -324,7 +328,7 @@ def test_the_record_says_what_was_measured_and_comes_back_from_json(model, tmp_p
         "coordinates": SIZE,
     }
     assert (document["samples"], document["seed"], document["bound_particles"]) == (5, 5, 3)
-    assert document["protocol"] == {"observed": OBSERVED, "multimodal_threshold": 0.5}
+    assert document["protocol"] == {"observed": OBSERVED}
     alone = sum(len(found) == 1 for found in multimodal_truths(windows))
     assert document["basis"] == {"multimodal": {"threshold": 0.5, "itself": True, "alone": alone}}
     assert f"{alone} of 12 have no other" in str(result)
@@ -354,7 +358,7 @@ def test_table_and_plot_show_every_method_and_metric(model):
     result = run({"dkf": model}, array_windows())
     text = str(result)
     for part in (
-        "zero velocity",
+        "last value",
         "dkf",
         "K = 5",
         "K = 1",
@@ -395,7 +399,7 @@ def test_scores_print_as_in_the_papers(score, text):
 
 
 def nan_at_the_second_window(x, horizon, samples):
-    forecast = zero_velocity(x, horizon).repeat(samples, 1, 1, 1)
+    forecast = last_value(x, horizon).repeat(samples, 1, 1, 1)
     forecast[0, 1, 2, 0] = math.nan
     return forecast
 
@@ -407,7 +411,7 @@ def test_forecasts_that_are_not_finite_are_an_error_naming_method_and_window():
 
 
 def test_forecasts_of_another_shape_are_an_error_naming_both():
-    short = Forecaster(lambda x, horizon, samples: zero_velocity(x, horizon - 1).expand(samples, -1, -1, -1))
+    short = Forecaster(lambda x, horizon, samples: last_value(x, horizon - 1).expand(samples, -1, -1, -1))
     with pytest.raises(ValueError, match=r"forecasts of model must be .* \(5, 12, 5, 3\), not \(5, 12, 4, 3\)"):
         run(short, array_windows())
 
@@ -417,8 +421,8 @@ def test_forecasts_of_another_shape_are_an_error_naming_both():
     [
         (lambda: run({}, array_windows(), samples=0), "samples is 0; it must be at least 1"),
         (
-            lambda: run({"zero velocity": Forecaster(None)}, array_windows()),
-            "name of a reference row: zero velocity",
+            lambda: run({"last value": Forecaster(None)}, array_windows()),
+            "name of a reference row: last value",
         ),
         (lambda: ArrayWindows(draw(3, 4, 2), 4), "observed is 4 of 4 steps of x, which leaves none to predict"),
         (lambda: ArrayWindows(draw(3, 4, 2), "2"), "observed is '2'; it must be a whole number"),
@@ -452,7 +456,7 @@ def people():
 
 def test_bone_lengths_tell_stretched_people(people):
     test, training = people
-    tall = Forecaster(lambda x, horizon, samples: 1.1 * zero_velocity(x, horizon).expand(samples, -1, -1, -1))
+    tall = Forecaster(lambda x, horizon, samples: 1.1 * last_value(x, horizon).expand(samples, -1, -1, -1))
     assert free_running(tall, test, scores=motion.scores)["bone-length error"].mean == pytest.approx(0.1, abs=1e-3)
     result = run({}, test, scores=motion.scores, training_windows=training, samples=2)
     assert result["zero velocity"]["bone-length error"].mean < 1e-3
@@ -475,8 +479,8 @@ def test_reference_rows_of_real_data_are_those_published_with_it(real, file, pro
     x = test.all()["x"]
     training = motion.windows(clips, motion.PROTOCOLS[protocol], "train+validation").all()["x"]
     observed, futures = x[:, : test.protocol.observed], x[:, test.protocol.observed :]
-    ade, fde = metrics.average_displacement_error, metrics.final_displacement_error
-    point = zero_velocity(observed, futures.shape[1]).movedim(0, 1)
+    ade, fde = errors.average_displacement_error, errors.final_displacement_error
+    point = last_value(observed, futures.shape[1]).movedim(0, 1)
     assert [score(point, futures).mean().item() for score in (ade, fde)] == pytest.approx(still, abs=6e-4)
     many = nearest_neighbours(observed, training, 50).movedim(0, 1)
     scores = [ade(many, futures), fde(many, futures), metrics.average_pairwise_distance(many)]

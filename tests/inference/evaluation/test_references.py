@@ -9,7 +9,7 @@ import torch
 from dvae.data.sequences import ArrayWindows, columns_of
 from dvae.inference.evaluation.evaluate import evaluate
 from dvae.inference.evaluation.held import hold
-from dvae.inference.evaluation.references import References, climatology, seasonal, zero_velocity
+from dvae.inference.evaluation.references import References, climatology, last_value, seasonal
 
 HORIZON = 5
 
@@ -39,7 +39,7 @@ def test_a_season_is_what_was_there_a_whole_number_of_periods_before(season):
             t -= season
         assert found[n, h, d] == x[n, t, d]
     if season == 1:
-        assert torch.equal(found, zero_velocity(x, HORIZON)[0])
+        assert torch.equal(found, last_value(x, HORIZON)[0])
 
 
 def test_a_value_that_the_last_season_lacks_is_that_of_an_earlier_one():
@@ -96,8 +96,8 @@ def test_windows_that_name_their_columns_have_the_references_of_tables(gaps):
     expected = {"last value": 1, "seasonal": 1, "mean": 1, "climatology": 20, "nearest neighbours": 9}
     assert {name: row.samples for name, row in rows.items()} == expected
     bare = replace(held, columns=None)
-    assert list(run(bare, training_windows=known).rows) == ["zero velocity", "nearest neighbours"]
-    assert rows["last value"].clip_means == run(bare).rows["zero velocity"].clip_means
+    assert list(run(bare, training_windows=known).rows) == ["last value", "nearest neighbours"]
+    assert rows["last value"].clip_means == run(bare).rows["last value"].clip_means
     assert list(run(held).rows) == ["last value", "seasonal"]
     assert list(run(replace(held, season=None)).rows) == ["last value"]
     assert list(run(replace(held, season=8)).rows) == ["last value"]  # of 7 observed frames
@@ -120,12 +120,12 @@ def test_reference_rows_are_scored_as_the_forecasts_they_are():
 
 def test_references_are_had_by_name_or_say_what_they_need():
     held, known = windows(), windows(9, seed=1)
-    asked = ["nearest neighbours", "zero velocity", "seasonal"]
+    asked = ["nearest neighbours", "last value", "seasonal"]
     assert list(run(held, references=asked, training_windows=known, season=3).rows) == asked
     for options, message in (
         (
             {"references": ["season"]},
-            r"no reference row 'season' \(did you mean 'seasonal'\?\); there are zero",
+            r"no reference row 'season' \(did you mean 'seasonal'\?\); there are last",
         ),
         ({"references": ["seasonal"]}, "'seasonal' needs a season of 1 to 7 frames, which are observed$"),
         ({"references": ["seasonal"], "season": 9}, "of 1 to 7 frames, which are observed, not 9"),

@@ -11,7 +11,7 @@ import dvae
 from dvae import motion
 from dvae.data.sequences import ArrayWindows, Fingerprinted, HeldOutWindows, Listed, Sequences, Source, sequences
 from dvae.inference.evaluation.evaluate import evaluate
-from dvae.inference.evaluation.references import zero_velocity
+from dvae.inference.evaluation.references import last_value
 from dvae.inference.evaluation.scores import (
     ENERGY,
     Measure,
@@ -30,7 +30,7 @@ def draw(*shape, seed=0):
 
 def still(windows, *measures, **options):
     result = evaluate({}, windows, scores=lambda _: measures, progress=False, **options)
-    return result, result["zero velocity"]
+    return result, result["last value"]
 
 
 def test_a_score_is_a_function_of_forecasts_truth_past_and_places():
@@ -42,13 +42,13 @@ def test_a_score_is_a_function_of_forecasts_truth_past_and_places():
         seen.append(index)
         assert torch.equal(truth, x[index, 4:])
         assert torch.equal(past["x"], x[index, :4])
-        assert torch.equal(forecasts[:, 0], zero_velocity(past["x"], 2)[0])
+        assert torch.equal(forecasts[:, 0], last_value(past["x"], 2)[0])
         return index.double()
 
     result, scores = still(windows, Measure("place", function, "windows", ""), batch_size=4)
     assert torch.equal(torch.cat(seen), torch.arange(9))
     assert scores["place"].mean == pytest.approx(4)
-    assert result.rows["zero velocity"].clip_means["place"] == (1, 4, 7)
+    assert result.rows["last value"].clip_means["place"] == (1, 4, 7)
     assert result.metrics["place"].unit == "windows"
     assert "place (windows)" in str(result)
 
@@ -82,7 +82,7 @@ def test_notes_bases_and_true_futures_come_with_a_score():
     note = {"note": "read it so", "basis": {"judge": "abc"}, "truth": "what happened"}
     measures = replace(ENERGY, **note), Measure("b", paired(lambda x, y: x.mean((-1, -2, -3)) * 0), **note)
     result, _ = still(ArrayWindows(draw(4, 3, 1), 2), *measures)
-    assert list(result.rows) == ["what happened", "zero velocity"]
+    assert list(result.rows) == ["what happened", "last value"]
     assert result["what happened"]["energy score"].mean == 0
     assert (result.notes, result.basis) == (["read it so"], {"judge": "abc"})
     assert dvae.Evaluation.from_json(result.to_json()).to_json() == result.to_json()
@@ -92,7 +92,7 @@ def test_without_more_said_scores_are_proper_and_of_any_arrays():
     windows = ArrayWindows(draw(4, 5, 2), 3)
     result = evaluate({}, windows, progress=False)
     assert list(result.metrics) == [measure.name for measure in proper(windows)]
-    assert result["zero velocity"]["CRPS"].mean == pytest.approx((windows.x[:, 3:] - windows.x[:, 2:3]).abs().mean())
+    assert result["last value"]["CRPS"].mean == pytest.approx((windows.x[:, 3:] - windows.x[:, 2:3]).abs().mean())
     model = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 2}).double()
     compared = dvae.compare({"a": model}, windows, particles=2, samples=3, contrasts=0, progress=False)
     assert compared.shown == {"energy score": "", "CRPS": ""}

@@ -19,7 +19,7 @@ from dvae.data.sequences import bridged, gapped, past_of
 from dvae.inference.diagnostics.checks import STATISTICS, Statistic
 from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.held import clip_places
-from dvae.inference.evaluation.references import distances, nearest_neighbours, zero_velocity
+from dvae.inference.evaluation.references import distances, last_value, nearest_neighbours
 from dvae.models.motion.trajectories import TrajectoryMethod
 from dvae.models.registry import METHODS
 from dvae.motion.data.clips import Clip, MotionSet
@@ -27,6 +27,7 @@ from dvae.motion.drawing.film import save_film
 from dvae.motion.drawing.player import MISSING, _scene
 from dvae.motion.drawing.plot import staged
 from dvae.motion.scoring import energies
+from dvae.motion.scoring import metrics as errors
 
 PEOPLE = motion.simulate(clips=10, frames=90, seed=1)
 GAPS = motion.occlude(PEOPLE, seed=1)
@@ -252,7 +253,7 @@ def test_gaps_are_bridged_by_straight_lines():
 def test_zero_velocity_stays_where_joints_were_last():
     x, mask = torch.randn(2, 5, 3), torch.ones(2, 5, 3, dtype=torch.bool)
     mask[0, 3:, 1] = mask[1, :, 2] = False
-    found = zero_velocity(torch.where(mask, x, torch.nan), 4, mask)
+    found = last_value(torch.where(mask, x, torch.nan), 4, mask)
     assert torch.equal(found[0, :, 0], found[0, :, 3])
     assert torch.equal(found[0, 0, 0], torch.stack([x[0, 4, 0], x[0, 2, 1], x[0, 4, 2]]))
     assert found[0, 1, 0, 2] == 0
@@ -288,19 +289,19 @@ def test_neighbours_are_found_by_what_was_observed():
 
 
 SCORES = [
-    metrics.average_displacement_error,
-    metrics.final_displacement_error,
-    metrics.median_average_displacement_error,
-    metrics.median_final_displacement_error,
+    errors.average_displacement_error,
+    errors.final_displacement_error,
+    errors.median_average_displacement_error,
+    errors.median_final_displacement_error,
     metrics.energy_score,
     metrics.continuous_ranked_probability_score,
     metrics.variogram_score,
 ]
 SEVERAL = [
-    metrics.multimodal_average_displacement_error,
-    metrics.multimodal_final_displacement_error,
-    metrics.median_multimodal_average_displacement_error,
-    metrics.median_multimodal_final_displacement_error,
+    errors.multimodal_average_displacement_error,
+    errors.multimodal_final_displacement_error,
+    errors.median_multimodal_average_displacement_error,
+    errors.median_multimodal_final_displacement_error,
 ]
 
 
@@ -332,11 +333,11 @@ def test_a_diversity_with_gaps_is_that_of_what_pairs_share():
     """Futures that lie equally far apart in all numbers have the same diversity, whatever is missing."""
     samples, truths = torch.randn(4, 6, 5).double(), torch.arange(3.0).double()[:, None, None].expand(3, 6, 5)
     gaps = torch.where(torch.rand(3, 6, 5) < 0.7, truths, torch.nan)
-    found = metrics.average_pairwise_distance_error(samples, gaps)
-    torch.testing.assert_close(found, metrics.average_pairwise_distance_error(samples, truths))
+    found = errors.average_pairwise_distance_error(samples, gaps)
+    torch.testing.assert_close(found, errors.average_pairwise_distance_error(samples, truths))
     gaps[0], gaps[1:, 0] = torch.nan, truths[1:, 0]
     gaps[1, 1:], gaps[2] = torch.nan, torch.nan
-    assert metrics.average_pairwise_distance_error(samples, gaps).isnan()  # no two share anything
+    assert errors.average_pairwise_distance_error(samples, gaps).isnan()  # no two share anything
 
 
 def test_scores_of_bodies_are_of_what_was_observed():
@@ -391,7 +392,7 @@ def test_cumulative_motion_is_of_joints_that_were_observed():
                 x.unflatten(-1, (-1, 3))[..., joints, :].diff(dim=-3).norm(dim=-1).mean(-1).double()
                 for x in (forecasts, truth)
             )
-            pooled = metrics.motion_pseudo_values(ours.mean(1), real.mean(-1), torch.zeros_like(clips), clips)
+            pooled = errors.motion_pseudo_values(ours.mean(1), real.mean(-1), torch.zeros_like(clips), clips)
             assert found == pytest.approx(np.average(pooled, weights=clips.bincount()), rel=1e-5)
 
 

@@ -13,10 +13,10 @@ from dvae.cli.futures import draw_futures
 from dvae.data.schema import SchemaError
 from dvae.data.sequences import leaves, past_of
 from dvae.inference.diagnostics.checks import decode
-from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.held import clip_places
 from dvae.motion.geometry import kinematics, rotations
 from dvae.motion.geometry.views import LENGTHS, TURNS, Rotations
+from dvae.motion.scoring import metrics as errors
 
 FORMS = ["6d", "quaternion", "vector"]
 
@@ -190,13 +190,13 @@ def test_what_is_drawn_is_what_is_scored(run_of_turns):
     loaded = dvae.load(run_of_turns)
     test = loaded.data.windows("test")
     drawn = draw_futures(loaded, test, range(len(test)), samples=3, seed=0)
-    errors = metrics.average_displacement_error(
+    found = errors.average_displacement_error(
         torch.from_numpy(drawn.forecasts[..., 1:, :]).movedim(0, 1).flatten(3),  # the root was dropped
         torch.from_numpy(drawn.truth[..., 1:, :]).flatten(2),
     )
     scored = dvae.evaluate(loaded.model, test, scores=motion.scores, samples=3, seed=0, progress=False).rows["model"]
-    means = [errors[places == clip].mean() for places in [clip_places(test.keys)] for clip in places.unique()]
-    torch.testing.assert_close(torch.stack(means), torch.tensor(scored.clip_means["ADE"]).to(errors))
+    means = [found[places == clip].mean() for places in [clip_places(test.keys)] for clip in places.unique()]
+    torch.testing.assert_close(torch.stack(means), torch.tensor(scored.clip_means["ADE"]).to(found))
 
 
 def test_data_of_other_turns_have_another_fingerprint_where_they_are_read(people_of_two_sizes):

@@ -151,4 +151,4 @@ def test_options_out_of_range_are_refused():
 def test_a_method_says_what_it_is_fitted_on():
     kinds = {name: kind.fitted_on for name, kind in dvae.methods().items()}
     assert kinds.pop("motion-latent") == "segments"
-    assert {*kinds.values()} == {"motion"}
+    assert {*kinds.values()} == {"windows"}

@@ -1,0 +1,239 @@
+"""Errors of forecast motion, as pure functions on arrays.
+
+The errors follow the evaluation code of DLow (Yuan and Kitani 2020, arXiv:2003.08386) and GSPS (Mao, Liu and Salzmann
+2021, arXiv:2108.08422); the median versions are those of HiT-DVAE (Bie et al. 2022, arXiv:2204.01565). They reward the
+best (or the median) of K samples and are not proper: a forecaster gains by spreading its samples. APDE and CMD are
+those of BeLFusion (Barquero, Escalera and Palmero 2023, arXiv:2211.14304); they ask for as much diversity and motion as
+real futures have.
+
+Shapes are those of `dvae.inference.evaluation.metrics`, with truths `(..., M, T, D)` where M futures are admissible. A
+displacement is the Euclidean norm over *all* D coordinates of a frame, in the unit of the data (metres); it is not a
+mean over joints. Where the last frame of a truth was not observed, the final error is at the last frame that was.
+"""
+
+import torch
+from torch import Tensor
+
+from ...data.sequences import HeldOutWindows, mean_of_known
+from ...inference.evaluation.metrics import (
+    Array,
+    as_pair,
+    as_same_type,
+    as_samples,
+    displacement,
+    jackknife_pseudo_values,
+    mean_pairwise_distance,
+    over_observed,
+    per_window,
+    shape_of,
+)
+from ...inference.evaluation.references import distances, last_places
+
+
+def average_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """ADE: displacement averaged over the T frames, of the best of the K samples.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truth: `(..., T, D)`.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+    return per_window(over_observed(lambda x, y: displacement(x, y).mean(-1).amin()), *as_pair(samples, truth))
+
+
+def final_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """FDE: displacement at the last frame, of the sample that is best there. Shapes as in ADE."""
+    return per_window(over_observed(lambda x, y: displacement(x[:, -1], y[-1]).amin()), *as_pair(samples, truth))
+
+
+def median_average_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """ADEm: median over the K samples of the mean displacement (even K: mean of the middle two)."""
+    return per_window(over_observed(lambda x, y: _median(displacement(x, y).mean(-1))), *as_pair(samples, truth))
+
+
+def median_final_displacement_error(samples: Array, truth: Array) -> Tensor:
+    """FDEm: median over the K samples of the final displacement (even K: mean of the middle two)."""
+    return per_window(over_observed(lambda x, y: _median(displacement(x[:, -1], y[-1]))), *as_pair(samples, truth))
+
+
+def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: bool = True) -> list[Tensor]:
+    """Multimodal ground truth: for every window, those that were in almost the same pose when their future began.
+
+    Two windows belong together when their last observed poses are at a Euclidean distance *below* the threshold, over
+    all coordinates; where some are missing, see `distances`. By default as in the evaluation of DLow (Yuan and Kitani
+    2020): a window belongs to itself, and one that nobody joins keeps its single truth and is scored like the others,
+    as every evaluation here does. (GSPS leaves such windows out of every metric, so that its published numbers are on a
+    subset.)
+
+    Args:
+        windows: N windows; the protocol says what is observed.
+        threshold: largest distance (exclusive), in the unit of the data; 0.5 m in the papers.
+        itself: whether a window is among its own truths. Without, it may have none, and its multimodal errors are
+            undefined.
+
+    Returns:
+        N index tensors `(M_n,)`, ascending; `futures[truths[n]]` are the truths `(M_n, T, D)` of window n.
+
+    Raises:
+        ValueError: a threshold that is not positive.
+    """
+    observed = windows.protocol.observed
+    if not threshold > 0:
+        raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
+    poses, seen = last_places(windows.all(), observed)
+    poses = poses.double()
+    found: list[Tensor] = []
+    for rows in torch.arange(len(poses)).split(512):
+        close = distances(poses[rows], poses, None if seen is None else seen[rows], seen) < threshold
+        close[torch.arange(len(rows)), rows] = itself
+        found += [row.nonzero()[:, 0] for row in close]
+    return found
+
+
+def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:
+    """How multimodal errors are to be read, for the caption of a table."""
+    closer = f"all windows whose last poses are closer than {threshold:g} m{', itself included' if itself else ''}"
+    return f"MM: over the futures of {closer}; {alone} of {windows} have no other"
+
+
+def multimodal_errors(samples: Array, truths: Array) -> Tensor:
+    """MMADE, MMFDE, MMADEm and MMFDEm at once: errors to each of M admissible futures, averaged over them.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truths: `(..., M, T, D)`, the futures that `multimodal_truths` finds, the true one among them.
+
+    Returns:
+        `(..., 4)`, in the unit of the data.
+    """
+
+    def errors(x: Tensor, y: Tensor) -> Tensor:
+        apart = _cross(x, y)
+        return torch.cat([apart.amin(1), _median(apart, 1)]).mean(-1)
+
+    samples, truths = _multimodal(samples, truths)
+    return per_window(errors, samples, truths)
+
+
+def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMADE: the ADE to each of the admissible futures, averaged over them: `(...)`, see `multimodal_errors`."""
+    return multimodal_errors(samples, truths)[..., 0]
+
+
+def multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMFDE: the FDE to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    return multimodal_errors(samples, truths)[..., 1]
+
+
+def median_multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMADEm: the ADEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    return multimodal_errors(samples, truths)[..., 2]
+
+
+def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
+    """MMFDEm: the FDEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    return multimodal_errors(samples, truths)[..., 3]
+
+
+def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
+    """APDE: |APD of the samples - APD of the M admissible futures| (BeLFusion).
+
+    Where the true future alone is admissible there is no diversity to compare with; paper and public code leave such
+    windows out of the mean, and the value is NaN.
+
+    Args:
+        samples: `(..., K, T, D)`.
+        truths: `(..., M, T, D)`, as for MMADE.
+
+    Returns:
+        `(...)`, in the unit of the data; NaN for M = 1, and where no two truths have a number in common.
+    """
+
+    def score(x: Tensor, y: Tensor) -> Tensor:
+        return (mean_pairwise_distance(x) - mean_pairwise_distance(y)).abs() if len(y) > 1 else x.new_tensor(torch.nan)
+
+    return per_window(score, *_multimodal(samples, truths))
+
+
+def cumulative_motion_distance(motion: Array, real: Array) -> Tensor:
+    """CMD, the area between cumulative motion as forecast and at its real pace: sum_{t=1}^{T-1} (T - t) |M_t - M|.
+
+    M_t is what joints move by from frame t to t + 1 of the T predicted ones, the mean over joints, samples and windows,
+    and M the mean of true motion over frames too. It is sum_i sum_{t<=i} |M_t - M| (BeLFusion): what goes wrong early
+    counts in all later frames. True motion itself, which has no steady pace, is not at 0.
+
+    Args:
+        motion: `(..., T - 1)`, M_1 to M_{T-1}.
+        real: `(...)`, M.
+
+    Returns:
+        `(...)`, in the unit of the data.
+    """
+    motion, real = torch.as_tensor(motion), torch.as_tensor(real)
+    if motion.ndim != real.ndim + 1 or motion.shape[:-1] != real.shape or not motion.numel():
+        raise ValueError(
+            "motion (..., T - 1), T at least 2, needs a pace (...) of true motion, not "
+            f"{shape_of(motion)} and {shape_of(real)}"
+        )
+    frames = torch.arange(motion.shape[-1], 0, -1, device=motion.device)
+    return (frames * (motion - real[..., None]).abs()).sum(-1)
+
+
+def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: Tensor) -> tuple[float, ...]:
+    """The CMD of a set of windows, as a jackknife pseudo-value of each clip (see `jackknife_pseudo_values`).
+
+    It is computed for each class of motion, and averaged with the classes' shares of the windows.
+
+    Args:
+        motion: `(N, T - 1)`, what joints move by in the forecasts of each window; NaN where that cannot be compared. A
+            step of which no window tells counts as one at the true pace.
+        real: `(N,)`, and in its true future, over all frames.
+        classes: `(N,)`, whole numbers.
+        places: `(N,)`, the clip of every window, from 0 to C - 1.
+    """
+
+    def distance(kept: Tensor) -> Tensor:
+        groups = [kept & (classes == number) for number in classes[kept].unique()]
+        paces = [(rows.sum(), mean_of_known(motion[rows], 0), mean_of_known(real[rows], 0)) for rows in groups]
+        found = [n * cumulative_motion_distance(steps.where(~steps.isnan(), pace), pace) for n, steps, pace in paces]
+        return torch.stack(found).sum() / kept.sum()
+
+    clips = range(int(places.max()) + 1)
+    without = [distance(places != clip) for clip in clips] if len(clips) > 1 else []
+    return jackknife_pseudo_values(
+        distance(places >= 0), torch.stack(without) if without else places.new_empty(0), places
+    )
+
+
+def _cross(samples: Tensor, truths: Tensor) -> Tensor:
+    """Displacement of each of (K, T, D) from each of (M, T, D), averaged over frames, and at the last: (2, K, M)."""
+
+    def both(apart: Tensor) -> Tensor:
+        return torch.stack([apart.mean(0), apart[-1]])
+
+    centre = truths.mean(0)
+    if centre.isnan().any():
+        each = over_observed(lambda x, y: both(displacement(x, y).T))
+        return torch.stack([each(samples, truth) for truth in truths], -1)
+    # |x - y|^2 as products, as cdist has it but for its copies; about the centre the cancellation is harmless.
+    x, y = ((frames - centre).transpose(0, 1) for frames in (samples, truths))
+    squares = x.square().sum(-1)[:, :, None] + y.square().sum(-1)[:, None]
+    return both(squares.baddbmm_(x, y.mT, alpha=-2).clamp_(min=0).sqrt_())
+
+
+def _median(errors: Tensor, dim: int = 0) -> Tensor:
+    return errors.quantile(0.5, dim=dim)
+
+
+def _multimodal(samples: Array, truths: Array) -> tuple[Tensor, Tensor]:
+    samples = as_samples(samples)
+    truths = torch.as_tensor(truths, device=samples.device)
+    without_count = truths.shape[:-3] + truths.shape[-2:]
+    if truths.ndim < 3 or without_count != samples.shape[:-3] + samples.shape[-2:] or not truths.numel():
+        raise ValueError(
+            f"samples (..., K, T, D) of shape {shape_of(samples)} need truths (..., M, T, D) that differ "
+            f"from them in M alone, M at least 1, not {shape_of(truths)}"
+        )
+    return as_same_type(samples, truths)
