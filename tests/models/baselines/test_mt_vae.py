@@ -7,7 +7,6 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.models.baselines.mt_vae import NormedLSTM
 from dvae.testing import FactorizationContract
 
 SMALL = {"latent": 4, "width": 16}
@@ -66,11 +65,6 @@ def test_the_model_of_human36m_has_the_layers_of_the_public_code():
     assert sum(parameter.numel() for parameter in model.parameters()) == encoder + guide + change + decoder
 
 
-def test_past_and_future_have_one_embedding(windows):
-    model = built(windows)
-    assert model.encoder["w"].network.past is model.generator["x"].network.past
-
-
 def test_a_motion_that_stays_the_same_has_one_code(windows):
     """Whatever it is: a guide of the change of style has nothing else to read."""
     network, poses = built(windows).encoder["w"].network, batch_of(windows)["x"][:, :5]
@@ -78,30 +72,6 @@ def test_a_motion_that_stays_the_same_has_one_code(windows):
     torch.testing.assert_close(same, same[:1].expand(3, -1), rtol=0, atol=0)
     other = network({"x": poses.flip(1), "h": poses.flatten(1)}, 5)
     assert (other - other[:1])[1:].abs().max() > 1e-3
-
-
-def test_no_pose_that_is_made_is_read(windows):
-    """A longer future begins as a shorter one, by states and not by poses."""
-    model, batch = built(windows), batch_of(windows)
-    w = torch.randn(3, 4, dtype=torch.float64)
-    short = model.forecast({"x": batch["x"][:, :5]}, 3, fix={"w": w})["x"][0]
-    torch.testing.assert_close(short, future(model, batch, w)[:, :3])
-    assert model.method.train(windows).feeding == 0
-
-
-def test_gates_do_not_know_the_level_or_the_scale_of_what_they_add_up():
-    torch.manual_seed(0)
-    network = NormedLSTM(3, 6).double()
-    values, zero = torch.randn(2, 4, 3, dtype=torch.float64), torch.zeros(2, 6, dtype=torch.float64)
-    shares = network.share(values)
-    expected = network(shares.unbind(1), zero, zero)
-    levels = torch.randn(4, dtype=torch.float64).repeat_interleave(6)
-    torch.testing.assert_close(network((shares + levels).unbind(1), zero, zero), expected)
-    with torch.no_grad():
-        network.recurrent.weight.mul_(1e3)
-        far = network((1e3 * shares).unbind(1), zero, zero)
-        network.recurrent.weight.mul_(1e3)
-    torch.testing.assert_close(network((1e6 * shares).unbind(1), zero, zero), far, rtol=1e-5, atol=1e-8)
 
 
 def test_the_loss_is_the_papers(windows):
@@ -130,49 +100,3 @@ def test_the_loss_is_the_papers(windows):
     constant = 3 * truth[0].numel() * torch.tensor(2 * scale).log()
     join = 2 * (made[:, 0] - last[:, 0]).square().sum()
     torch.testing.assert_close(objective(terms, 100), (4 * paper + constant + join) / (3 * 12))
-
-
-def test_weights_rise_as_in_the_paper():
-    objective = dvae.method("mt-vae", latent=512).objective()
-    for step in (0, 100, 20_000, 60_000):
-        a = 1 - 0.99995**step
-        assert objective.kl_weight(step) == pytest.approx(a, rel=1e-4)
-        assert objective.energy_weights["velocity"](step) == pytest.approx(5 * a * 512 / 16, rel=1e-4)
-
-
-def test_a_divergence_below_the_floor_costs_nothing_more(windows):
-    objective = small(floor=0.5).train(windows, steps=10).objective
-    terms = dvae.SequenceELBO().terms(built(windows), batch_of(windows))
-
-    def loss(each):  # nats for each number of w
-        return objective(replace(terms, kl={"w": torch.full((3,), 4 * each, dtype=torch.float64)}), 10)
-
-    assert loss(0.0) == loss(0.499)
-    assert loss(1.0) > loss(0.501) > loss(0.499)
-
-
-def test_velocities_count_where_both_poses_were_observed(windows):
-    model, batch = built(windows, heading=False), batch_of(windows)
-    mask = torch.ones_like(batch["x"], dtype=torch.bool)
-    mask[:, 7, :3] = False  # the third that is made
-    mask[:, 16] = False  # after the first eight
-    found = []
-    for hidden in (0.0, torch.nan):
-        torch.manual_seed(1)
-        terms = dvae.SequenceELBO().terms(model, {"x": batch["x"].masked_fill(~mask, hidden), "mask": mask})
-        found.append(terms.energies["velocity"])
-    assert torch.equal(*found)
-    torch.manual_seed(1)
-    drawn = model.guide({"x": batch["x"].masked_fill(~mask, 0.0), "mask": mask})["w"]
-    futures = [future(model, batch, w) for w in (drawn, torch.randn(3, 4, dtype=torch.float64))]
-    counted = torch.ones(3, 8, 48, dtype=torch.bool)
-    counted[:, 2:4, :3] = False
-    truth, last = batch["x"][:, 5:], batch["x"][:, 4:5]
-    errors = [torch.cat([last - last, made - truth], 1).diff(dim=1)[:, :8].abs() for made in futures]
-    torch.testing.assert_close(found[0], (sum(errors) * counted).sum((1, 2)))
-
-
-def test_losses_without_weight_are_not_computed(windows):
-    terms = dvae.SequenceELBO().terms(built(windows, velocity=0.0, cycle=0.0), batch_of(windows))
-    assert not terms.energies
-    assert not small(velocity=0.0, cycle=0.0).train(windows).objective.energy_weights

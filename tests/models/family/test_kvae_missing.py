@@ -2,9 +2,7 @@
 
 import pytest
 import torch
-from pyro import poutine
-from torch.autograd import gradcheck
-from torch.distributions import MultivariateNormal, kl_divergence
+from torch.distributions import MultivariateNormal
 
 import dvae
 from dvae.models.family.kvae import KVAE, smooth
@@ -142,16 +140,6 @@ def test_what_stands_at_a_missing_frame_is_not_read(components):
         assert steps[PRESENT].all(), name
 
 
-def test_a_mask_that_hides_nothing_changes_nothing_and_one_that_hides_all_leaves_nothing():
-    model, x = build(), torch.randn(B, T, 3, dtype=torch.float64)
-    a, all_of_it = torch.randn(B, T, D, dtype=torch.float64), torch.ones(B, T, 3, dtype=torch.bool)
-    whole, masked = model.log_joint(x, {"a": a}), model.log_joint({"x": x, "mask": all_of_it}, {"a": a})
-    assert all(torch.equal(value, masked[name]) for name, value in whole.items())
-    assert not dvae.SequenceELBO().terms(model, {"x": x, "mask": ~all_of_it}).bound.any()
-    free = model.impute({"x": x, "mask": ~all_of_it}, samples=3)["x"]
-    assert free.isfinite().all()
-
-
 @pytest.mark.parametrize("components", [1, 3])
 def test_padding_changes_nothing(components):
     model, data, lengths = build(components=components), batch(), [6, 3, 4]
@@ -183,81 +171,7 @@ def test_one_step_at_a_time_is_all_steps_at_once(known):
         torch.testing.assert_close(chosen, features[rows])
 
 
-@pytest.mark.parametrize("components", [1, 2])
-def test_gradients_are_those_of_finite_differences(components):
-    model = build(components=components)
-    network = model.generator["a"].network
-    a = torch.randn(B, T, D, dtype=torch.float64)
-    with torch.enable_grad():
-        for leaves in ([a.requires_grad_()], list(network.parameters())):
-            assert gradcheck(lambda *_: network({"a": a, presence("a"): PRESENT}, T), leaves, atol=1e-4, fast_mode=True)
-    moved = torch.autograd.functional.jacobian(lambda v: network({"a": v, presence("a"): PRESENT}, T), a.detach())
-    read = moved.abs().amax((2, 5)).amax((0, 1)).gt(0)  # of any feature, by sequence and step that is read
-    assert torch.equal(read, PRESENT & (torch.arange(T) < T - 1))
-
-
 # ----------------------------------------------------------------------------------------------- what is drawn of it
-
-
-def left(network, present, a, wanted):
-    """What draws a (S, T, D) at steps `wanted` are beside their mean given what is present, made white."""
-    alpha = torch.ones(a.shape[1], 1).double()
-    here = places(network, wanted, a.shape[1], "a")
-    each = torch.eye(a[0].numel(), dtype=a.dtype).view(-1, *a.shape[1:])  # in which the mean is linear
-    means, covariances = zip(*(given(network, alpha, present, row, here) for row in each), strict=True)
-    away = a[:, wanted].flatten(1) - a.flatten(1) @ torch.stack(means)
-    return torch.linalg.solve_triangular(torch.linalg.cholesky(covariances[0]), away.mT, upper=False)
-
-
-def assert_standard_normal(white):
-    size, n = white.shape
-    assert white.mean(1).abs().max() < 5 / n**0.5
-    assert (white @ white.mT / n - torch.eye(size)).abs().max() < 5 * (2 / n) ** 0.5
-
-
-@pytest.mark.parametrize("row", range(B))
-def test_missing_frames_are_drawn_given_all_others(row):
-    model, data, n = build(components=1), batch(), 4000
-    many = {name: value[row].expand(n, -1, -1) for name, value in data.items()}
-    network, present = model.generator["a"].network, PRESENT[row]
-    site = poutine.trace(model.guide).get_trace(many).nodes["a"]
-    for a in (site["value"], smooth(model, many).a[0]):
-        assert_standard_normal(left(network, present, a, ~present))
-    with torch.enable_grad():  # what a bound reads is the same, and the rest is left as it is
-        torch.manual_seed(0)
-        rough = model.guide(data)["a"]
-    torch.manual_seed(0)
-    fine = model.guide(data)["a"]
-    assert torch.equal((rough == fine).all(-1), PRESENT)
-
-
-@pytest.mark.parametrize("row", range(B))
-def test_forecasts_go_on_from_what_is_there(row):
-    model, data, n = build(components=1), batch(), 4000
-    one = {name: value[row : row + 1] for name, value in data.items()}
-    a = model.forecast(one, horizon=2, samples=n)["a"][:, 0]
-    present = torch.cat([PRESENT[row], torch.zeros(2, dtype=torch.bool)])
-    assert_standard_normal(left(model.generator["a"].network, present, a, torch.arange(T + 2) >= T))
-
-
-def test_missing_frames_are_imputed_from_both_sides():
-    """The imputed x is a linear function of a missing a, whose mean and spread are those of the dense normal."""
-    model, n = build(components=1), 20_000
-    present = torch.tensor([True, True, False, True, True])
-    data = batch(present[None])
-    filled, seen = model.impute(data, samples=n, draw=False)["x"][:, 0], data["mask"][0]
-    assert torch.equal(filled[:, seen], data["x"][0][seen].expand(n, -1))
-    network, out = model.generator["a"].network, model.generator["x"].law.out
-    loc, scale = (p[0][present].flatten() for p in model.encoder["a"]({"x": model.read(data)["x"]}, 1, 5))
-    alpha, here = torch.ones(5, 1).double(), places(network, ~present, 5, "a")
-    _, spread = given(network, alpha, present, torch.zeros(5, D).double(), here)
-    columns = [given(network, alpha, present, e.view(4, D)[[0, 1, 0, 2, 3]], here)[0] for e in torch.eye(8).double()]
-    gain = torch.stack(columns, 1)
-    mean = out.weight @ gain @ loc + out.bias
-    covariance = out.weight @ (gain @ (scale**2).diag() @ gain.mT + spread) @ out.weight.mT
-    largest = covariance.diagonal().max()
-    assert ((filled[:, 2].mean(0) - mean).abs() < 5 * (largest / n) ** 0.5).all()
-    assert (torch.cov(filled[:, 2].T) - covariance).abs().max() < 5 * largest * (2 / n) ** 0.5
 
 
 def linear(model, data):
@@ -296,42 +210,3 @@ def test_bounds_estimate_the_evidence_of_what_was_observed(bound):
     ratio = (found.bound.unflatten(0, (n, B)) - expected).exp()
     assert ratio.std(0).max() < 1
     assert ((ratio.mean(0) - 1).abs() < 4 * ratio.std(0) / n**0.5).all()
-
-
-def test_the_bound_is_that_of_the_marginal():
-    """Its KL is, on average, that of the encoded frames from the dense normal of these alone."""
-    model, data, n = build(components=1), batch(), 4000
-    network = model.generator["a"].network
-    covariance = dense(network, torch.ones(T, 1).double())
-    loc, scale = model.encoder["a"]({"x": model.read(data)["x"]}, B, T)
-    for b in range(B):
-        seen = places(network, PRESENT[b], T, "a")
-        p = MultivariateNormal(torch.zeros(len(seen)).double(), covariance[seen][:, seen])
-        q = MultivariateNormal(loc[b][PRESENT[b]].flatten(), (scale[b][PRESENT[b]] ** 2).flatten().diag())
-        found = dvae.SequenceELBO().terms(model, {name: v[b].expand(n, -1, -1) for name, v in data.items()}).kl["a"]
-        assert abs(found.mean() - kl_divergence(q, p)) < 5 * found.std() / n**0.5
-
-
-@torch.enable_grad()
-def test_a_model_is_fitted_with_frames_missing():
-    data = {name: value.float() if name == "x" else value for name, value in batch(torch.rand(16, 8) < 0.6).items()}
-    model = KVAE(latent=2, auxiliary=3, width=4, hidden=(5,)).build({"x": 3})
-    options = {"accelerator": "cpu", "progress": False, "batch_size": 8}
-    before = dvae.SequenceELBO(num_particles=20).loss(model, model.guide, data)
-    for precision in ("32-true", "bf16-mixed"):
-        dvae.fit(model, data, steps=15, precision=precision, **options)
-    assert all(parameter.isfinite().all() for parameter in model.parameters())
-    assert dvae.SequenceELBO(num_particles=20).loss(model, model.guide, data) < before
-
-
-def test_draws_of_one_sequence_share_what_is_there():
-    model, data = build(components=1), batch()
-    a = model.guide(data, draws={"a": 2})["a"]
-    found = model.log_joint(dict(zip(data, (v.repeat(2, 1, 1) for v in data.values()), strict=True)), {"a": a})
-    together = dvae.SequenceELBO().terms(model, data, draws={"a": 2})
-    assert together.kl["a"].shape == (B,)
-    assert together.steps["a"].shape == (B, T)
-    assert not together.steps["a"][~PRESENT].any()
-    for row, present in enumerate(PRESENT.repeat(2, 1)):
-        expected = evidence(model.generator["a"].network, present, a[row])
-        assert found["a"][row].item() == pytest.approx(expected.item(), abs=1e-8)

@@ -9,8 +9,6 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.distributions.priors import MixtureLaw
-from dvae.models.motion.poses import without_gaps
 from dvae.testing import FactorizationContract
 
 SMALL = {"latent": 4, "width": 8, "hidden": (6, 5)}
@@ -96,15 +94,6 @@ def test_the_loss_is_the_squared_error_the_first_step_and_the_weighted_divergenc
     assert loss.item() == pytest.approx(expected.item(), rel=1e-6)  # the scale is kept in single precision
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_with_the_poses_of_the_papers_the_weight_of_the_divergence_is_theirs(name):
-    for skeleton, weight in ((motion.HUMAN36M, 0.1), (motion.HUMANEVA, 0.01), (motion.WALKER, 0.1)):
-        preset = dvae.method(name).preset(skeleton)
-        assert preset == {"beta": weight, "heading": skeleton is motion.WALKER}
-        assert dvae.method(name).filled(preset).objective().kl_weight == weight
-        assert dvae.method(name, beta=2.0).filled(preset).objective().kl_weight == 2.0
-
-
 def test_best_of_many_pays_for_the_nearest_future_alone(windows):
     model, batch = built(windows, "bom", samples=4), batch_of(windows)
     objective = small("bom", samples=4).train(windows).objective
@@ -135,13 +124,6 @@ def test_decoders_read_their_own_means_in_training_and_gradients_flow_through_th
     assert slope.any()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_future_has_one_summary_of_the_past_for_all_networks(windows, name):
-    model = built(windows, name)
-    (latent,) = model.latents
-    assert model.encoder[latent].network.past is model.generator["x"].network.past
-
-
 def test_perturbations_of_nothing_have_the_squared_error_of_draws_of_the_prior(windows):
     model, batch = built(windows, "rhp"), batch_of(windows)
     torch.manual_seed(1)
@@ -153,44 +135,3 @@ def test_perturbations_of_nothing_have_the_squared_error_of_draws_of_the_prior(w
     loss = small("rhp").train(windows).objective(terms, 0)
     assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
     assert not terms.kl["w"].any()
-
-
-def test_what_perturbs_the_code_is_all_that_futures_differ_by(windows):
-    model, past = built(windows, "rhp"), {"x": batch_of(windows)["x"][:, :5]}
-    spread = model.forecast(past, 7, 6)["x"].var(0)
-    assert (spread > 0).all()
-    with torch.no_grad():
-        model.generator["x"].network.noise.layer.weight.zero_()
-    made = model.forecast(past, 7, 6)["x"]
-    torch.testing.assert_close(made, made[:1].expand(6, -1, -1, -1), rtol=0, atol=1e-12)
-
-
-def test_there_is_no_divergence_to_weigh_without_a_guide():
-    with pytest.raises(ValueError, match=r"beta is 0.1, but rhp's guide is its prior, with no divergence to weigh"):
-        dvae.method("rhp", beta=0.1)
-
-
-def test_gaps_of_the_past_are_bridged(windows):
-    model, batch = built(windows, "cvae"), batch_of(windows)
-    mask = torch.rand(batch["x"][..., ::3].shape, generator=torch.Generator().manual_seed(0)) > 0.3
-    mask = mask.repeat_interleave(3, 2)
-    past, seen = batch["x"][:, :5], mask[:, :5]
-    bridged = without_gaps(windows.skeleton, past, seen)
-    assert torch.equal(bridged[seen], past[seen])
-    w = model.guide(batch)
-    held = model.forecast({"x": past.masked_fill(~seen, torch.nan), "mask": seen}, 7, fix=w)["x"]
-    assert torch.equal(held, model.forecast({"x": bridged}, 7, fix=w)["x"])
-
-
-def test_a_mixture_is_learned_from_prior_draws_too(windows):
-    model = built(windows, "cvae", components=3)
-    assert isinstance(model.generator["w"].law, MixtureLaw)
-    batch = batch_of(windows)
-    dvae.SequenceELBO().terms(model, batch).kl["w"].sum().backward()
-    assert all(parameter.grad.any() for parameter in model.generator["w"].parameters())
-
-
-def test_other_data_are_refused(windows):
-    rooted = windows.with_protocol(replace(windows.protocol, root="relative"))
-    with pytest.raises(ValueError, match="cvae makes poses relative to the pelvis, but the protocol simulated has the"):
-        small("cvae").build(rooted)

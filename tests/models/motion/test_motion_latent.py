@@ -1,18 +1,15 @@
 """The latent space of 4D motion: its two guides, its two phases, and what it makes of bodies."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
 
 import dvae
 from dvae import motion
-from dvae.data.schema import Schema, SchemaError
 from dvae.inference.training.gradnorm import GradNorm
 from dvae.models.motion.motion_latent import PARTS, SURFACE, MotionLatent
 from dvae.motion import bodies
-from dvae.motion.segments.embodied import SHAPE, Segments, SegmentSchema
+from dvae.motion.segments.embodied import SHAPE, Segments
 
 SMALL = MotionLatent(latent=4, widths=(32, 16))
 
@@ -45,13 +42,6 @@ def test_the_published_guide_lacks_the_shape_and_the_other_does_not(segments):
         assert torch.equal(first, other) != shaped
 
 
-def test_without_a_surface_it_is_built_of_sizes():
-    model = SMALL.build(Schema({"turns": 12, "place": 3, "time": 1, SHAPE: 2}, 20))
-    assert model.sample(2, 20, {SHAPE: torch.zeros(2, 2)})["turns"].shape == (2, 20, 12)
-    with pytest.raises(SchemaError, match="sizes missing for turns"):
-        SMALL.build({"x": 3})
-
-
 def test_the_energy_is_the_mean_squared_distance_of_vertices(segments):
     model, batch = made(segments), segments.all()
     torch.manual_seed(0)
@@ -80,30 +70,6 @@ def test_training_has_two_phases_of_adaptive_weights(segments, tmp_path):
     assert last["weight/surface"] != 1
 
 
-@pytest.mark.parametrize(
-    ("finish", "steps", "phases"),
-    [(0.0, 30, {PARTS: 30}), (1.0, 2, {(SURFACE, "time"): 2}), (0.6, 1, {(SURFACE, "time"): 1}), (0.4, 1, {PARTS: 1})],
-)
-def test_a_phase_without_steps_is_left_out(finish, steps, phases, segments):
-    method = MotionLatent(latent=4, widths=(32, 16), finish=finish)
-    recipe = method.train(segments, None, steps)
-    assert {stage.objective.tasks: stage.steps for stage in recipe.stages} == phases
-    assert len(recipe.fit(made(segments, method), batch_size=4, log_every=1, progress=False).history) == steps
-
-
-def test_training_brings_surfaces_nearer(segments):
-    model, batch = made(segments), segments.all()
-
-    def error():
-        made = model.reconstruct(batch)["x"][0]
-        return bodies.vertex_error(*(model.vertices(x, batch[SHAPE]) for x in (made, batch["x"]))).mean()
-
-    before = error()
-    SMALL.train(segments, None, 120).fit(model, batch_size=16, learning_rate=3e-3, progress=False)
-    model.eval()
-    assert error() < before / 2
-
-
 def test_segments_are_a_source_whose_frames_go_back_to_motion(segments):
     batch = segments.all()
     assert batch["x"].shape[1:] == (100, segments.timed.size)
@@ -118,14 +84,3 @@ def test_segments_are_a_source_whose_frames_go_back_to_motion(segments):
     joints = segments.body.regressor @ segments.body.at_rest(batch[SHAPE])[0]
     assert surface.shape == (len(segments), 100, 1486, 3)
     assert joints.shape == (len(segments), 22, 3)
-
-
-def test_a_schema_goes_through_json(people, segments):
-    references = motion.reference_cycles(people)
-    timed = motion.TimedFrames.of(segments.motion, frames=20, scaling="deviation", references=references)
-    schema = Segments(segments.motion, timed).schema
-    read = SegmentSchema.from_config(json.loads(json.dumps(schema.config())))
-    assert read.sizes == schema.sizes
-    assert read.timed.skeleton == timed.skeleton
-    x = timed.to(segments.motion)["x"]
-    torch.testing.assert_close(read.timed.to(segments.motion)["x"], x, rtol=0, atol=0)
