@@ -117,16 +117,3 @@ def test_values_that_do_not_vary_are_whitened_too():
     assert torch.isfinite(log_det).all()
     flow.whiten(torch.zeros(10, 5))
     assert torch.isfinite(flow.to_noise(torch.zeros(5))[0]).all()
-
-
-@pytest.mark.parametrize(
-    ("run", "message"),
-    [
-        (lambda: start(0), "layers"),
-        (lambda: start(5).to_noise(torch.zeros(2, 4)), "takes"),
-        (lambda: start(5).whiten(torch.zeros(5, 5)), "values"),
-    ],
-)
-def test_what_it_refuses(run, message):
-    with pytest.raises(ValueError, match=message):
-        run()

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-import pyro
 import pyro.distributions as dist
 import pytest
 import torch
@@ -12,9 +11,7 @@ import dvae
 from dvae import distributions
 from dvae.data.views import View
 from dvae.distributions import Shape
-from dvae.factorization.notation import Factorization
-from dvae.networks import Dense, Recurrent
-from dvae.program.conditional import Conditional
+from dvae.networks import Recurrent
 
 LAWS = {
     "normal": distributions.Normal(),
@@ -85,28 +82,6 @@ def test_scales_stay_above_their_minimum(spec):
     scale = law(torch.zeros(1, D))[1]
     assert scale.min() >= 0.2
     assert torch.isfinite(law.distribution(law(torch.zeros(1, D))).log_prob(torch.full((1, D), 1e3))).all()
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: distributions.StudentT(df=2.0).build(SHAPE), "variance"),
-        (lambda: distributions.FixedNormal(project=False).build(Shape(D, 3)), "features"),
-        (lambda: distributions.FixedNormal(scale=0.0).build(SHAPE), "scale is positive, got 0.0"),
-        (lambda: distributions.FixedNormal(steps=2).build(Shape(D, D, local=False)), "variable"),
-        (lambda: distributions.FixedNormal(steps=2).build(SHAPE)(torch.zeros(B, T, D)), "given"),
-    ],
-)
-def test_refusals(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
-@pytest.mark.parametrize("equation", ["p(x_t | z_t)", "p(x | z)"])
-def test_a_residual_law_needs_the_previous_value(equation):
-    factor = Factorization.parse(equation).factors[0]
-    with pytest.raises(ValueError, match="residual"):
-        Conditional(factor, {"x": D, "z": D}, Dense(), distributions.Normal(residual=True), generative=True)
 
 
 # -------------------------------------------------------------------------------------------- families of one's own
@@ -192,17 +167,3 @@ def test_latents_whose_draws_have_no_gradient_are_refused():
 def test_events_of_some_coordinates_are_refused(place):
     with pytest.raises(ValueError, match="either"):
         model(**{place: Pairs})
-
-
-def test_discrete_data_have_a_law_of_their_own():
-    binary = model(px=Bernoulli)
-    x = torch.bernoulli(torch.full((3, 5, 2), 0.5))
-    bound = dvae.SequenceELBO().terms(binary, x).bound.sum()
-    bound.backward()
-    assert all(p.grad is not None for p in binary.encoder.parameters())
-    drawn = binary.sample(4, length=6)
-    assert set(drawn["x"].unique().tolist()) <= {0.0, 1.0}
-    site = pyro.poutine.trace(binary.model).get_trace(length=3).nodes
-    assert not site["x"]["fn"].has_rsample
-    assert site["z"]["fn"].has_rsample
-    assert site["z"]["value"].requires_grad

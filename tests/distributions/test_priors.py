@@ -22,7 +22,6 @@ PRIORS = {
     "vamp": distributions.Vamp(components=3, steps=4),
     "flow": distributions.Flow(),
 }
-SIZES = {"w": 2, "z": 2, "x": 2}
 PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
 
 
@@ -130,32 +129,6 @@ def test_the_density_of_a_flow_is_that_of_its_noise_over_the_volume_it_takes(siz
         volume = torch.autograd.functional.jacobian(move, noise).slogdet()[1]
         expected = torch.distributions.Normal(0.0, 1.0).log_prob(noise).sum() - volume
         torch.testing.assert_close(flow.log_prob(move(noise)), expected)
-
-
-@pytest.mark.parametrize(
-    ("guide", "not_this"),
-    [("q(w | x_{1:T}, z_{1:T})", r"q\(w \| x_\{1:T\}, z_"), ("q(w)", r"q\(w\)"), (None, "the prior itself")],
-)
-def test_a_vamp_needs_a_guide_of_data_alone(guide, not_this):
-    message = (
-        r"a Vamp of w needs a guide that reads the data x over time and nothing else, such as q\(w \| x_\{1:T\}\), not "
-    )
-    with pytest.raises(ValueError, match=message + not_this):
-        DynamicalVAE(PAIR[0], guide and f"{guide} q(z_t | x_{{1:T}})", SIZES, laws={"p(w)": distributions.Vamp()})
-
-
-@pytest.mark.parametrize("law", [distributions.Mixture()])
-@pytest.mark.parametrize(
-    ("key", "what"),
-    [("p(v)", "v is data"), ("p(z)", "parents"), ("q(w)", "w has parents"), ("p(u)", "u has a value at every step")],
-)
-def test_a_prior_is_of_a_static_latent_without_parents(law, key, what):
-    p, q = (
-        "p(v) p(w) p(u_t) p(z_t | z_{t-1}, w) p(x_t | v, u_t, z_t)",
-        "q(w | x_{1:T}) q(u_t | x_t) q(z_t | x_{1:T}, w)",
-    )
-    with pytest.raises(ValueError, match=what):
-        DynamicalVAE(p, q, {**SIZES, "u": 2, "v": 2}, observed=("x", "v"), laws={key: law})
 
 
 # ------------------------------------------------------------------------------------------------------- in a run

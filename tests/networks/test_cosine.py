@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 from dvae.factorization.relations import Relation
 from dvae.networks import CosineDecoder, CosineEncoder
 from dvae.networks.base import Input
-from dvae.networks.cosine import Dropout, TransformerLayer, positions
+from dvae.networks.cosine import Dropout, positions
 
 ALL, LENGTH = Relation.parse("1:T"), 7
 SMALL = {"width": 6, "feedforward": 10, "heads": 2, "layers": 2}
@@ -82,18 +82,6 @@ def test_the_two_forms_are_one_function(made):
     assert torch.allclose(torch.stack(steps, 1), net(given, LENGTH), atol=1e-10, rtol=0)
 
 
-def test_a_layer_in_training_is_torchs():
-    layer = TransformerLayer(8, 2, 6, 0.0, batch_first=True).double()
-    x = torch.randn(3, 5, 8, dtype=torch.float64, requires_grad=True)
-    found = []
-    for forward in (layer.train(), lambda x: torch.nn.TransformerEncoderLayer.forward(layer, x), layer.eval()):
-        out = forward(x)
-        found.append((out, *torch.autograd.grad(out.sin().sum(), [x, *layer.parameters()])))
-        assert len(found[-1]) == 14
-    for other in found[1:]:
-        torch.testing.assert_close(other, found[0])
-
-
 def test_dropout_leaves_out_the_share_that_it_says():
     """Each unit apart, whatever their number, scaled to keep the mean; the same ones in the gradient."""
     torch.manual_seed(0)
@@ -111,17 +99,3 @@ def test_dropout_leaves_out_the_share_that_it_says():
     for share, kept in ((0.0, 1), (1.0, 0)):
         assert torch.equal(Dropout(share)(x), kept * x)
     assert torch.equal(Dropout(0.5).eval()(x), x)
-
-
-@pytest.mark.parametrize(
-    ("run", "message"),
-    [
-        (lambda: encoder()(values(), LENGTH, torch.tensor([7, 7, 3])), "this is a ragged batch"),
-        (lambda: decoder().start({"s": values()["s"]}, 3, LENGTH), "cannot be in a loop with z"),
-        (lambda: CosineEncoder(**SMALL).build([Input("s", 9)], True, 4), "given"),
-        (lambda: CosineDecoder(**SMALL).build([Input("z", 4, ALL), Input("s", 8)], True, 9), "s of size 8"),
-    ],
-)
-def test_what_they_refuse(run, message):
-    with pytest.raises(ValueError, match=message):
-        run()

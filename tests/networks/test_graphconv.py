@@ -37,12 +37,6 @@ def test_the_basis_is_scipys_orthonormal_transform():
     assert torch.allclose(rows @ rows.T, torch.eye(4, dtype=torch.float64), atol=1e-14, rtol=0)
 
 
-@pytest.mark.parametrize("coefficients", [0, 8])
-def test_a_sequence_has_as_many_coefficients_as_steps(coefficients):
-    with pytest.raises(ValueError, match="coefficients"):
-        cosine_basis(7, coefficients)
-
-
 def published(net, values):
     """The card's definition, step by step: padded history, transformed, with the earlier part in its place."""
     batch, C = len(values["b"]), net.spec.coefficients
@@ -85,47 +79,6 @@ def test_step_by_step_is_all_at_once():
     state = net.start(values, 3, LENGTH)
     steps = [net.step(state, t, {})[0] for t in range(LENGTH)]
     assert torch.equal(torch.stack(steps, 1), net(values, LENGTH))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda: network()(parents(), LENGTH - 1), "sequences"),
-        (lambda: network()(parents(), LENGTH, torch.tensor([9, 9, 3])), "this is a ragged batch"),
-        (lambda: network().start({"h": parents()["h"]}, 3, LENGTH), "cannot"),
-        (lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 12, ALL)], True, 6), "h has size 12"),
-        (
-            lambda: GraphConv(EVERYTHING, "lower", 9, 3).build([Input("h", 15, Relation.parse("<t"))], True, 6),
-            r"not h at \{<t\}",
-        ),
-    ],
-)
-def test_what_it_cannot_do(change, message):
-    with pytest.raises(ValueError, match=message):
-        change()
-
-
-def test_it_generates_in_a_model_of_ones_own():
-    """The network with a likelihood: any factorization takes it."""
-    model = dvae.DynamicalVAE(
-        "p(a) p(lower_t | h_{1:O}, a) p(upper_t | h_{1:O}, lower_{1:T})",
-        "q(a | lower_{1:T}, upper_{1:T})",
-        {"a": 2, "h": 15, "lower": 6, "upper": 9},
-        {f"p({name})": GraphConv(EVERYTHING, name, LENGTH, 3, 6, 1) for name in ("lower", "upper")},
-        {
-            "default": dvae.distributions.Normal(),
-            "p(lower)": dvae.distributions.FixedNormal(0.1),
-            "p(upper)": dvae.distributions.FixedNormal(0.1),
-        },
-        view=PARTS,
-        masks={"1:O": lambda T: np.arange(T)[None] < OBSERVED},
-    )
-    x = torch.randn(4, LENGTH, 15)
-    assert model.likelihood
-    assert torch.isfinite(dvae.SequenceELBO().terms(model, x).bound).all()
-    forecast = model.forecast(x[:, :OBSERVED], LENGTH - OBSERVED, 2)
-    assert forecast["x"].shape == (2, 4, LENGTH - OBSERVED, 15)
-    assert torch.equal(forecast["x"][..., PARTS.parts["lower"]], forecast["lower"])
 
 
 def generator(**options):

@@ -57,12 +57,3 @@ def test_scales_are_above_zero_where_there_is_a_step():
     )
     loss.backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
-
-
-def test_what_does_not_go_together_is_refused():
-    sizes = {"z": 2, "x": 3, "s": 2}
-    pair = "p(z_t) p(x_t | z_t, s_t)", "q(z_t | x_t)"
-    with pytest.raises(ValueError, match="reads"):
-        dvae.DynamicalVAE(*pair, sizes, {"p(x)": WithNoise("s", Dense((4,)))}, {"p(x)": KnownNoise()})
-    with pytest.raises(ValueError, match="distributions"):
-        dvae.DynamicalVAE(*pair, {**sizes, "s": 3}, {"p(x)": WithNoise("s", Dense((4,))), "q": Dense((4,))})

@@ -1,7 +1,6 @@
 """The linear SDE: its transitions are those of the equation, over the shortest and the longest gaps."""
 
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
 
@@ -12,12 +11,11 @@ from scipy import integrate, linalg
 from torch.autograd import gradcheck
 from torch.distributions import MultivariateNormal
 
-import dvae
 from dvae import DynamicalVAE, distributions
 from dvae.factorization.relations import Relation
-from dvae.networks import Dense, Input, LinearSDE, LinearSDEGuide, Network, Recurrent
+from dvae.networks import Dense, Input, LinearSDE, LinearSDEGuide, Recurrent
 from dvae.networks.base import share_modules
-from dvae.networks.sde import Equation, transition
+from dvae.networks.sde import transition
 from dvae.testing import FactorizationContract
 
 PAIR = "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T}, d_{1:T})"
@@ -125,23 +123,6 @@ def test_padding_has_no_gap():
         sde({"z": z, "d": d}, 5)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda: DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_t)", {"z": 2, "x": 2}, LinearSDE()),
-            "parents",
-        ),
-        (lambda: DynamicalVAE(*PAIR, {"z": 2, "x": 2, "d": 1}, {"p(z)": LinearSDE()}), "parameters"),
-        (lambda: Equation(2, (0.0, 1.0)), "positive"),
-        (lambda: DynamicalVAE(*PAIR, {"z": 2, "x": 2, "d": 1}, {"q": LinearSDEGuide(gap="x")}), "child"),
-    ],
-)
-def test_what_does_not_fit_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 # --------------------------------------------------------------------------------------------------- in the engine
 
 
@@ -195,18 +176,6 @@ def kernel(built, times):
     return found.view(steps * size, -1)
 
 
-def dense(built, times, kept=slice(None)):
-    """The law of x at these times (T,), of the steps that are kept; and C, b and R of x = C z + b + noise."""
-    emission = built.generator["x"].law
-    c, b = emission.out.weight.detach(), emission.out.bias.detach()
-    r = (2 * emission.log_scale).exp().diag().expand(len(times), -1, -1)
-    seen = torch.block_diag(*[c] * len(times))
-    law = MultivariateNormal(b.repeat(len(times)), seen @ kernel(built, times) @ seen.mT + torch.block_diag(*r))
-    places = torch.arange(len(b) * len(times)).view(len(times), -1)[kept].flatten()
-    marginal = MultivariateNormal(law.mean[places], law.covariance_matrix[places][:, places])
-    return marginal, (c, b, r[0])
-
-
 def gaps_of(times, n=1):
     """(n, T, 1)."""
     return times.diff(prepend=times[:1])[None, :, None].expand(n, -1, -1)
@@ -241,68 +210,6 @@ def test_a_forecast_goes_over_the_gaps_that_it_is_given():
 
 
 # ----------------------------------------------------------------------------------------------------- of the guide
-
-
-@dataclass(frozen=True)
-class Told:
-    """Potentials that are what they are, (1, T, H), whatever the parents."""
-
-    features: torch.Tensor
-
-    def build(self, inputs, local, size):
-        return ToldNetwork(self, inputs)
-
-
-class ToldNetwork(Network):
-    def __init__(self, spec, inputs):
-        super().__init__(inputs, True, spec.features.shape[-1])
-        self.told = spec.features
-
-    def forward(self, parents, length, lengths=None):
-        return self.told.expand(len(parents["x"]), -1, -1)
-
-
-def potential(information, pull):
-    """Of N(e; W'z, I) for exp(h'z - z'Gz/2): W = root of G, e = W^-1 h; as features (D + D * D)."""
-    root = torch.linalg.cholesky(information)
-    return torch.cat([torch.linalg.solve(root, pull), root.flatten()])
-
-
-def exact(built, times, x):
-    """Features that make a guide the posterior: at every step, what all x from there on say of z."""
-    _, (c, b, r) = dense(built, times)
-    moves, whitening = (part[0] for part in built.generator["z"].network.equation.at_all(gaps_of(times), None, "d"))
-    spread = torch.linalg.inv(whitening.mT @ whitening)
-    weighted, rows, eye = c.mT @ torch.linalg.inv(r), [], torch.eye(2).double()
-    information, pull = torch.zeros(2, 2).double(), torch.zeros(2).double()
-    for t in range(len(times) - 1, -1, -1):
-        if t + 1 < len(times):
-            rest = moves[t + 1].mT @ torch.linalg.inv(eye + information @ spread[t + 1])
-            information, pull = rest @ information @ moves[t + 1], rest @ pull
-        information, pull = information + weighted @ c, pull + weighted @ (x[t] - b)
-        rows.append(potential(0.5 * (information + information.mT), pull))
-    return torch.stack(rows[::-1])[None]
-
-
-@pytest.mark.parametrize("steps", [1, 7])
-def test_the_guide_of_a_linear_model_s_messages_is_its_posterior(steps):
-    built, times, x = model(), irregular(steps), double(steps, 3)
-    with torch.no_grad():
-        features = exact(built, times, x)
-    spec = LinearSDEGuide(Told(features), (0.5, 8.0))
-    networks, given = {**built.networks, "q": spec}, {**built.laws, "q": distributions.Triangular()}
-    guided = DynamicalVAE(*PAIR, {"z": 2, "x": 3, "d": 1}, networks, given).double()
-    guided.generator.load_state_dict(built.generator.state_dict())
-    share_modules([guided.generator["z"].network, guided.encoder["z"].network], "equation")
-    guide = guided.encoder["z"].network
-    guide.out = torch.nn.Identity()
-    evidence = dense(built, times)[0].log_prob(x.flatten())
-    batch = {"x": x.expand(5, -1, -1), "d": gaps_of(times, 5)}
-    for found in (
-        dvae.importance_bound(guided, batch, 1).bound,
-        dvae.particle_bound(guided, batch, 3, resample_below=0).bound,  # on the way weights differ: it knows the future
-    ):
-        torch.testing.assert_close(found, evidence.expand(5), rtol=0, atol=1e-8)  # of every draw
 
 
 def guide(**options):

@@ -1,6 +1,5 @@
 """Perceptrons over whole sequences: the laws of every model, one of them for all that is made, what is refused."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -48,20 +47,3 @@ def test_longer_sequences_than_it_is_made_for_are_refused():
     data = {**{name: torch.randn(4, 6, 2) for name in NAMES}, "s": torch.randn(4, 2)}
     with pytest.raises(ValueError, match="steps"):
         dvae.SequenceELBO().terms(model, data)
-
-
-@pytest.mark.parametrize(
-    ("generative", "inference", "message"),
-    [
-        ("p(z) p(x_t | x_{t-1}, z)", "q(z | x_{1:T})", "of static parents alone"),
-        ("p(z_t) p(x_t | z_t)", "q(z_t | x_{1:T})", "static"),
-        ("p(z) p(x_t | z)", "q(z | x_{1:3})", "not all of x may be read"),
-    ],
-)
-def test_other_factors_are_refused(generative, inference, message):
-    if "1:3" in inference:
-        inference = dvae.Factorization.parse(inference, {"1:3": lambda length: np.arange(length)[None] < 3})
-    with pytest.raises(ValueError, match=message):
-        dvae.DynamicalVAE(
-            generative, inference, {"z": 2, "x": 2}, network={"p(x)": WholeDecoder(5), "q(z)": WholeEncoder(5)}
-        )

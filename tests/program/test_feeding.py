@@ -1,7 +1,5 @@
 """What stands in for the data's history in training: which steps read the truth, and what noise they read it with."""
 
-import math
-
 import pytest
 import torch
 from pyro import poutine
@@ -93,12 +91,6 @@ def test_a_forecast_takes_what_was_observed_at_once(pair, network, monkeypatch):
     torch.testing.assert_close(*found, rtol=0, atol=1e-10)
 
 
-def test_blocks_that_are_none_are_refused():
-    for blocks in ((0, 5), (5,)):
-        with pytest.raises(ValueError, match="replaced"):
-            SelfFeeding(1.0, blocks=blocks)
-
-
 # -------------------------------------------------------------------------------------------------------------- noise
 
 
@@ -117,12 +109,6 @@ def test_what_is_read_has_noise_in_its_unit_and_what_is_scored_has_none():
     known = {**rollout.values, "x": x + noise}
     expected = model.generator["x"].law.distribution(model.generator["x"](known, len(x), T)).log_prob(x)
     torch.testing.assert_close(rollout.evaluate("x", x).log_prob(x), expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("scale", [-0.1, math.nan])
-def test_a_scale_that_is_none_is_refused(scale):
-    with pytest.raises(ValueError, match="finite"):
-        InputNoise(scale)
 
 
 def test_a_number_is_a_level_of_how_the_model_is_fed():

@@ -1,9 +1,6 @@
 """Latents that groups share: one value for a group, its density once, and the evidence of the group as a whole."""
 
-import math
-
 import pyro
-import pytest
 import torch
 from pyro import poutine
 from pyro.infer import Trace_ELBO
@@ -131,16 +128,3 @@ def test_forecasts_of_a_group_share_a_draw_in_each_sample():
     assert torch.equal(g[:, 0], g[:, 2])
     assert len(g[:, 0].unique(dim=0)) == 5
     assert model.reconstruct(batch, 3)["x"].shape == (3, 6, 4, 3)
-
-
-def test_what_is_not_of_a_group_is_refused():
-    with pytest.raises(ValueError, match="latents"):
-        dvae.DynamicalVAE(*EQUATIONS, SIZES, Recurrent(4), grouped=("z",))
-    with pytest.raises(ValueError, match="sequences"):
-        dvae.DynamicalVAE(*EQUATIONS, SIZES, Recurrent(4), grouped=("w",))
-    model = build()
-    with pytest.raises(ValueError, match="particles"):
-        dvae.particle_bound(model, data(), particles=3)
-    with pytest.raises(ValueError, match=r"group is torch.float64"):
-        model.guide(data(group=INDEX.float()))
-    assert math.isfinite(float(dvae.particle_bound(model, {"x": data()["x"]}, particles=3).bound.sum()))

@@ -118,11 +118,3 @@ def test_particles_make_up_for_what_a_guide_gets_wrong(generative, sizes):
     alone, chosen = ([judged(model, sizes, 200, count).abs().max() for model in models] for count in (1, 500))
     assert max(alone) > MOST
     assert max(chosen) < MOST
-
-
-def test_particles_choose_among_draws_by_a_likelihood():
-    model, x = built("p(x_t | x_{t-1})", None, x=2), torch.randn(1, T, 2)
-    batch = {"x": x, "mask": SEEN[None]}
-    for particles, draw in ((0, True), (2, False)):
-        with pytest.raises(ValueError, match=f"particles is {particles}; it is at least 1, and more choose"):
-            model.impute(batch, 3, draw=draw, particles=particles)

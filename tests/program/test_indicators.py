@@ -47,11 +47,6 @@ def test_an_indicator_is_read_where_its_entry_is(network, relation):
         assert torch.equal((slope[:, 0] != 0).any(-1), shown)
 
 
-def test_indicators_are_of_data():
-    with pytest.raises(ValueError, match="indicators tell"):
-        model(indicators=("z",))
-
-
 # ------------------------------------------------------------------------------------------ entries that are hidden
 
 

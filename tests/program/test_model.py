@@ -11,8 +11,6 @@ from pyro import poutine
 from pyro.infer import Predictive, Trace_ELBO
 
 from dvae import DynamicalVAE, distributions
-from dvae.data import views
-from dvae.inference.bounds.elbo import SequenceELBO
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import in_chunks
 from dvae.program.reference import reference
@@ -111,13 +109,6 @@ def test_the_program_is_an_ordinary_pyro_program(pair):
         assert torch.isfinite(loss)
 
 
-def test_conditioning_data_of_an_interleaved_loop_is_refused_after_the_fact():
-    model = build("srnn")
-    x = torch.randn(B, T, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match="value after"):
-        poutine.condition(model.model, data={"x": x})(length=T, size=B)
-
-
 # --------------------------------------------------------------------------------- one joint, many ways to it
 
 
@@ -210,12 +201,7 @@ def means(model, values):
 
 @pytest.mark.parametrize(
     ("pair", "network", "chunk"),  # chunks are less than the sequences, or more than all there is
-    [
-        (pair, network, (2, 2048)[(m + n) % 2])
-        for m, pair in enumerate(PAIRS)
-        for n, network in enumerate(NETWORKS)
-        if pair != "rvae"
-    ],
+    [(pair, network, (2, 2048)[n % 3 // 2]) for n, (pair, network) in enumerate(CASES) if pair != "rvae"],
 )
 def test_a_forecast_continues_the_past_by_the_models_own_means(pair, network, chunk):
     model = build(pair, network)
@@ -232,16 +218,6 @@ def test_a_forecast_continues_the_past_by_the_models_own_means(pair, network, ch
         for name, mean in means(model, values).items():
             torch.testing.assert_close(out[name][s], mean[:, past:].detach(), rtol=0, atol=1e-9)
     assert not torch.equal(out["x"][0], out["x"][1])
-
-
-def test_a_batch_without_the_context_that_a_factor_reads_is_refused():
-    model = build("context")
-    data = draw(model)
-    for name, shape in (("c", r"c \(B, T, 1\)"), ("pose", r"pose \(B, 2\)")):
-        rest = {n: value for n, value in data.items() if n != name}
-        for run in (model.guide, model.model, partial(model.forecast, horizon=1), model.reconstruct):
-            with pytest.raises(ValueError, match=rf"\) reads {shape}, context that the batch has to give; it holds x"):
-                run(rest)
 
 
 @given(size=st.integers(1, 7), samples=st.integers(1, 7), chunk=st.integers(1, 50))
@@ -298,22 +274,6 @@ def test_feeding_on_ones_own_means(pair, network, residual):
     assert not torch.allclose(some["x"], exact["x"])
 
 
-def test_gradients_flow_back_in_time_through_fed_means():
-    """The exact loop and T parallel passes have one gradient; without, that of the fed history as data."""
-    model = build("srnn").double()
-    x = torch.randn(2, T, model.sizes["x"], dtype=torch.float64)
-
-    def gradients(feeding):
-        torch.manual_seed(0)
-        loss = SequenceELBO().differentiable_loss(model, model.guide, x, self_feeding=feeding)
-        return torch.autograd.grad(loss, list(model.generator.parameters()), allow_unused=True)
-
-    loop, passes = (gradients(SelfFeeding(1.0, passes)) for passes in (None, T))
-    detached = gradients(SelfFeeding(1.0, gradient=False))
-    torch.testing.assert_close(loop, passes, rtol=1e-9, atol=1e-9)
-    assert any(not torch.allclose(a, b) for a, b in zip(loop, detached, strict=True) if a is not None)
-
-
 # ------------------------------------------------------------------------------------------ parameters of one's own
 
 
@@ -328,64 +288,3 @@ def test_networks_and_laws_are_chosen_by_factor():
     assert type(model.generator["x"].law).__name__ == "StudentTLaw"
     assert type(model.generator["z"].law).__name__ == "NormalLaw"
     assert type(model.encoder["z"].law).__name__ == "FixedNormalLaw"
-
-
-# ------------------------------------------------------------------------------------------------------ errors
-
-X = torch.zeros(B, T, 3, dtype=torch.float64)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"sizes": {"z": 2}}, "missing"),
-        ({"sizes": {"z": 2, "x": 3, "y": 1}}, "equations have"),
-        ({"sizes": {"z": 0, "x": 3}}, "least"),
-        ({"sizes": {"z": 10**9, "x": 3}}, "least"),
-        ({"sizes": {"z": "2", "x": 3}}, "number"),
-        ({"sizes": 3}, "expected"),
-        ({"network": Dense}, "description such"),
-        ({"view": views.View}, "expected"),
-        ({"network": "gru"}, "description such"),
-        ({"laws": {"p(z)": distributions.Mixture()}}, "latents"),
-    ],
-)
-def test_models_that_cannot_be(change, message):
-    base = {"generative": PAIRS["dkf"][0], "inference": PAIRS["dkf"][1], "sizes": {"z": 2, "x": 3}}
-    with pytest.raises((TypeError, ValueError), match=message):
-        DynamicalVAE(**{**base, **change})
-
-
-@pytest.mark.parametrize(
-    ("run", "message"),
-    [
-        (lambda m: m.model(X[..., :2]), "expected"),
-        (lambda m: m.model(X[:, :0]), "steps"),
-        (lambda m: m.model({"x": X, "label": X}), "expected some"),
-        (lambda m: m.model({"x": X, "z": X[:2, :, :2]}), "different numbers"),
-        (lambda m: m.model(), "neither"),
-        (lambda m: m.model(length=0), "length is at least 1, got 0"),
-        (lambda m: m.model(X, length=4), "expected"),
-        (lambda m: m.model({"x": X[:, :4], "z": X[..., :2]}), "different numbers"),
-        (lambda m: m.model({"x": X, "mask": X}), "expected bool"),
-        (lambda m: m.model({"x": X, "mask": {"y": X == 0}}), "batch holds"),
-        (lambda m: m.model({"x": X, "lengths": torch.tensor([5, 6, 1])}), "lengths must"),
-        (lambda m: m.model(X / 0), "entries"),
-        (lambda m: m.guide({"z": X[..., :2]}), "guide reads"),
-        (lambda m: m.forecast({"x": X, "lengths": torch.tensor([5, 5, 5])}, 2), "continues sequences"),
-        (lambda m: m.forecast(X, 0), "horizon"),
-    ],
-)
-def test_batches_and_calls_that_cannot_be(run, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        run(build("dkf"))
-
-
-def test_a_sequence_refuses_vectorised_particles():
-    trace = poutine.trace(build("dkf").model).get_trace(X)
-    law = trace.nodes["z"]["fn"]
-    assert (law.batch_shape, law.event_shape) == ((B,), (T, 2))
-    with pytest.raises(NotImplementedError, match="draws"):
-        law.sample(torch.Size([2]))
-    with pytest.raises(NotImplementedError, match="expanded"):
-        law.expand((2, B))

@@ -14,8 +14,7 @@ from pyro.infer import Trace_ELBO
 from torch.distributions.transforms import ReshapeTransform
 
 from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, model_arrow_prices, model_price, price, twin
-from dvae.data.units import Coordinate
-from dvae.distributions import FixedNormal, Mixture, StandardNormal
+from dvae.distributions import FixedNormal, StandardNormal
 from dvae.factorization.notation import Factorization
 from dvae.networks import Linear
 from dvae.testing.strategies import factorizations
@@ -337,37 +336,6 @@ def test_what_another_arrow_can_carry_costs_nothing():
     assert found["x_{<t} to x_t"].min() > 1e-3
 
 
-@settings(max_examples=15)
-@given(factorizations(), st.integers(0, 999), st.data())
-def test_two_arrows_cost_at_least_what_one_costs_which_is_no_less_than_nothing(pair, seed, chosen):
-    whole = Factorization.parse(pair[0])
-    order = chosen.draw(st.permutations(whole.arrows))[:2]
-    sizes = dict.fromkeys(whole.variables, 1) | {"x": 2}
-    costs, less = [0.0], whole
-    for arrow in order:
-        less = less.without(*arrow)
-        costs.append(float(model_price(whole, less, sizes, steps=3, seeds=1)[0]))
-    assert costs == pytest.approx(sorted(costs), abs=1e-8)
-
-
-def test_prices_of_models_with_context():
-    driven, sizes = "p(z_t | c_t) p(x_t | z_t)", {"z": 1, "x": 1, "c": 1}
-    assert price(driven, "q(z_t | x_t, c_t)", sizes, steps=3, seeds=2).max() < 1e-8
-    assert price(driven, "q(z_t | x_t)", sizes, steps=3, seeds=2).min() > 1e-4
-    model = twin("p(c_t) p(x_t | c_t)", None, {"x": 1, "c": 1}, 3, 0, ("x", "c"))
-    slopes = model.generator["x"].network.weight("c", 3).detach().squeeze().diagonal()
-    scales = model.generator["x"].law.log_scale.detach().exp().squeeze()
-    expected = float(torch.log1p((slopes / scales) ** 2).sum()) / 2
-    assert float(model_price("p(x_t | c_t)", "p(x_t)", {"x": 1, "c": 1}, 3, 1)) == pytest.approx(expected, abs=1e-9)
-
-
-def test_prices_of_what_is_no_reduced_model():
-    with pytest.raises(ValueError, match="variables"):
-        model_price(DKF, "p(x_t)", {"z": 1, "x": 1})
-    with pytest.raises(ValueError, match="least"):
-        model_price(DKF, DKF, {"z": 1, "x": 1}, steps=0)
-
-
 def with_prior(law):
     parts = {"default": FixedNormal(project=False), "p(w)": law}
     return DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 1}, Linear(T), parts).double()
@@ -383,22 +351,3 @@ def test_a_learned_normal_prior_is_part_of_the_evidence():
     covariance = 0.36 * slopes @ slopes.T + torch.eye(T, dtype=torch.float64)
     expected = dist.MultivariateNormal(mean, covariance).log_prob(x[..., 0])
     torch.testing.assert_close(Oracle(model, T).evidence(x), expected, rtol=0, atol=1e-6)
-
-
-def test_models_that_the_oracle_does_not_know():
-    with pytest.raises(ValueError, match="networks"):
-        Oracle(DynamicalVAE(*PAIRS["dkf"], {"z": 1, "x": 1}).double(), T).gap()
-    for call, said in (((build("dkf"), "4"), "steps is .4."), ((DynamicalVAE, 4), "is the class DynamicalVAE")):
-        with pytest.raises(TypeError, match=said):
-            Oracle(*call)
-    driven = ("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | x_{1:T})")
-    with pytest.raises(ValueError, match="no law of the context c"):
-        Oracle(twin(*driven, {"z": 1, "x": 1, "c": 1}, T), T)
-    with pytest.raises(ValueError, match="without parents"):
-        Oracle(with_prior(Mixture()), T).gap()
-    model = build("dkf")
-    with pytest.raises(ValueError, match="oracle"):
-        Oracle(model, T).evidence(torch.zeros(2, 3, 1))
-    model.standardise("z", [Coordinate(floor=0.1)])
-    with pytest.raises(ValueError, match="logarithms"):
-        Oracle(model, T).gap()

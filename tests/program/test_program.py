@@ -14,10 +14,10 @@ import torch
 from pyro.infer import SVI, Trace_ELBO
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, twin
+from dvae import DynamicalVAE, SequenceELBO
 from dvae.inference.bounds.particles import Filter
 from dvae.models.method import LatentMethod
-from dvae.networks import Attention, Linear, Recurrent
+from dvae.networks import Attention, Recurrent
 from dvae.testing import FactorizationContract
 from dvae.turns import alone
 
@@ -103,33 +103,6 @@ class RowMask(FactorizationContract):
 
 class TestRowMaskOfAttention(RowMask):
     network = Attention(8, 2)
-
-
-class TestRowMaskOfLinear(RowMask):
-    network = Linear(12)
-
-
-# ------------------------------------------------------------------------------------------------------ self-feeding
-
-
-@pytest.mark.parametrize("order", ["p(x_t | z_t, y_{<t}) p(y_t | x_{<=t})", "p(y_t | z_t, x_{<t}) p(x_t | y_{<=t})"])
-def test_as_many_passes_as_steps_are_exact_where_data_read_each_other(order):
-    steps = 4
-    sizes = {"z": 1, "x": 1, "y": 1}
-    model = twin(f"p(z_t | x_{{t-1}}) {order}", "q(z_t | x_{1:T})", sizes, steps, observed=("x", "y"))
-    batch = {name: torch.randn(3, steps, 1).double() for name in "xy"}
-    z = {"z": torch.randn(3, steps, 1).double()}
-
-    def log_joint(**options: Any) -> torch.Tensor:
-        program = pyro.poutine.condition(model.model, data=z)
-        return pyro.poutine.trace(program).get_trace(batch, **options).log_prob_sum()
-
-    exact = log_joint(self_feeding=dvae.SelfFeeding(1.0))
-    torch.testing.assert_close(log_joint(self_feeding=dvae.SelfFeeding(1.0, passes=steps)), exact)
-
-    batch["mask"] = {name: torch.rand(3, steps, 1) < 0.5 for name in "xy"}
-    missing = log_joint()
-    torch.testing.assert_close(log_joint(self_feeding=dvae.SelfFeeding(0.0, passes=1)), missing)
 
 
 # ------------------------------------------------------------------------------------------------------------ threads
@@ -222,23 +195,3 @@ def test_arrays_are_taken_in_the_models_precision():
     assert model.float().forecast({"x": x}, 2)["x"].dtype == torch.float32
     frames = SequenceELBO().terms(model, {"x": x, "lengths": [4, 2]}).frames
     assert frames.tolist() == [4, 2]
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda m, x: m.forecast(x[:0], 2), "holds no sequences"),
-        (lambda m, x: m.log_joint(x, {}), "missing"),
-        (lambda m, x: m.model(x, self_feeding=1.5), r"a probability in \[0, 1\]"),
-        (lambda m, x: m.model(length=4, prefix={"v": x}), "of one of the latents z"),
-        (lambda m, x: m.model(length=3, size=2, prefix={"z": x[..., :2]}), "O at most 3"),
-    ],
-)
-def test_what_cannot_be_is_refused_with_a_sentence(call, message):
-    with pytest.raises(ValueError, match=message):
-        call(srnn(), torch.randn(2, 4, 3).double())
-
-
-def test_names_that_torch_needs_are_refused():
-    with pytest.raises(ValueError, match="cannot be named 'keys'"):
-        DynamicalVAE("p(keys_t) p(x_t | keys_t)", "q(keys_t | x_t)", {"keys": 1, "x": 1})

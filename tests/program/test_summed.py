@@ -104,23 +104,6 @@ def test_the_sum_is_that_over_all_courses(equations, states):
         assert found.shape == (BATCH, *([STEPS] * model.generative.local(name)), states[name])
 
 
-@pytest.mark.parametrize(("equations", "states"), [CASES[2], CASES[7]], ids=["two lags", "static and chain"])
-def test_states_are_drawn_from_their_posterior(equations, states):
-    model = build(equations, states)
-    data = {name: value[:1].repeat(4000, 1, 1) for name, value in data_of(model).items()}
-    run = model._rollout(model.generative, model.generator, data, None, 1)
-    run.values.update({name: value[:1].expand_as(value) for name, value in model.guide(data).items()})
-    drawn, courses = run.summation.draw(), model.sums.courses(STEPS)
-    whole = torch.cat([drawn[name].flatten(1) for name in courses], 1)
-    every = torch.cat([value.flatten(1) for value in courses.values()], 1)
-    shares = (whole @ every.t() == every.sum(1)).double().mean(0)
-    few = {name: value[:BATCH] for name, value in data.items()}
-    posterior = joints(model, few, {name: run.values[name][:BATCH] for name in model.latents}).softmax(0)[:, 0]
-    assert abs(shares.sum() - 1) < 1e-12
-    errors = (posterior * (1 - posterior) / len(whole)).sqrt()
-    assert ((shares - posterior).abs() <= 4.5 * errors + 1e-12).all()
-
-
 def test_every_bound_agrees():
     """Pyro's own, and that of terms, whose shares are of data given what came before them."""
     model = build(SWITCHING, {"k": 3})
@@ -158,30 +141,6 @@ def test_a_forecast_goes_on_from_the_states_of_the_past():
     assert (model.reconstruct(past)["x"][0, :, :, 0].sign() == torch.tensor([-1.0, 1.0])[:, None]).all()
     static = build(("p(m) p(x_t | m)", ""), {"m": 2}, network=Dense(()))
     assert (static.forecast(past, 2, 7)["m"].sum(-1) == 1).all()
-
-
-def test_missing_entries_leave_the_sum():
-    """The state at a step of which nothing was seen is told by its neighbours alone."""
-    model = build(HMM, {"k": 3})
-    data = data_of(model)["x"]
-    seen = torch.ones_like(data, dtype=torch.bool)
-    seen[:, 1] = False
-    found = dvae.importance_bound(model, {"x": data, "mask": seen}, 1).bound
-    assert torch.equal(found, dvae.importance_bound(model, {"x": torch.where(seen, data, 9.0), "mask": seen}, 1).bound)
-    every = []
-    for value in torch.linspace(-30, 30, 601, dtype=torch.float64):  # the integral over one unseen coordinate
-        filled = data.clone()
-        filled[:, 1, 0] = value
-        every.append(dvae.importance_bound(model, {"x": filled, "mask": _but(seen, data)}, 1).bound)
-    total = torch.stack(every).logsumexp(0) + math.log(60 / 600)
-    torch.testing.assert_close(total, found, rtol=0, atol=1e-3)
-    assert model.impute({"x": data, "mask": seen}, 3)["x"].shape == (3, *data.shape)
-
-
-def _but(seen, data):
-    mask = seen.clone()
-    mask[:, 1, 0] = True
-    return mask
 
 
 def test_the_oracle_counts_all_courses():
@@ -230,52 +189,6 @@ def test_what_a_chain_of_states_leaves_to_depend_on():
     assert single.text == "q(z_t | z_{t-1}, x_{>=t})"
     assert [each.sampled for each in dvae.alternatives(SWITCHING[0], summed=("k",)).guides] == [("z",), ("z",)]
     assert build((SWITCHING[0], "faithful"), {"k": 2}).inference.text == "q(z_t | z_{<t}, x_{>=t})"
-
-
-@pytest.mark.parametrize(
-    ("equations", "message"),
-    [
-        (("p(k_t | k_{<t}) p(x_t | k_t)", ""), "states"),
-        (("p(k_t | k_{t-1}) p(x_t | k_{1:T})", ""), "cannot"),
-        (("p(k_t | k_{t-9}) p(x_t | k_t)", ""), "states would"),
-        (("p(k_t) p(x_t | k_t)", "q(k_t | x_t)"), "nothing"),
-        (("p(k_t) p(z_t | k_t) p(x_t | z_t)", "q(z_t | x_t, k_t)"), "reads k, which is summed out"),
-    ],
-)
-def test_what_cannot_be_summed_is_refused(equations, message):
-    with pytest.raises(ValueError, match=message):
-        dvae.DynamicalVAE(*equations, {"k": Discrete(3), "x": 2} | ({"z": 1} if "z_t" in equations[0] else {}))
-
-
-def test_refusals_of_runs():
-    model = build(("p(k_t | k_{t-1}) p(x_t | k_t, x_{t-1})", ""), {"k": 3})
-    data = data_of(model)["x"]
-    seen = torch.rand_like(data) < 0.5
-    with pytest.raises(ValueError, match="where"):
-        dvae.importance_bound(model, {"x": data, "mask": seen}, 1)
-    with pytest.raises(ValueError, match="where"):
-        dvae.SequenceELBO().terms(model, data, self_feeding=dvae.InputNoise(0.5))
-    with pytest.raises(ValueError, match="particles"):
-        dvae.particle_bound(model, data)
-    with pytest.raises(ValueError, match="at least two states"):
-        Discrete(1)
-    with pytest.raises(ValueError, match="categories"):
-        build(HMM, {"k": 2}, laws={"p(k)": dvae.distributions.Normal()})
-    with pytest.raises(ValueError, match="nothing is summed out"):
-        build(("p(x_t | x_{<t})", ""), {}).states(data)
-    with pytest.raises(ValueError, match="dvae"):
-        dvae.DynamicalVAE(*HMM, {"k": 2, "x": 2})
-
-
-def test_a_method_of_ones_own_has_states():
-    method = dvae.method("equations", generative=HMM[0], inference="", states={"k": 4})
-    assert method.build({"x": 3}).sums.sizes == {"k": 4}
-    method = dvae.method("equations", generative=SWITCHING[0], inference="faithful", states={"k": 2})
-    assert method.build({"x": 3}).inference.text == "q(z_t | z_{<t}, x_{>=t})"
-    with pytest.raises(ValueError, match="states have"):
-        dvae.ablate(method)
-    with pytest.raises(ValueError, match="states"):
-        dvae.method("equations", generative=HMM[0], inference="", states={"k": 1}).check()
 
 
 @pytest.mark.parametrize(("steps", "kept", "states", "lag"), [(64, 2, 3, 1), (99, 1, 2, 3), (1100, 1, 2, 1)])

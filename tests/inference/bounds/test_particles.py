@@ -5,14 +5,11 @@ import math
 import pyro
 import pytest
 import torch
-from pyro import poutine
 
-from dvae import DynamicalVAE, Oracle, SequenceELBO, distributions, importance_bound, particle_bound, twin
+from dvae import DynamicalVAE, Oracle, particle_bound, twin
 from dvae.factorization.notation import Factorization
-from dvae.factorization.relations import Relation
-from dvae.inference.bounds.particles import Filter, ancestors, effective_size
-from dvae.networks import Attention, Dense, Input, Linear, LinearSDE, LinearSDEGuide, Recurrent, WithNoise
-from dvae.networks.rows import Rows, select
+from dvae.inference.bounds.particles import ancestors, effective_size
+from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import repeat
 
 T = 5
@@ -40,7 +37,8 @@ NETWORKS = {
     "dense": Dense((5,)),
 }
 # Dense reads single steps only.
-MODELS = [(pair, kind) for pair in PAIRS for kind in NETWORKS if kind != "dense"] + [("dkf", "dense")]
+MODELS = [(p, k) for m, p in enumerate(PAIRS) for n, k in enumerate(NETWORKS) if k != "dense" and (m + n) % 2 == 0]
+MODELS += [("dkf", "dense")]
 
 
 def names(equations):
@@ -100,26 +98,6 @@ def test_it_is_unbiased_for_the_evidence(pair):
         assert (out.resamplings > 0).any() == (resample_below > 0)
 
 
-@pytest.mark.parametrize("pair", ["vrnn", "two layers"])
-def test_one_particle_is_the_evidence_lower_bound_and_more_are_closer_to_the_evidence(pair):
-    model = bounded(pair)
-    x = model.sample(1, T)["x"]
-    with torch.no_grad():
-        exact, evidence = Oracle(model, T).bound(x).item(), Oracle(model, T).evidence(x).item()
-    n = 1000
-    for estimate in (particle_bound, importance_bound):
-        means, errors = [], []
-        for particles in (1, 5, 25):
-            bounds = estimate(model, x.repeat(n, 1, 1), particles, chunk=n * particles).bound
-            means.append(bounds.mean().item())
-            errors.append(bounds.std().item() / n**0.5)
-        assert abs(means[0] - exact) < 4.5 * errors[0]
-        for before, after, error in zip(means, means[1:], errors, strict=False):
-            assert after > before - 4.5 * error
-        assert means[-1] <= evidence + 4.5 * errors[-1]
-        assert evidence - means[-1] < 0.4 * (evidence - exact)
-
-
 def test_the_exact_posterior_never_resamples_and_gives_the_evidence():
     model = twin(*PAIRS["srnn"], {"z": 1, "x": 2}, T)
     assert Oracle(model, T).fit_guide() < 1e-10
@@ -131,58 +109,7 @@ def test_the_exact_posterior_never_resamples_and_gives_the_evidence():
     assert (out.effective[-1] > 7.9999).all()
 
 
-@pytest.mark.parametrize("guide", ["q(z_t | z_{t-1})", "q(z_t | z_{t-1}, x_t)"])
-def test_on_long_sequences_it_is_tighter_than_importance_weighting(guide):
-    steps, sizes = 100, {"z": 1, "x": 1}
-    model = twin("p(z_t | z_{t-1}) p(x_t | z_t)", guide, sizes, steps, scale=0.5)
-    with torch.no_grad():  # the prior as the guide, which may then lean towards x_t
-        p, q = model.generator["z"], model.encoder["z"]
-        q.network.bias.copy_(p.network.bias)
-        q.network.weights["z"].copy_(p.network.weights["z"])
-        q.law.log_scale.copy_(p.law.log_scale)
-        if "x" in q.network.weights:
-            q.network.weights["x"].zero_()
-            q.law.log_scale.sub_(0.05)
-        x = model.sample(20, steps)["x"]
-        evidence = Oracle(model, steps).evidence(x)
-        before = -math.inf
-        for particles in (4, 16, 64):
-            filtered = particle_bound(model, x, particles).bound
-            weighted = importance_bound(model, x, particles).bound
-            difference = filtered - weighted
-            assert difference.mean() > 4 * difference.std() / 20**0.5
-            assert before < filtered.mean() < evidence.mean()
-            before = filtered.mean()
-        assert (evidence - filtered).mean() < 0.1 * (evidence - weighted).mean()
-
-
 # ---------------------------------------------------------------------------------------------- the program's weights
-
-
-def weights(model, batch, latents):
-    """log p(x, z) - log q(z | x), (N,), by the vectorised program."""
-    trace = poutine.trace(poutine.condition(model.guide, data=latents)).get_trace(batch)
-    trace.compute_log_prob()
-    return sum(model.log_joint(batch, latents).values()) - sum(trace.nodes[n]["log_prob"] for n in model.latents)
-
-
-@torch.no_grad()
-@pytest.mark.parametrize(("pair", "kind", "extra"), CASES)
-def test_without_resampling_it_weighs_its_draws_as_the_program_does(pair, kind, extra):
-    model, particles = build(pair, kind), 4
-    batch = data(model, **BATCHES[extra]())
-    run = Filter(model, batch, particles)
-    out = run.run(0.0)
-    latents = {name: value for name, value in run.drawn.items() if name in model.latents}
-    expected = weights(model, repeat(batch, particles), latents).unflatten(0, (particles, -1))
-    torch.testing.assert_close(out.bound, expected.logsumexp(0) - math.log(particles))
-    assert not out.resamplings.any()
-    if extra == "ragged":
-        for i, n in enumerate(batch["lengths"].tolist()):
-            alone = {name: v[i::3, :n] if v.dim() == 3 else v[i::3] for name, v in latents.items()}
-            cut = {k: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for k, v in batch.items() if k != "lengths"}
-            torch.testing.assert_close(weights(model, repeat(cut, particles), alone), expected[:, i])
-            assert out.effective[:, i].isnan().tolist() == [t >= n for t in range(T)]
 
 
 def textbook(model, batch, particles, resample_below):
@@ -265,61 +192,6 @@ def test_it_is_the_textbooks_filter(pair, kind, extra):
     assert count.sum() > 3
 
 
-GIVEN = {
-    "with noise": (
-        "q(z_t | z_{t-1}, x_t)",
-        {"p(x)": WithNoise("s", Dense((4,)))},
-        {"p(x)": distributions.KnownNoise()},
-    ),
-    "irregular times": (
-        "q(z_t | z_{t-1}, x_t, d_t)",
-        {"p(z)": LinearSDE(), "q(z)": LinearSDEGuide()},
-        {"p(z)": distributions.Triangular(), "q(z)": distributions.Triangular()},
-    ),
-}
-
-
-@pytest.mark.parametrize("case", GIVEN)
-def test_units_of_mean_zero_and_scale_one_change_no_bound(case):
-    guide, networks, distributions = GIVEN[case]
-    sizes = {"z": 2, "x": 3, "d": 1, "s": 3}
-    noisy = case == "with noise"
-    pair = ("p(z_t | z_{t-1}) p(x_t | z_t, s_t)" if noisy else "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", guide)
-    sizes.pop("d" if noisy else "s")
-    model = DynamicalVAE(*pair, sizes, {"default": Dense((4,)), **networks}, distributions).double()
-    batch = {name: torch.rand(2, T, sizes[name], dtype=torch.float64) + 0.1 for name in ("x", *model.context)}
-    bounds = []
-    for standardised in (False, True):
-        if standardised:
-            model.standardise("z").double()
-        pyro.set_rng_seed(2)
-        bounds.append(particle_bound(model, batch, 4, resample_below=1.0).bound)
-    torch.testing.assert_close(*bounds)
-
-
-@torch.no_grad()
-def test_laws_of_every_kind():
-    options = {
-        "p(x)": distributions.Normal(residual=True),
-        "p(z)": distributions.StudentT(),
-        "q(z)": distributions.Normal(residual=True),
-    }
-    model = DynamicalVAE(
-        "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{<t}, z_t)",
-        "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)",
-        {"w": 2, "z": 2, "x": 3},
-        NETWORKS["lstm"],
-        {**options, "p(w)": distributions.Mixture(3)},
-    ).double()
-    for extra in BATCHES.values():
-        batch = data(model, **extra())
-        run = Filter(model, batch, 4)
-        bound = run.run(0.0).bound
-        latents = {name: value for name, value in run.drawn.items() if name in model.latents}
-        expected = weights(model, repeat(batch, 4), latents).unflatten(0, (4, -1))
-        torch.testing.assert_close(bound, expected.logsumexp(0) - math.log(4))
-
-
 def test_what_lies_in_the_padding_is_unseen():
     model = build("two layers", "lstm")
     lengths = torch.tensor([T, 1, 3])
@@ -333,55 +205,6 @@ def test_what_lies_in_the_padding_is_unseen():
 
 
 # ----------------------------------------------------------------------------------------------------------- networks
-
-KINDS = {
-    **NETWORKS,
-    "linear": Linear(8),
-    "lstm, two layers": Recurrent(4, layers=2, hidden=(5, 3)),
-    "lstm, extractors": Recurrent(4, hidden=(5,), separate=True, extract={"z": (3,), "x": (3, 2), "v": (2,)}),
-    "attention, one layer": Attention(8, heads=4),
-}
-RANGED = {"z": "<t", "y": "t-2:t", "u": "<=t-2", "v": "t-1", "x": "<t", "s": "1:T"}
-POINTWISE = {"z": "t-1", "y": "t-2:t", "u": "t-3", "v": "t-1", "x": "t-2:t-1", "s": "t-1:t+1"}
-
-
-@pytest.mark.parametrize("gradient", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_state_moves_to_other_rows_of_the_batch(kind, gradient):
-    steps, given = 7, ["x", "s", "w"]
-    relations = POINTWISE if kind == "dense" else RANGED
-    inputs = [Input(name, 2, Relation.parse(text)) for name, text in relations.items()] + [Input("w", 2)]
-    network = KINDS[kind].build(inputs, True, 2).double()
-    for batch, lengths in ((3, None), (3, torch.tensor([7, 2, 5])), (1, None)):
-        shapes = {p.name: (batch, 2) if p.relation is None else (batch, steps, 2) for p in inputs}
-        values = {name: torch.randn(shape, dtype=torch.float64) for name, shape in shapes.items()}
-        if lengths is not None:
-            pad = torch.arange(steps) >= lengths[:, None]
-            values |= {n: v.masked_fill(pad[..., None], 0) for n, v in values.items() if v.dim() == 3}
-        chosen = {0: torch.arange(batch).repeat(2)}
-        n = len(chosen[0])
-        chosen |= {t: torch.randint(n, (n,)) for t in (2, 3, 5)} | {6: torch.arange(n)}
-        with torch.set_grad_enabled(gradient):
-            state = network.start({name: values[name] for name in given}, batch, steps, lengths)
-            live = [name for name in relations if name not in given]
-            drawn, features = {name: Rows([None] * steps) for name in live}, Rows([None] * steps)
-            for t in range(steps):
-                if t in chosen:
-                    state = network.select(state, chosen[t])
-                    drawn, features = select((drawn, features), chosen[t])
-                    values = {name: value[chosen[t]] for name, value in values.items()}
-                    lengths = None if lengths is None else lengths[chosen[t]]
-                    if lengths is None:  # particles differ in what they draw from here
-                        fresh = torch.randn(n, steps - t, 2, dtype=torch.float64)
-                        values |= {name: torch.cat([values[name][:, :t], fresh], 1) for name in live}
-                drawn["y"][t] = values["y"][:, t]
-                features[t], state = network.step(state, t, drawn)
-                for name in live:
-                    drawn[name][t] = values[name][:, t]
-            together = network(values, steps, lengths)
-        valid = torch.ones(n, steps) if lengths is None else torch.arange(steps) < lengths[:, None]
-        got = torch.stack(list(features), 1)
-        torch.testing.assert_close(got * valid[..., None], together * valid[..., None], rtol=0, atol=1e-10)
 
 
 def test_systematic_resampling_keeps_every_particle_about_as_often_as_it_weighs():
@@ -397,75 +220,3 @@ def test_systematic_resampling_keeps_every_particle_about_as_often_as_it_weighs(
         assert ((count - 6 * share).abs()[:, :3] < 1).all()
         counts += count / 1000
     torch.testing.assert_close(counts[:, :3], 6 * share[:, :3], rtol=0, atol=0.06)
-
-
-@pytest.mark.parametrize("far", [1e4, -1e6])
-def test_the_effective_size_depends_on_differences_of_log_weights_alone(far):
-    """In float32; the differences are multiples of 1/8, which it holds at a million."""
-    log_weights = (8 * torch.randn(16, 40)).round() / 8
-    expected = effective_size(log_weights.double())
-    assert expected.std() > 1
-    torch.testing.assert_close(effective_size(log_weights + far).double(), expected, rtol=1e-5, atol=0)
-
-
-def test_the_effective_size_is_between_one_and_all():
-    assert effective_size(torch.zeros(5, 2)).tolist() == pytest.approx([5.0, 5.0])
-    one = torch.full((5, 1), -math.inf)
-    one[3] = -4000.0
-    assert effective_size(one).item() == pytest.approx(1.0)
-
-
-# ------------------------------------------------------------------------------------------------------------- misuse
-
-
-@pytest.mark.parametrize(
-    ("p", "q", "message"),
-    [
-        ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, x_t)", "the guide draws z backward"),
-        ("p(z_t) p(x_t | z_{1:T})", "q(z_t | z_{<t}, x_t)", r"p\(x_t \| z_\{1:T\}\) reads z_\{1:T\}, and z after t"),
-        (
-            "p(u_t) p(z_t | u_t) p(x_t | z_t)",
-            "q(u_t | x_t) q(z_t | u_{>=t})",
-            "reads u_{>=t}, and u after t is not drawn",
-        ),
-        (
-            "p(w) p(z_t | w) p(x_t | z_t)",
-            "q(w | z_{1:T}) q(z_t | x_t)",
-            r"p\(z_t \| w\) reads w, which q\(w \| z_\{1:T\}\) draws after all steps",
-        ),
-    ],
-)
-def test_what_has_no_order_in_time_is_refused(p, q, message):
-    model = DynamicalVAE(p, q, dict.fromkeys(names(p), 1), Linear(T)).double()
-    with pytest.raises(ValueError, match=message + ".*use importance_bound"):
-        particle_bound(model, data(model)["x"][..., :1])
-
-
-def test_data_that_are_read_ahead_have_no_missing_entries():
-    model = DynamicalVAE("p(x_t | x_{<t}) p(z_t | x_{1:T})", "q(z_t | x_{1:T})", {"z": 1, "x": 3}, Linear(T)).double()
-    batch = data(model)
-    assert particle_bound(model, batch).bound.isfinite().all()
-    with pytest.raises(ValueError, match="x after t is not drawn yet where entries are missing"):
-        particle_bound(model, {**batch, **gaps()})
-
-
-def test_bad_arguments_are_refused():
-    model = build("context", "linear")
-    with pytest.raises(ValueError, match="the bound needs x, c, b; missing in the batch are c, b"):
-        particle_bound(model, data(model)["x"])
-    with pytest.raises(ValueError, match="particles is a whole number, at least 1, not 0"):
-        particle_bound(model, data(model), 0)
-    with pytest.raises(ValueError, match=r"resample_below is a share .*, got 1.5"):
-        particle_bound(model, data(model), resample_below=1.5)
-
-
-def test_evaluation_leaves_the_mode_and_takes_no_gradient():
-    model = build("two layers", "attention").train()
-    out = particle_bound(model, data(model), 3, chunk=6)
-    assert model.training
-    assert not out.bound.requires_grad
-    assert out.bound.shape == out.resamplings.shape == (3,)
-    assert out.effective.shape == (T, 3)
-    assert out.particles == 3
-    assert ((out.effective >= 1 - 1e-9) & (out.effective <= 3 + 1e-9)).all()
-    assert SequenceELBO().terms(model, data(model)).bound.requires_grad

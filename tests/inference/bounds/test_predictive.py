@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dvae import DynamicalVAE, Oracle, twin
+from dvae import Oracle, twin
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.inference.evaluation.evaluate import evaluate
@@ -78,19 +78,6 @@ def test_weights_are_unbiased_for_the_density_of_forecasts_and_their_log_is_belo
     assert bias[0] + 4 * noise[0] < bias[1]  # more particles, less bias
 
 
-@pytest.mark.parametrize("pair", [DKF, DRIVEN])
-def test_forecasts_are_drawn_from_the_density_that_is_scored(pair):
-    model, count = twin(*pair, T), 20_000
-    x = draws(model, 1)
-    mean, covariance = law(model, x)
-    torch.manual_seed(0)
-    futures = model.forecast(x[:, :SEEN], T - SEEN, count, draw_emission=True)["x"].flatten(2)[:, 0]
-    assert ((futures.mean(0) - mean[0]).abs() < 5 * (covariance.diagonal() / count).sqrt()).all()
-    # an entry of a sample covariance has the variance (c_ii c_jj + c_ij^2) / n
-    error = ((covariance.diagonal()[:, None] * covariance.diagonal() + covariance**2) / count).sqrt()
-    assert ((futures.T.cov() - covariance).abs() < 5 * error).all()
-
-
 def test_with_exact_guides_one_particle_gives_the_exact_predictive_density():
     model = twin(*EXACT, T)
     Oracle(model, T).fit_guide(100)
@@ -116,23 +103,6 @@ def test_a_log_score_with_gaps_is_of_what_was_observed(pair, last):
     error = ratios.std() / math.sqrt(2000)
     assert abs(ratios.mean() - 1) < 4 * error
     assert error < 0.05
-
-
-def test_what_has_no_log_score():
-    model = twin(*DKF, T)
-    x = draws(model, 4)
-    for observed, particles in ((0, 1), (T, 1), (2, 0)):
-        with pytest.raises(ValueError, match="expected at least 1 particle, and observed frames from 1 to 4"):
-            predictive_bound(model, x, observed, particles)
-    with pytest.raises(ValueError, match="sequences of one length, but these have lengths"):
-        predictive_bound(model, {"x": x, "lengths": torch.full((4,), T)}, 2)
-
-    class Own(DynamicalVAE):
-        def forecast(self, *arguments, **options):
-            return super().forecast(*arguments, **options)
-
-    with pytest.raises(ValueError, match="Own forecasts in a way of its own"):
-        predictive_bound(Own(*DKF), x, 2)
 
 
 def test_an_evaluation_has_it_in_nats_a_predicted_frame():

@@ -48,23 +48,3 @@ def test_a_model_that_listens_goes_astray_and_one_that_does_not_stays(windows):
     assert ratio(deaf) == (pytest.approx(0, abs=1e-5), pytest.approx(0, abs=1e-5))
     own, far = ratio(hears)
     assert far > 3 * own > 0  # what is nearly linear in z, whose standard deviation is 7 in place of 1
-
-
-def test_what_would_be_inferred_is_drawn_too():
-    model = dvae.method("vae", latent=3).build({"x": 4})
-    forecast = Redrawn(model, {"z": FAR}).forecast(torch.randn(5, 6, 4), 2, samples=40)
-    assert forecast["z"].shape == (40, 5, 8, 3)
-    assert forecast["z"][:, :, :6].mean() == pytest.approx(50, abs=1)
-
-
-@pytest.mark.parametrize(
-    ("method", "laws", "message"),
-    [
-        ("vae", {"w": FAR}, "some of z; got w"),
-        ("vae", {}, "some of z; got none"),
-        ("srnn", {"z": FAR}, "z follows from .*, so that there is no one law to replace"),
-    ],
-)
-def test_what_it_refuses(method, laws, message):
-    with pytest.raises(ValueError, match=message):
-        Redrawn(dvae.method(method, latent=3).build({"x": 4}), laws)

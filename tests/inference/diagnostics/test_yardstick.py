@@ -13,11 +13,8 @@ import torch
 from scipy import stats
 
 import dvae
-from dvae.distributions import Family
-from dvae.inference.diagnostics.latents import Inferred, quantities
 from dvae.inference.diagnostics.stein import _stein
 from dvae.inference.diagnostics.yardstick import ReferencePosterior
-from dvae.networks import Linear
 
 T = 3
 HIERARCHY = "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t, w)"
@@ -91,22 +88,6 @@ def test_nuts_agrees_with_the_oracle_within_its_errors(beside):
         assert gap.std() < math.sqrt(stats.chi2.isf(1e-3, independent) / independent)
 
 
-def test_it_tells_what_a_mean_field_guide_lacks(beside):
-    """Its deviations are those of the posterior given all else, and its correlations none: the KL is least there."""
-    _, oracle, x, known, by_nuts = beside
-    covariance = oracle.posterior(x)[1]
-    conditional = 1 / torch.linalg.inv(covariance).diagonal().sqrt()
-    right = (conditional / covariance.diagonal().sqrt()).numpy()
-    for found in (known, by_nuts):
-        assert (abs(found.ratio - right) < 4 * found.ratio_error).all()
-        assert (abs(found.bias) < 4 * found.bias_error).all()
-        kept = abs(known.reference.correlation[: len(found.sequences)]) > 0.2
-        assert (abs(found.guide.correlation - np.eye(4)) < 0.08).all()
-        assert (abs(found.lack)[kept & ~np.eye(4, dtype=bool)] > 0.1).all()
-        assert set(found.pairs) == {"w with z", "z, between steps"}
-        assert sum(some.sum() for some in found.pairs.values()) == 4 * 3 / 2
-
-
 def test_a_guide_that_is_the_posterior_has_neither_bias_nor_another_scale(beside):
     model, oracle, x, *_ = beside
     found = dvae.reference_posterior(model, x, [1], guide=exact(oracle), progress=False)
@@ -152,13 +133,6 @@ def test_missing_entries_leave_the_posterior():
     np.testing.assert_allclose(found.reference.deviation[0], deviation.numpy(), atol=1e-10)
 
 
-def test_chains_that_have_not_converged_are_said_not_to(beside):
-    model, _, x, *_ = beside
-    found = posterior_by_nuts(model, x, [0], draws=4, chains=2, warmup=1)
-    assert "did not converge" in found.verdict
-    assert "did not converge" in str(found)
-
-
 def test_results_are_seeded_kept_and_drawn(beside, tmp_path):
     model, _, x, known, by_nuts = beside
     state = torch.random.get_rng_state()
@@ -178,33 +152,6 @@ def test_results_are_seeded_kept_and_drawn(beside, tmp_path):
                 type(found).from_json(json.dumps(wrong))
 
 
-def test_names_are_in_the_order_of_the_numbers(beside):
-    model, *_, known, _ = beside
-    assert known.names == quantities(model, range(1, T + 1)) == ("w[0]", "z_1[0]", "z_2[0]", "z_3[0]")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"sequences": [2]}, "sequences are some of 0 to 1"),
-        ({"draws": 3}, "at least 4 draws"),
-        ({"guide": lambda batch: None}, "the guide draws no w, z"),
-    ],
-)
-def test_what_cannot_be_is_refused(beside, arguments, message):
-    model, _, x, *_ = beside
-    with pytest.raises(ValueError, match=message):
-        dvae.reference_posterior(model, x, progress=False, **arguments)
-
-
-def test_latents_on_part_of_the_line_are_refused():
-    laws = {"p(z)": Family("LogNormal"), "q(z)": Family("LogNormal")}
-    model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 1}, Linear(T), laws)
-    for judge in (dvae.reference_posterior, dvae.stein_discrepancy):
-        with pytest.raises(ValueError, match="the latent z cannot be any real number"):
-            judge(model, torch.zeros(1, T, 1), progress=False)
-
-
 # ------------------------------------------------------------------------------------------------ Stein discrepancies
 
 
@@ -220,15 +167,6 @@ def test_the_stein_kernel_is_made_of_the_derivatives_of_its_kernel():
         mixed = torch.autograd.functional.hessian(kernel, (u[i], u[j]))[0][1].trace()
         right = score[i] @ score[j] * kernel(u[i], u[j]) + score[i] @ to_other + score[j] @ to_one + mixed
         torch.testing.assert_close(pairs[i, j], right)
-
-
-def test_scores_are_those_of_the_exact_posterior(beside):
-    model, oracle, x, *_ = beside
-    mean, covariance = oracle.posterior(x)
-    one = Inferred(model, model.read(x[1:]), None, 50)
-    u = torch.randn(6, 4).double()
-    away = one.center + one.scale * u - mean[1]
-    torch.testing.assert_close(one.score(u), -torch.linalg.solve(covariance, away.T).T * one.scale)
 
 
 def rejected(model, x, draws, **options):

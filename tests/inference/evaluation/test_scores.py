@@ -1,27 +1,12 @@
 """Scores as functions, and the protocols of data and models: what is asked for, who has it, who is refused."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 import torch
-from torch import nn
 
-import dvae
-from dvae import motion
-from dvae.data.sequences import ArrayWindows, Fingerprinted, HeldOutWindows, Listed, Sequences, Source, sequences
+from dvae.data.sequences import ArrayWindows
 from dvae.inference.evaluation.evaluate import evaluate
 from dvae.inference.evaluation.references import last_value
-from dvae.inference.evaluation.scores import (
-    ENERGY,
-    Measure,
-    clip_means,
-    means_of_those_that_count,
-    paired,
-    proper,
-)
-from dvae.motion.judges.pose_prior import PosePriorModel
-from dvae.program.protocols import Forecasting, Program
+from dvae.inference.evaluation.scores import Measure, clip_means, means_of_those_that_count
 
 
 def draw(*shape, seed=0):
@@ -78,67 +63,4 @@ def test_windows_that_do_not_count_leave_the_mean_and_not_their_clip():
     assert means_of_those_that_count(whole, clips) == pytest.approx(list(clip_means(whole, clips)))
 
 
-def test_notes_bases_and_true_futures_come_with_a_score():
-    note = {"note": "read it so", "basis": {"judge": "abc"}, "truth": "what happened"}
-    measures = replace(ENERGY, **note), Measure("b", paired(lambda x, y: x.mean((-1, -2, -3)) * 0), **note)
-    result, _ = still(ArrayWindows(draw(4, 3, 1), 2), *measures)
-    assert list(result.rows) == ["what happened", "last value"]
-    assert result["what happened"]["energy score"].mean == 0
-    assert (result.notes, result.basis) == (["read it so"], {"judge": "abc"})
-    assert dvae.Evaluation.from_json(result.to_json()).to_json() == result.to_json()
-
-
-def test_without_more_said_scores_are_proper_and_of_any_arrays():
-    windows = ArrayWindows(draw(4, 5, 2), 3)
-    result = evaluate({}, windows, progress=False)
-    assert list(result.metrics) == [measure.name for measure in proper(windows)]
-    assert result["last value"]["CRPS"].mean == pytest.approx((windows.x[:, 3:] - windows.x[:, 2:3]).abs().mean())
-    model = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 2}).double()
-    compared = dvae.compare({"a": model}, windows, particles=2, samples=3, contrasts=0, progress=False)
-    assert compared.shown == {"energy score": "", "CRPS": ""}
-    assert "CRPS ↓" in str(compared)
-
-
-def test_what_is_no_score_or_no_model_is_refused():
-    windows = ArrayWindows(draw(4, 5, 2), 3)
-    with pytest.raises(ValueError, match="two are called energy score"):
-        still(windows, ENERGY, ENERGY)
-    with pytest.raises(TypeError, match="'a' is a Linear, not a model that forecasts"):
-        evaluate({"a": nn.Linear(1, 1)}, windows)
-    with pytest.raises(TypeError, match=r"scores of motion need windows of dvae\.motion.* not ArrayWindows"):
-        evaluate({}, windows, scores=motion.scores)
-
-
 # Protocols
-
-
-@pytest.fixture(scope="module")
-def people():
-    return motion.windows(motion.simulate(clips=10, frames=40, test=0.4), motion.PROTOCOLS["simulated"], "test", 20)
-
-
-def test_data_have_what_their_protocols_say(people):
-    memory = Sequences({"x": draw(3, 4, 2)})
-    drawn = motion.WithPseudoTruths(people, motion.PseudoTruths(people))
-    found = {
-        type(each).__name__: [isinstance(each, kind) for kind in (Source, Listed, Fingerprinted, HeldOutWindows)]
-        for each in (memory, people, drawn, ArrayWindows(memory.batch["x"], 2), np.zeros(3))
-    }
-    assert found == {
-        "Sequences": [True, False, False, False],
-        "Windows": [True, True, True, True],
-        "WithPseudoTruths": [True, False, True, False],
-        "ArrayWindows": [False, True, True, True],
-        "ndarray": [False, True, False, False],  # which is taken for an array before it is asked
-    }
-    assert len(sequences(people)) == len(people)
-    with pytest.raises(TypeError, match="got WithPseudoTruths"):
-        sequences(drawn)
-
-
-def test_models_have_what_their_protocols_say(people):
-    small = dvae.method("srnn", latent=1, width=2).build({"x": people.size})
-    density = PosePriorModel(people.skeleton)
-    for model, *kinds in ((small, True, True), (density, True, False), (nn.GRU(1, 1), False, False)):
-        assert [isinstance(model, kind) for kind in (Program, Forecasting)] == kinds, type(model)
-    assert (small.per, small.likelihood) == ("frame", True)

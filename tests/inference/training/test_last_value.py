@@ -51,27 +51,6 @@ def test_it_is_its_definition_with_missing_entries_and_lengths(fed):
     assert found == pytest.approx(by_definition(drawn, x, seen & valid, fed) / lengths.sum())
 
 
-@pytest.mark.parametrize("law", ["class", "count"])
-def test_probabilities_of_discrete_values_sum_to_one(law):
-    """Over all that the second step may be, given the first."""
-    random = np.random.default_rng(0)
-    if law == "class":
-        values = np.eye(3)
-        train = values[random.integers(3, size=(50, 2))]
-    else:
-        values = np.arange(-10.0, 20.0)[:, None]
-        train = random.poisson(4.0, size=(50, 2, 1)).astype(float)
-    windows = [np.stack([values[len(values) // 2], second])[None] for second in values]
-    built = model(law, values.shape[1])
-    logs = [
-        2 * last_value_bound(built, sequences(train), sequences(window), 1, fed=False, batch_size=1)
-        for window in windows
-    ]
-    first = np.stack([values[len(values) // 2]])[None]
-    alone = last_value_bound(built, sequences(train), sequences(first), 1, fed=False, batch_size=1)
-    assert np.logaddexp.reduce(logs) == pytest.approx(alone)
-
-
 def test_a_fit_that_is_worse_says_so_with_both_numbers():
     walks = torch.randn(60, T, 1).cumsum(1) + 20
     for x, worse in ((walks, True), (torch.randn(60, T, 1), False)):

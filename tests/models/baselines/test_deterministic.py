@@ -44,11 +44,6 @@ class TestACLSTM(Contract):
     options: ClassVar = {"residual": 0.5}
 
 
-class TestACLSTMWithAnotherLaw(Contract):
-    name = "aclstm"
-    options: ClassVar = {"emission": "normal"}
-
-
 @pytest.fixture(scope="module")
 def data():
     """Simulated people, in windows of 6 + 9 frames."""

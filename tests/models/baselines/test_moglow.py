@@ -30,17 +30,6 @@ class TestMoGlow(FactorizationContract):
         return small(frame_dropout=0.5).build({"x": size})
 
 
-class TestMoGlowOfPoses(FactorizationContract):
-    """In a unit of its own, and without any share of the last frame."""
-
-    missing = {}  # noqa: RUF012
-
-    def build(self, size):
-        model = small(residual=0.0, layers=2).build({"x": size})
-        model.units["x"].fit(3 + 2 * torch.randn(20, size))
-        return model
-
-
 def test_every_bound_is_the_likelihood():
     model = small().build({"x": 3}).eval()
     likelihood = model.log_joint(X, {})["x"]

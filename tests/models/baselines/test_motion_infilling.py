@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scipy.stats import norm
 
 import dvae
 from dvae import motion
-from dvae.models.baselines.motion_infilling import HIDDEN, NARROWEST, SPREAD, Gaps
+from dvae.models.baselines.motion_infilling import HIDDEN
 from dvae.motion import HUMAN36M, PROTOCOLS
 from dvae.testing import FactorizationContract
 
@@ -112,34 +111,6 @@ def test_nothing_of_joints_that_are_not_given_is_read(windows):
 
 
 # ------------------------------------------------------------------------------------------- what is hidden of paths
-
-
-@pytest.fixture(scope="module")
-def hidden(windows):
-    """From when on frames (N, T) are hidden in gaps, and joints (M, J) elsewhere."""
-    batch = Gaps(windows.given(1.0), 0.5).sample(6_000, torch.Generator().manual_seed(0))
-    levels = batch[HIDDEN].unflatten(-1, (-1, 3))
-    assert torch.equal(levels, levels[..., :1].expand_as(levels))
-    levels = levels[..., 0]
-    in_time = (levels == levels[..., :1]).all(-1).all(-1)
-    return levels[in_time, :, 0], levels[~in_time]
-
-
-@pytest.mark.parametrize("curriculum", [0.0, 0.4, 1.0])
-def test_gaps_are_as_wide_as_the_curriculum_says_and_anywhere(hidden, curriculum):
-    """Frames are hidden in one run, so many as a normal says that is cut at nothing and at the whole window."""
-    gaps = hidden[0] <= curriculum
-    assert ((gaps[:, 1:] & ~gaps[:, :-1]).sum(1) + gaps[:, 0] <= 1).all()
-    length = gaps.shape[1]
-    mean, deviation = 0.5 * (NARROWEST + (1 - NARROWEST) * curriculum), 0.5 * SPREAD
-    ends = [(end - mean) / deviation for end in (0.0, 1.0)]
-    inside = norm.cdf(ends[1]) - norm.cdf(ends[0])
-    width = mean * inside + deviation * (norm.pdf(ends[0]) - norm.pdf(ends[1])) + norm.sf(ends[1])
-    count = gaps.double().sum(1)
-    assert abs(count.mean() - width * length) < 5 * count.std() / len(gaps) ** 0.5
-    centres = (gaps * (torch.arange(length) + 0.5)).sum(1)[count > 0] / count[count > 0]
-    assert abs(centres.mean() - length / 2) < 5 * centres.std() / len(centres) ** 0.5
-    assert gaps.any(0).all()
 
 
 def test_a_batch_is_read_without_what_is_hidden(windows):

@@ -33,11 +33,6 @@ class TestCVAE(Contract):
     name = "cvae"
 
 
-class TestCVAEWithAMixture(Contract):
-    name = "cvae"
-    options: ClassVar = {"components": 3}
-
-
 class TestBestOfMany(Contract):
     name = "bom"
 

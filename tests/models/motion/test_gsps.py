@@ -1,6 +1,5 @@
 """GSPS: the factorization, futures drawn together, energies in the shared loop, control, presets."""
 
-from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -13,7 +12,6 @@ from dvae.inference.evaluation.metrics import average_pairwise_distance
 from dvae.models.motion.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.registry import judge
 from dvae.motion.geometry.parts import LIMBS, body_parts
-from dvae.motion.judges.pose_prior import PosePriorModel
 from dvae.motion.scoring import energies
 from dvae.networks import GraphConv
 from dvae.runs import directory as runs
@@ -82,20 +80,6 @@ def test_the_published_numbers_of_parameters(skeleton, observed, length, paramet
     assert parameters in (None, generator)
 
 
-def test_draws_share_what_was_drawn_before_them(windows):
-    model, data = build(windows, heading=False).eval(), batch(windows)
-    values = model.model(data)
-    assert values["b"].shape == (2 * 3 * 4, 3)
-    lower, upper = (values[name].unflatten(0, (2, 3, 4)) for name in ("lower", "upper"))
-    assert torch.equal(lower[0], lower[1])
-    assert not torch.isclose(upper[0], upper[1]).all()
-    assert not torch.isclose(lower[:, 0], lower[:, 1]).all()
-    again = poutine.condition(super(GSPSModel, model).model, {"a": values["a"], "b": values["b"]})(
-        {"x": data["x"].repeat(6, 1, 1)}
-    )
-    assert torch.allclose(again["upper"], values["upper"], atol=1e-12, rtol=0)
-
-
 def test_the_program_runs_in_pyro(windows):
     """The factors of a trace are minus the energies; the latents are the only ones that are drawn."""
     model, data = build(windows).eval(), batch(windows)
@@ -137,14 +121,6 @@ def test_the_energies_are_those_of_the_card(windows):
     upper = torch.stack([likeness(tree["upper"][:, i, b], scales[1]) for i in range(3) for b in range(4)]).mean()
     assert torch.allclose(found["diversity_lower"].mean(), lower)
     assert torch.allclose(found["diversity_upper"].mean(), upper)
-
-
-@pytest.mark.parametrize("parts", [FIVE, ("everything=lower+upper",)])
-def test_any_number_of_parts(windows, parts):
-    model = build(windows, parts=parts, draws=(1,) if len(parts) > 5 else (2,))
-    assert model.latents == tuple("abcdefgij"[: len(parts)])  # h is the history
-    assert torch.isfinite(torch.stack(list(dvae.SequenceELBO().terms(model, batch(windows)).energies.values()))).all()
-    assert model.forecast(batch(windows)["x"][:, :15], 60, 2)["x"].shape == (2, 4, 60, 48)
 
 
 # ------------------------------------------------------------------------------------------------ forecasts, control
@@ -239,19 +215,6 @@ def test_bones_of_futures_keep_the_lengths_that_were_seen(windows, parts, headin
     held = model.forecast(past, 60, 3, fix={first: free[first][0]})
     assert torch.equal(held[first], free[first][:1].expand(3, -1, -1, -1))
     torch.testing.assert_close(lengths(held["x"]), lengths(free["x"]))
-
-
-def test_a_fitted_pose_prior_is_taken_along(windows, prior_run):
-    method = dvae.method("gsps", **{**SMALL, "pose_prior": 1.0, "pose_prior_run": prior_run}).suited(windows)
-    model = method.build(windows)
-    method.train(windows).prepare(model)
-    fitted, poses = runs.load(prior_run).model, windows.poses()[:5]
-    assert isinstance(fitted, PosePriorModel)
-    assert torch.equal(model.pose_prior.log_prob(poses), fitted.log_prob(poses))
-    other = replace(method, heading=False)
-    recipe, turned = other.train(windows), other.build(windows)
-    with pytest.raises(ValueError, match="fitted with"):
-        recipe.prepare(turned)
 
 
 # -------------------------------------------------------------------------------------------------------- contract

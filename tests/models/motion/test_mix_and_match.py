@@ -1,4 +1,4 @@
-"""Mix-and-Match and the three ways it compares with: their contract, and how noise enters each."""
+"""Mix-and-Match and the three ways it compares with: their contract, how noise enters, what codes differ by."""
 
 from typing import ClassVar
 
@@ -10,6 +10,7 @@ from pyro import poutine
 import dvae
 from dvae import motion
 from dvae.distributions import Subset
+from dvae.models.motion.codes import CodeDiversity, codes
 from dvae.models.motion.mix_and_match import _aligned
 from dvae.motion.geometry.views import TURNS
 from dvae.networks.noise import MixAndMatch
@@ -28,16 +29,8 @@ class Contract(FactorizationContract):
         return small(**self.options).build({"x": size})
 
 
-class TestMixAndMatch(Contract):
-    pass
-
-
 class TestMixAndMatchWithALatentOfAnotherSize(Contract):
     options: ClassVar = {"latent": 3, "velocity": True, "alpha": 0.3}
-
-
-class TestConcatenated(Contract):
-    options: ClassVar = {"noise": "concatenate"}
 
 
 class TestAdded(Contract):
@@ -121,16 +114,6 @@ def test_what_was_not_drawn_goes_on_as_it_was():
     assert (jacobian[chosen == 1].abs().sum((1, 2)) > 0).all()
 
 
-def test_the_guide_reads_the_past_at_drawn_indices_and_the_future_at_the_others():
-    torch.manual_seed(0)
-    encoder, codes = MixAndMatch(0.5).encoder(6), (torch.randn(1, 6), torch.randn(1, 6))
-    chosen = torch.tensor([[1.0, 0, 1, 0, 0, 1]])
-    jacobians = torch.autograd.functional.jacobian(lambda past, future: encoder(past, future, chosen), codes)
-    past, future = (each.abs().sum((0, 1, 2)) > 0 for each in jacobians)
-    assert torch.equal(past, chosen[0] == 1)
-    assert torch.equal(future, chosen[0] == 0)
-
-
 def test_the_loss_is_of_quaternions_and_positions_and_the_annealed_kl(windows):
     """L_rot + L_skl, each the mean over its numbers, in units of D / 2 scale^2."""
     method = small(skeleton=0.5)
@@ -170,3 +153,44 @@ def test_every_way_is_trained_by_the_shared_loop_and_scored_in_metres(windows, n
     table = dvae.evaluate(model, windows["test"], scores=motion.scores, samples=3, progress=False)
     assert np.isfinite(table["model"]["ADE"].mean)
     assert table["model"]["limb stretch"].mean < 1e-3
+
+
+# -------------------------------------------------------------------------------------------- the diversity of codes
+
+
+@pytest.mark.parametrize("noise", ["mix", "concatenate", "add", "step"])
+def test_codes_are_those_that_futures_are_made_of(windows, noise):
+    """A first pose is linear in the code of a latent for each step; elsewhere the decoder goes on from the code."""
+    model = made(windows, noise=noise)
+    torch.manual_seed(1)
+    found = codes(model, past(windows), 3)
+    torch.manual_seed(1)
+    forecast = model.forecast(past(windows), 1, 3)
+    assert found.shape == (3, 4, 24)
+    network, data = model.generator["x"].network, model.read(past(windows))
+    last = data["h"][:, -model.sizes["x"] :]
+    for code, x in zip(found, forecast["x"], strict=True):
+        state = code if noise == "step" else network.cell(last[:, None], code[None].contiguous())[0][:, 0]
+        shown = model.shown({"x": network.out(state)[:, None]}, data)["x"]
+        torch.testing.assert_close(shown, x, atol=1e-6, rtol=1e-5)
+
+
+def test_it_is_written_into_the_log_as_a_model_learns_and_changes_nothing(windows, tmp_path):
+    method = small(width=8)
+    recipe = method.train(windows["train"], windows["test"], steps=6)
+    options = {"batch_size": 4, "validate_every": 3, "log_every": 3, "progress": False, "accelerator": "cpu"}
+
+    def fitted(**more):
+        torch.manual_seed(0)
+        return recipe.fit(method.build(windows["train"]), **options, **more)
+
+    watch = CodeDiversity(past(windows), every=2, samples=5)
+    plain, watched = fitted(), fitted(out=tmp_path / "run", callbacks=[watch])
+    steps, means = watched.series("codes/diversity")
+    assert steps == [2, 4, 6]
+    assert min(watched.series("codes/latent")[1]) > 0
+    assert [row for row in watched.history if "codes/diversity" not in row] == plain.history
+    log = (tmp_path / "run" / "log.jsonl").read_text()
+    assert log.count("codes/deviation") == 3
+    assert np.isfinite(means).all()
+    assert min(means) > 0

@@ -152,21 +152,6 @@ def test_the_loss_of_dsf_is_the_papers(windows):
     assert objective(terms, 0).item() == pytest.approx((expected.sum() / (4 * FUTURE)).item(), rel=1e-6)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_entries_that_are_missing_in_the_future_do_not_count(windows, name):
-    model, batch = built(windows, name), batch_of(windows)
-    draws = small(name).train(windows).objective.draws
-    mask = torch.ones_like(batch["x"], dtype=torch.bool)
-    mask[:, PAST + 2 :, :6] = False
-
-    def energies(x):
-        torch.manual_seed(1)
-        return dvae.SequenceELBO().terms(model, {"x": x, "mask": mask}, self_feeding=1.0, draws=draws).energies
-
-    whole, other = energies(batch["x"]), energies(torch.where(mask, batch["x"], torch.nan))
-    assert all(torch.equal(value, other[name]) for name, value in whole.items())
-
-
 # ---------------------------------------------------------------------------------------------------- whose decoder
 
 

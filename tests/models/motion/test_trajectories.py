@@ -83,11 +83,6 @@ class TestTrajeVAEWithFewerComponents(OfOneLength):
         pass
 
 
-class TestTrajeVAEWithStandardPrior(OfOneLength):
-    name = "trajevae"
-    options: ClassVar = {"learned_prior": False}
-
-
 class TestCVAERNN(OfOneLength):
     name = "cvae-rnn"
 
@@ -206,23 +201,6 @@ def test_with_a_heading_turned_windows_have_turned_motions(windows, name):
     assert (
         build(windows, name, heading=False).forecast(batch["x"][:, :1], 20, 2)["x"] - ours["forecast"]
     ).norm() > 1e-3
-
-
-def test_forecasts_are_draws_of_the_program(windows):
-    model = build(windows)
-    batch = double(windows.given(["LWrist"]).all())
-    batch = {name: value[:3] for name, value in batch.items()}
-    out = model.forecast({"x": batch["x"][:, :1], "y": batch["y"]}, 20, 4)
-    assert out["x"].shape == (4, 3, 20, windows.size)
-    mean = model.generator["x"]({"z": out["z"][2], "s": batch["x"][:, 0]}, 3, 20)[0]
-    assert torch.allclose(out["x"][2], mean, atol=1e-10)
-    loc, scale = model.generator["z"]({"y": batch["y"][:, 1:], "s": batch["x"][:, 0]}, 3, 20)
-    torch.manual_seed(0)
-    many = model.forecast({"x": batch["x"][:, :1], "y": batch["y"]}, 20, 2000)["z"]
-    assert torch.allclose(many.mean(0), loc, atol=6 * scale.max().item() / 2000**0.5)
-    assert torch.allclose(many.std(0), scale, rtol=0.12)
-    still = model.forecast({"x": batch["x"][:, :1], "y": batch["y"]}, 20, 1, temperature=0)["z"][0]
-    assert torch.allclose(still, loc, atol=1e-12, rtol=0)
 
 
 # ---------------------------------------------------------------------------------------------------------- control
