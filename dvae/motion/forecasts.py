@@ -10,18 +10,14 @@ import numpy as np
 
 from .. import files
 from .data.clips import Clip, MotionSet
-from .files.archive import archive, write_arrays
+from .files.archive import holds, write_arrays
 from .files.plain import read_arrays
 from .geometry.skeleton import FIELDS, Skeleton
 
 
 def is_forecasts(path: str | Path) -> bool:
     """Whether a file is an npz with a member `forecasts`."""
-    try:
-        with archive(path) as members:
-            return "forecasts" in members
-    except (OSError, ValueError):  # whoever reads it says what is wrong with it
-        return False
+    return holds(path, "forecasts")
 
 
 @dataclass(frozen=True, eq=False)

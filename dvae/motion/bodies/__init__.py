@@ -13,7 +13,7 @@ from .fitting import betas, fitted, retargeted, shapes_of
 from .lofted import MARKERS, SHAPE, human
 from .measures import enclosed_volume, vertex_error
 from .skinning import Body
-from .smplx import read_body, write_body
+from .smplx import read_body
 
 __all__ = [
     "MARKERS",
@@ -27,5 +27,4 @@ __all__ = [
     "retargeted",
     "shapes_of",
     "vertex_error",
-    "write_body",
 ]

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ... import files
-from ..files.archive import archive, write_arrays
+from ..files.archive import archive
 from ..files.smpl import JOINTS, PARENTS
 from .skinning import Body
 
@@ -25,9 +24,6 @@ MOST_VERTICES = 2**17
 
 FURTHEST = 1e3
 """Of a body's numbers, none of which is more in metres or shares."""
-
-_ROOT = 2**32 - 1
-"""Parent of the root in the files: -1 as a number without a sign."""
 
 _MEMBERS: dict[str, tuple[str | int, ...]] = {  # and their axes: vertices, shape parameters, joints, faces
     "v_template": ("V", 3),
@@ -72,25 +68,6 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
         goes_with.append(goes_with[int(parent)])
     kept = torch.zeros(len(template), len(JOINTS)).index_add(1, torch.tensor(goes_with), weights)
     return Body(JOINTS, PARENTS, template, changes, regressor[: len(JOINTS)], kept, faces)
-
-
-def write_body(path: str | Path, body: Body) -> None:
-    """Write a body in that layout, npz, for `read_body` and `smplx`.
-
-    Raises:
-        OSError: it cannot be written; the error names it.
-    """
-    tree = [[_ROOT if parent < 0 else parent for parent in body.parents], range(len(body.parents))]
-    arrays = {
-        "v_template": body.template,
-        "shapedirs": body.shapes,
-        "J_regressor": body.regressor,
-        "weights": body.weights,
-        "kintree_table": torch.tensor([list(row) for row in tree]),
-        "f": body.faces,
-    }
-    with files.written(path) as file:
-        write_arrays(file, ((name, tensor.numpy(force=True)) for name, tensor in arrays.items()))
 
 
 def _defect(found: dict[str, np.ndarray], shapes: int) -> str:

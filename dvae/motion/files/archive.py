@@ -68,6 +68,15 @@ def archive(path: str | Path, mapping: bool = False) -> Iterator[dict[str, Membe
         raise ValueError(f"{path}: {text}") from error
 
 
+def holds(path: str | Path, *names: str) -> bool:
+    """Whether a file is an npz with members of these names."""
+    try:
+        with archive(path) as members:
+            return members.keys() >= {*names}
+    except (OSError, ValueError):  # the reader reports what is wrong with it
+        return False
+
+
 @contextmanager
 def _damage() -> Iterator[None]:
     """What the zip library raises over damaged bytes, which is almost anything, as a sentence."""

@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,13 +16,13 @@ from ..geometry.skeleton import Skeleton
 from ..naming import sides
 from ..scoring.matching import RIGID, Kept
 from .amc import read_amc, read_expmap
-from .archive import LARGEST
+from .archive import LARGEST, holds
 from .bvh import read_bvh
 from .markers import read_c3d
 from .plain import LABELS, check_key, companion, read_archive, read_labels, read_table
 from .recording import Recording
 from .settled import World, doubt, settle, turned, understand
-from .smpl import is_amass, read_amass
+from .smpl import read_amass
 
 READERS: dict[str, Callable[[Path], Recording]] = {
     ".bvh": read_bvh,
@@ -149,10 +150,9 @@ def read_motion(
         clips.append(clip)
     if not clips:
         raise ValueError(f"{path}: no file of it can be read; the first: {unread[0][2]}")
-    if not collected.skeleton.rest:
-        clips = [replace(clip, rotations=None) for clip in clips]
-    said = collected.said(reader.world)
-    return MotionSet(clips, collected.skeleton, path.stem, False, skip_bad, skipped=unread, said=said, missing=missing)
+    return collected.motion(
+        clips, skip_bad=skip_bad, skipped=unread, said=collected.said(reader.world), missing=missing
+    )
 
 
 def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
@@ -172,7 +172,7 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
                 f"{path}: motion is read from files that end in {', '.join(READERS)}, or from folders of them, and "
                 "tables from .csv, .tsv, .parquet, .npz and .npy; export it as one of these"
             )
-        if suffix not in READERS or (suffix == ".npz" and not is_amass(path)):
+        if suffix not in READERS or (suffix == ".npz" and not holds(path, "poses", "trans")):
             return []
         return _known([File("all", path.stem, path)], companion(path, LABELS), labels)
     kinds: dict[str, list[File]] = {suffix: [] for suffix in READERS}
@@ -404,6 +404,11 @@ class Collected:
         name = self._skeleton.name if single or self._skeleton.name != self._first.stem else self._name
         return replace(self._skeleton, name=name, rest=self._skeleton.rest if self._alike else ())
 
+    def motion(self, clips: Sequence[Clip], **known: Any) -> MotionSet:
+        """The clips as one set, without rotations where they have different rest poses."""
+        clips = clips if self.skeleton.rest else [replace(clip, rotations=None) for clip in clips]
+        return MotionSet(clips, self.skeleton, self._name, copy=False, **known)
+
     def said(self, world: World) -> str:
         """How the files were understood."""
         found = [f"{world}, a person of {np.median(self._extents):.2f} m"]
@@ -432,9 +437,7 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
             if reason := collected.add(path, clip, motion.skeleton):
                 raise ValueError(reason)
             clips.append(clip)
-    clips = clips if collected.skeleton.rest else [replace(clip, rotations=None) for clip in clips]
-    missing = any(motion.missing for _, motion in sets)
-    return MotionSet(clips, collected.skeleton, name, False, skipped=skipped, missing=missing)
+    return collected.motion(clips, skipped=skipped, missing=any(motion.missing for _, motion in sets))
 
 
 def chosen(
@@ -450,8 +453,4 @@ def chosen(
         if reason := collected.add(Path("/".join(clip.key)), made, own):
             raise ValueError(f"{motion.name}: {reason}")
         clips.append(made)
-    if not collected.skeleton.rest:
-        clips = [replace(clip, rotations=None) for clip in clips]
-    return MotionSet(
-        clips, collected.skeleton, motion.name, False, skipped=motion.skipped, said=motion.said, missing=motion.missing
-    )
+    return collected.motion(clips, skipped=motion.skipped, said=motion.said, missing=motion.missing)

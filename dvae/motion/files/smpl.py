@@ -63,15 +63,6 @@ MOST_BETAS = 16
 _FPS = ("mocap_framerate", "mocap_frame_rate")
 
 
-def is_amass(path: Path) -> bool:
-    """Whether a file is an npz in AMASS's layout."""
-    try:
-        with archive(path) as members:
-            return {"poses", "trans"} <= members.keys()
-    except (OSError, ValueError):  # whoever reads it says what is wrong with it
-        return False
-
-
 def read_amass(path: str | Path) -> Recording:
     """Read an npz of AMASS: the 22 joints of the body, z up; `betas` is a label, numbers with spaces between them.
 

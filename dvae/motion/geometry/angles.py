@@ -17,7 +17,6 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import Function, once_differentiable
 
 from .skeleton import Skeleton, differences, inverse_lengths
 
@@ -198,58 +197,21 @@ def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
     """
     plan = _plan(skeleton, poses.device)
     matrix = differences(skeleton, plan.differences, poses.shape[-1], poses.dtype, poses.device)
-    cosines: Tensor = _Cosines.apply(poses.reshape(-1, poses.shape[-1]), matrix, plan)
-    return cosines.reshape(*poses.shape[:-1], len(plan.first))
-
-
-class _Cosines(Function):
-    """With its derivative by hand, which takes half the time of the recorded one.
-
-    Poses run along the last axis, so that every operation is one over long contiguous rows. With f and s the vectors
-    of a cosine c, of lengths |f| and |s|: dc/df = s / (|f| |s|) - c f / |f|^2. For a x b, with the gradient g of the
-    product: b x g for a, and g x a for b.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, poses: Tensor, matrix: Tensor, plan: _Plan) -> Tensor:
-        vectors = poses.new_empty(plan.vectors, 3, len(poses))
-        made = len(plan.differences)
-        with torch.autocast(poses.device.type, enabled=False):
-            torch.mm(matrix.T, poses.T, out=vectors[:made].flatten(0, 1))
-        for first, second in plan.crosses:
-            vectors[made : made + len(first)] = _cross(vectors.index_select(0, first), vectors.index_select(0, second))
-            made += len(first)
-        inverse = inverse_lengths(vectors, dim=1)
-        cos = (vectors.index_select(0, plan.first) * vectors.index_select(0, plan.second)).sum(1)
-        cos.mul_(inverse.index_select(0, plan.first)).mul_(inverse.index_select(0, plan.second))
-        if len(plan.partial):
-            inner = (vectors[plan.u] * vectors[plan.v]).sum(1)
-            absent = (inner < 0) != plan.negative[:, None]
-            cos[plan.partial] = cos[plan.partial].masked_fill(absent, torch.nan)
-        ctx.plan = plan
-        ctx.save_for_backward(matrix, vectors, inverse, cos)
-        return cos.T
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        matrix, vectors, inverse, cos = ctx.saved_tensors
-        plan: _Plan = ctx.plan
-        slope = outputs[0].T.masked_fill(cos.isnan(), 0)
-        along = slope * cos.nan_to_num()
-        scale = torch.zeros_like(inverse).index_add_(0, plan.first, along).index_add_(0, plan.second, along)
-        gradient = vectors * (-scale * inverse.square())[:, None]
-        slope = (slope * inverse.index_select(0, plan.first) * inverse.index_select(0, plan.second))[:, None]
-        gradient.index_add_(0, plan.first, slope * vectors.index_select(0, plan.second))
-        gradient.index_add_(0, plan.second, slope * vectors.index_select(0, plan.first))
-        made = len(vectors)
-        for first, second in reversed(plan.crosses):
-            product = gradient[made - len(first) : made]
-            gradient.index_add_(0, first, _cross(vectors.index_select(0, second), product))
-            gradient.index_add_(0, second, _cross(product, vectors.index_select(0, first)))
-            made -= len(first)
-        with torch.autocast(matrix.device.type, enabled=False):
-            return (matrix @ gradient[:made].flatten(0, 1)).T, None, None
+    flat = poses.reshape(-1, poses.shape[-1])
+    with torch.autocast(poses.device.type, enabled=False):
+        # poses run along the last axis, so that every operation is one over long contiguous rows
+        vectors = (matrix.T @ flat.T).unflatten(0, (-1, 3))
+    for first, second in plan.crosses:
+        crossed = _cross(vectors.index_select(0, first), vectors.index_select(0, second))
+        vectors = torch.cat([vectors, crossed])
+    units = vectors * inverse_lengths(vectors, dim=1)[:, None]
+    cosines = (units.index_select(0, plan.first) * units.index_select(0, plan.second)).sum(1)
+    if len(plan.partial):
+        absent = ((vectors[plan.u] * vectors[plan.v]).sum(1) < 0) != plan.negative[:, None]
+        lacking = torch.zeros_like(cosines, dtype=torch.bool).index_copy(0, plan.partial, absent)
+        cosines = cosines.masked_fill(lacking, torch.nan)
+    found: Tensor = cosines.T.reshape(*poses.shape[:-1], len(plan.first))
+    return found
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -305,39 +267,25 @@ def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
     return ANGLES[skeleton.name]
 
 
-class Places(NamedTuple):
+class _Plan(NamedTuple):
     """Which vectors to make, and between which of them the cosines of a skeleton are, by their places."""
 
     differences: tuple[tuple[int, int], ...]
     """The first vectors, from joint to joint."""
-    crosses: tuple[tuple[tuple[int, int], ...], ...]
-    """Of each round of cross products, which are appended, their factors."""
-    angles: tuple[tuple[int, int], ...]
-    partial: tuple[tuple[int, int, int, bool], ...]
-    """The angles that some poses do not have, and when: u v < 0, or not."""
-
-
-class _Plan(NamedTuple):
-    """The same as tensors."""
-
-    vectors: int
-    differences: tuple[tuple[int, int], ...]
     crosses: list[tuple[Tensor, Tensor]]
+    """Factors of each round of cross products, which are appended."""
     first: Tensor
     second: Tensor
     partial: Tensor
+    """The angles that some poses do not have, and when: u v < 0, or not."""
     u: Tensor
     v: Tensor
     negative: Tensor
 
 
 @lru_cache(maxsize=64)
-def angle_places(skeleton: Skeleton) -> Places:
-    """Those of a skeleton's angles.
-
-    Raises:
-        ValueError: the skeleton has no angles.
-    """
+@torch.inference_mode(False)  # as of `differences`
+def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
     angles = _angles(skeleton)
     needed: dict[Vector, int] = {}  # vector -> how deep its cross products are nested
     for angle in angles:
@@ -346,27 +294,16 @@ def angle_places(skeleton: Skeleton) -> Places:
     vectors = sorted(needed, key=needed.__getitem__)
     place = {vector: i for i, vector in enumerate(vectors)}
     rounds = [[vector for vector in vectors if needed[vector] == depth] for depth in range(max(needed.values()) + 1)]
-    return Places(
-        tuple(_joints(vector, skeleton) for vector in rounds[0]),
-        tuple(tuple((place[v[0]], place[v[2]]) for v in crosses if not isinstance(v, str)) for crosses in rounds[1:]),
-        tuple((place[angle.first], place[angle.second]) for angle in angles),
-        tuple((i, place[a.when[0]], place[a.when[1]], a.when[2] < 0) for i, a in enumerate(angles) if a.when),
-    )
-
-
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)  # as of `differences`
-def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
-    found = angle_places(skeleton)
 
     def columns(rows: Sequence[tuple[int, ...]], count: int) -> Any:
         return torch.tensor(rows, dtype=torch.long, device=device).reshape(-1, count).T.contiguous().unbind(0)
 
-    crosses = [columns(crosses, 2) for crosses in found.crosses]
-    first, second = columns(found.angles, 2)
-    partial, u, v, negative = columns(found.partial, 4)
-    made = len(found.differences) + sum(map(len, found.crosses))
-    return _Plan(made, found.differences, crosses, first, second, partial, u, v, negative.bool())
+    crosses = [columns([(place[v[0]], place[v[2]]) for v in some if not isinstance(v, str)], 2) for some in rounds[1:]]
+    first, second = columns([(place[angle.first], place[angle.second]) for angle in angles], 2)
+    parts = [(i, place[a.when[0]], place[a.when[1]], a.when[2] < 0) for i, a in enumerate(angles) if a.when]
+    partial, u, v, negative = columns(parts, 4)
+    made = tuple(_joints(vector, skeleton) for vector in rounds[0])
+    return _Plan(made, crosses, first, second, partial, u, v, negative.bool())
 
 
 def _depth(vector: Vector, needed: dict[Vector, int]) -> int:
