@@ -32,7 +32,7 @@ from torch.nn.functional import normalize
 
 from ...data.sequences import tensor_of
 from ..data.clips import Clip, MotionSet
-from ..geometry.kinematics import forward, swing
+from ..geometry.kinematics import forward, resting, swing
 from ..geometry.rotations import continuous, from_matrix, to_matrix
 from ..geometry.skeleton import Skeleton
 from ..naming import sides
@@ -368,9 +368,7 @@ def _bodies(motion: MotionSet) -> list[list[int]]:
 
 def _joints(body: Body, shapes: Tensor) -> Tensor:
     """Places (N, J, 3) of bodies (N, S) at rest with the root at 0."""
-    unturned = torch.eye(3).to(shapes).expand(body.joints, 3, 3)
-    places, _ = forward(body.parents, unturned, body.offsets(shapes), shapes.new_zeros(len(shapes), 3))
-    return places
+    return resting(body.parents, body.offsets(shapes))
 
 
 def standing(body: Body, shapes: Tensor) -> Tensor:
@@ -398,9 +396,7 @@ def _kept(motion: MotionSet, body: Body) -> Tensor:
     for offsets in resting_offsets(motion):
         shape = body.shape_of(offsets)
         if (body.offsets(shape) - offsets).abs().max() > SAME:
-            unturned = torch.eye(3).to(offsets).expand(body.joints, 3, 3)
-            joints, _ = forward(body.parents, unturned, offsets, offsets.new_zeros(3))
-            shape = source.shape(body, source.lengths(source.seen(joints)))
+            shape = source.shape(body, source.lengths(source.seen(resting(body.parents, offsets))))
         found.append(shape)
     return torch.stack(found)
 

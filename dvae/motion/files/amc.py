@@ -126,20 +126,18 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
     return bones, INCH / unit, degrees, order
 
 
-def read_amc(path: str | Path, skeleton: str | Path | None = None) -> Recording:
+def read_amc(path: str | Path) -> Recording:
     """Read an AMC file.
 
-    Args:
-        path: the file.
-        skeleton: its ASF file; by default the one beside it whose name begins its own (02.asf of 02_01.amc), or that
-            stands there alone.
+    Its skeleton is the ASF file in the same folder whose name begins the AMC file's name (02.asf of 02_01.amc), or the
+    only ASF file there.
 
     Raises:
         FileNotFoundError: there is no such file, or no ASF file beside it.
         ValueError: the file is none, or damaged, or of another skeleton; the message has the frame.
     """
     path = Path(path)
-    skeleton = Path(skeleton) if skeleton else _skeleton_of(path)
+    skeleton = _skeleton_of(path)
     bones, metres, degrees, order = read_asf(skeleton)
     names, parents, offsets = joints_of(bones)
     columns = {"root": 6} | {name: len(bone.turns) for name, bone in bones.items() if bone.turns}

@@ -52,6 +52,12 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
     return torch.cat(placed, -2).index_select(-2, back), torch.cat(turned, -3).index_select(-3, back)
 
 
+def resting(parents: Sequence[int], offsets: Tensor) -> Tensor:
+    """Joints (..., J, 3) with nothing turned and the root at 0, of offsets from their parents (..., J, 3)."""
+    unturned = torch.eye(3).to(offsets).expand(len(parents), 3, 3)
+    return forward(parents, unturned, offsets, offsets.new_zeros(*offsets.shape[:-2], 3))[0]
+
+
 def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
     """Local rotations of which `forward` makes poses as near as bones of these lengths allow.
 

@@ -29,7 +29,7 @@ import torch
 from ...data.sequences import tensor_of
 from ...options import Amount, Positive, Range, Share, check
 from ..data.clips import Clip, MotionSet
-from ..geometry.kinematics import forward
+from ..geometry.kinematics import resting
 from ..geometry.rotations import continuous, from_matrix, to_matrix
 from ..geometry.skeleton import Skeleton, rotate_about_up
 from .warping import alignment, subsequence_costs
@@ -251,9 +251,7 @@ def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
 @lru_cache(maxsize=8)
 def _resting(skeleton: Skeleton) -> torch.Tensor:
     """Joints (J, 3) with nothing turned, and the root at 0."""
-    unturned = torch.eye(3, dtype=torch.float64).expand(skeleton.joints, 3, 3)
-    places, _ = forward(skeleton.parents, unturned, skeleton.offsets, unturned.new_zeros(3))
-    return places
+    return resting(skeleton.parents, skeleton.offsets)
 
 
 @lru_cache(maxsize=8)

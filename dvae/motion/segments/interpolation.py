@@ -23,7 +23,7 @@ from ...inference.evaluation.result import Table, as_they_are, canvas
 from ...turns import alone
 from ..bodies import Body
 from ..data.clips import MotionSet
-from .embodied import SHAPE
+from .embodied import SHAPE, surfaces_of
 from .frames import OFFSETS, TimedFrames
 
 if TYPE_CHECKING:
@@ -107,9 +107,7 @@ class Interpolation:
 
     def vertices(self, pair: int = 0) -> Tensor:
         """Surfaces (M, N, V, 3) of a pair in metres."""
-        rotations, place, _ = self.timed.unpack(self.x[pair])
-        found: Tensor = self.body(self.shape[pair], rotations, place)[0]
-        return found
+        return surfaces_of(self.timed, self.body, self.x[pair], self.shape[pair])
 
     @cached_property
     def _unpacked(self) -> tuple[Tensor, Tensor, Tensor]:

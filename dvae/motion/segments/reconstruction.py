@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -39,18 +39,6 @@ if TYPE_CHECKING:
 
 ERROR, DURATION = "vertex error", "duration error"
 METRICS = {ERROR: Metric("mm"), DURATION: Metric("ms"), **TEACHER_FORCED}
-
-
-class LatentSpace(Protocol):
-    """A model that makes whole segments of a latent and a body, such as that of `motion-latent`."""
-
-    timed: TimedFrames
-
-    def encode(self, batch: Batch) -> Tensor:
-        """Latents (B, Z) of x (B, N, D) and beta (B, S)."""
-
-    def decode(self, latent: Tensor, shape: Tensor) -> Tensor:
-        """Frames (..., N, D) of latents (..., Z) on bodies (..., S)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -203,7 +191,7 @@ def reconstruct_segments(
     metres, whatever frames are.
 
     Args:
-        models: by name, such as of `motion-latent`; see `LatentSpace`.
+        models: by name, such as of `motion-latent`; of each `timed`, `encode` and `decode` are used.
         segments: held-out ones, on one kind of body.
         training: of which principal components are taken; without them there is no such row.
         bound_particles: of the importance-weighted bound and its k-hat; 0 leaves both out.
