@@ -101,7 +101,7 @@ def main(
     data = sensors(runs / "sensors.npz")
     on_twins = {"sizes": {"z": 1, "x": len(SENSORS)}, "steps": steps, "twins": seeds}
     found = dvae.ablate(method, data, runs, (0, 1, 2), {**TRAINING, "steps": fitting}, jobs, **on_twins)
-    found.save(runs / "ablation.json")
+    found.save(runs / "edges.json")
     write(page, fitted(found), name="fitted")
     found.plot().savefig(picture, dpi=100)
 

@@ -26,46 +26,67 @@ from .console import ERROR, OUT, UsageError, note, speaks
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)
 """The exit code that a shell gives to a program whose output nobody reads."""
 
-COMMANDS = {
-    "list": ("methods:list_methods", "List the methods: their equations and where they come from."),
-    "show": ("methods:show", "Show two equations: the joint distributions, the audit of the guide, and the graph."),
-    "fit": ("fitting:fit", "Fit a method, or equations of your own, to motion data."),
-    "resume": ("fitting:resume", "Continue a run from its last checkpoint."),
-    "sweep": ("fitting:sweep", "Fit methods with several seeds and sizes, several runs at a time."),
-    "evaluate": ("judging:evaluate", "Score runs on test windows."),
-    "criticise": ("judging:criticise", "Is a run's guide calibrated, and do its motions look like real ones?"),
-    "reference": ("judging:reference", "Put what a run's guide says of latents beside their posterior."),
-    "tubes": ("judging:tubes", "Widen a run's forecasts to tubes that hold the future as often as they say."),
-    "compare": (
-        "judging:compare",
-        "Compare runs on test windows: bounds, paired differences with their errors, use of latents.",
-    ),
-    "ablate": ("ablation:ablate", "What every arrow of a model and its guide is worth: on twins, and fitted to data."),
-    "bracket": ("judging:bracket", "A run's evidence between two bounds, and where its ELBO falls short of it."),
-    "forecast": ("futures:forecast", "Forecast the test windows, or those of one clip, many times each."),
-    "complete": ("futures:complete", "Complete motion along paths of some joints, from a clip or from a file."),
-    "interpolate": ("segments:interpolate", "Go from one segment of motion to another in a run's latent space."),
-    "recover": ("segments:recover", "Recover whole segments of motion from what was seen of them, and how surely."),
-    "impute": ("futures:impute", "Fill in the joints that windows or clips lack, several times each."),
-    "animate": ("futures:animate", "Play forecasts beside what happened, or a clip, as moving skeletons."),
-    "report": ("report:report", "Put what is known of runs on one page, with moving futures."),
-    "data": ("data:data", "Look into motion files."),
+GROUPS = {
+    "start": {
+        "list": ("methods:list_methods", "List the methods with their equations and sources."),
+        "show": ("methods:show", "Show two equations: joint distributions, audit of the guide, graph."),
+        "data info": ("data:info", "Describe motion files, or tables with a schema to edit."),
+        "data convert": ("data:convert", "Convert motion files to another format, rate or skeleton."),
+        "data get": ("data:get", "Download and verify public recordings."),
+    },
+    "fit": {
+        "fit": ("fitting:fit", "Fit a method, or equations of your own, to motion or to a table."),
+        "resume": ("fitting:resume", "Continue a run from its last checkpoint."),
+        "sweep": ("fitting:sweep", "Fit methods with several seeds and options, several runs at a time."),
+    },
+    "use": {
+        "forecast": ("futures:forecast", "Draw forecasts, or motion along given paths of some joints."),
+        "impute": ("futures:impute", "Draw missing values, or whole segments of motion from parts of them."),
+        "animate": ("futures:animate", "Play forecasts or a clip as moving skeletons."),
+    },
+    "assess": {
+        "evaluate": ("judging:evaluate", "Score runs on test windows."),
+        "compare": ("judging:compare", "Compare runs: bounds, paired differences with errors, use of latents."),
+        "check calibration": ("checks:calibration", "Calibrate the guide by simulation, and check predictions."),
+        "check posterior": ("checks:posterior", "Compare the guide with NUTS samples of the posterior."),
+        "check gap": ("checks:gap", "Bound the evidence from both sides and divide the gap of the ELBO."),
+        "check coverage": ("checks:coverage", "Widen forecasts to bands with a given coverage, and test it."),
+        "check edges": ("checks:edges", "Leave out each edge of model and guide in turn."),
+        "report": ("report:report", "Write one page of all that is known of some runs."),
+    },
 }
-"""Name to "module:function", imported when it is meant, and what `dvae --help` says of it."""
+"""Commands by group: name to "module:function", imported when it is called, and its line in `dvae --help`."""
+COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
+FAMILIES = {name.partition(" ")[0] for name in COMMANDS if " " in name}
+"""First words of commands of two words."""
+
+
+def named(given: Sequence[str]) -> str | None:
+    """Return the command that the arguments name; None if they name none.
+
+    Raises:
+        UsageError: an unknown command.
+    """
+    words = given[: 2 if given and given[0] in FAMILIES else 1]
+    if not words or words[-1].startswith("-") or (len(words) < 2 and words[0] in FAMILIES):
+        return None
+    name = " ".join(words)
+    if name not in COMMANDS:
+        known = [other for other in COMMANDS if len(words) == 1 or other.startswith(f"{words[0]} ")]
+        raise UsageError(f"unknown command {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+    return name
 
 
 def command(given: Sequence[str]) -> Callable[..., None] | None:
-    """The command that the arguments name, imported; None if they name none.
+    """Return the command that the arguments name, imported; None if they name none.
 
     Raises:
-        UsageError: an unknown one.
+        UsageError: an unknown command.
     """
-    if not given or given[0].startswith("-"):
+    if (name := named(given)) is None:
         return None
-    if given[0] not in COMMANDS:
-        raise UsageError(f"unknown command {given[0]!r}{nearest(given[0], COMMANDS)}; known: {', '.join(COMMANDS)}")
-    module, _, name = COMMANDS[given[0]][0].partition(":")
-    return getattr(import_module(f"{__package__}.{module}"), name)  # type: ignore[no-any-return]
+    module, _, function = COMMANDS[name][0].partition(":")
+    return getattr(import_module(f"{__package__}.{module}"), function)  # type: ignore[no-any-return]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -130,24 +151,42 @@ def _ended(given: list[str], debug: bool) -> int:
 
 
 def _run(given: list[str]) -> None:
-    """Runs the command with its arguments; without one, tyro says which there are."""
-    meant = command(given)
-    if meant is not None:
-        config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes)
-        tyro.cli(meant, prog=f"dvae {given[0]}", args=given[1:], config=config)
-        return
-    if given == ["--version"]:
+    """Run the command with its arguments, or print help."""
+    name, meant = named(given), command(given)
+    if meant is not None and name is not None:
+        rest = given[len(name.split()) :]
+        config: tuple[Any, ...] = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes)
+        if HELP & {*rest}:
+            from .help import described
+
+            meant, method = described(meant, rest, everything="--help-all" in rest)
+            name, rest, config = name + method, ["--help"], (*config, tyro.conf.DisallowNone)
+        tyro.cli(meant, prog=f"dvae {name}", args=rest, config=config)
+    elif given == ["--version"]:
         OUT.print(f"dvae {__version__}")
-        return
-    app = tyro.extras.SubcommandApp()
-    for name, (_, about) in COMMANDS.items():
-        app.command(name=name, help=about)(lambda: None)
-    app.cli(
-        prog="dvae",
-        description="Dynamical variational autoencoders from their factorizations. "
-        "With --debug, a failure shows its traceback; --version alone prints the version.",
-        args=given,
-    )
+    elif unknown := [argument for argument in given if argument.startswith("-") and argument not in HELP]:
+        raise UsageError(f"unknown option {unknown[0]}; dvae takes a command, --help or --version")
+    else:
+        _overview(given[0] if given and given[0] in FAMILIES else "")
+        if not HELP & {*given}:
+            raise SystemExit(2)
+
+
+HELP = {"-h", "--help", "--help-all"}
+
+
+def _overview(family: str) -> None:
+    """Print the commands by group, or those of a family such as `dvae check`."""
+    OUT.print(f"usage: dvae {family or '[--version]'} COMMAND [--help] [--help-all] [options]\n", highlight=False)
+    if not family:
+        OUT.print("Dynamical variational autoencoders from their factorizations.\n", highlight=False)
+    for group, commands in GROUPS.items():
+        chosen = {name: about for name, (_, about) in commands.items() if name.startswith(family)}
+        if chosen:
+            OUT.print(group, style="bold", highlight=False)
+            for name, about in chosen.items():
+                OUT.print(f"  {name:<18} {about}", highlight=False)
+    OUT.print("\n--help lists the common options of a command, --help-all all of them; --debug shows tracebacks.")
 
 
 def _meant(given: Sequence[str]) -> Iterator[str]:
@@ -156,17 +195,19 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
         return
     from ..models.registry import judges, methods
 
-    name, *rest = given
+    name = named(given) or ""
+    rest = given[len(name.split()) :]
     hints = get_type_hints(called)
     kinds = [*filter(is_dataclass, hints.values()), *(methods().values() if name in ("fit", "sweep") else ())]
-    for kind in kinds:
-        hints = get_type_hints(kind) | hints
-    options = {f"--{option.replace('_', '-')}" for option in [*hints, "from", "to", "help"]}
+    for kind in kinds:  # which grows by the dataclasses in it
+        hints = (own := get_type_hints(kind)) | hints
+        kinds += filter(is_dataclass, own.values())
+    options = {f"--{option.replace('_', '-')}" for option in [*hints, "from", "help", "help-all"]}
     for word in (word.partition("=")[0].replace("--no-", "--") for word in rest if word.startswith("--")):
         if word not in options and (meant := nearest(word, options)):
             yield f"{word} is no option of dvae {name}{meant}"
     choices = {option: _choices(hint) for option, hint in hints.items()}
-    names = {"fit": [*methods(), *judges()], "sweep": choices.get("method"), "data": choices.get("action")}.get(name)
+    names = {"fit": [*methods(), *judges()], "sweep": choices.get("method")}.get(name)
     for before, word in pairwise(["", *rest]):
         option = before if before.startswith("--") else ""
         known = choices.get(option.removeprefix("--").replace("-", "_")) if option else names

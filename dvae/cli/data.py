@@ -1,4 +1,4 @@
-"""The command that looks into motion files, converts them and gets some."""
+"""Commands on files: data info, convert and get."""
 
 from __future__ import annotations
 
@@ -17,11 +17,46 @@ ONTO = {skeleton.name: skeleton for skeleton in (motion.WALKER, motion.HUMAN36M,
 """Skeletons by name; others come from a skeleton.json."""
 
 
-def data(
-    action: Annotated[Literal["info", "convert", "get"], tyro.conf.Positional],
+def info(
+    files: Annotated[tuple[str, ...], tyro.conf.Positional],
     table: tables.ColumnOptions,
-    files: Annotated[tuple[str, ...], tyro.conf.Positional] = (SIMULATED,),
     out: Path | None = None,
+    metres: float | None = None,
+    up: Literal["y", "z"] | None = None,
+    recorded: float | None = None,
+    skip_bad: bool = False,
+    missing: Missing = False,
+) -> None:
+    """Describe motion files or tables.
+
+    Of motion: splits, clips, skeleton, units, axes, bone lengths and labels. Of a table: guesses the columns and prints
+    a schema; --out riders.toml writes it to a file that you can edit.
+
+    Args:
+        files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), "simulated", or tables.
+        table: columns of the tables.
+        out: file to write the schema of a table to.
+        metres: metres per unit of the files, instead of the detected value.
+        up: vertical axis of the files, instead of the detected one.
+        recorded: frames per second of the files, if they state a wrong rate.
+        skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
+    """
+    files = files or (SIMULATED,)
+    found = [file for file in files if tables.is_table(file)]
+    if table != tables.ColumnOptions() and len(found) < len(files):
+        raise UsageError("options of columns are about tables")
+    if out and len(found) < len(files):
+        raise UsageError("--out takes the schema that info proposes for a table; of motion info writes nothing")
+    if found:
+        tables.info(found, out, table)
+    for file in files:
+        if file not in found:
+            OUT.print(_read(file, metres, up, recorded, skip_bad, missing).info())
+
+
+def convert(
+    files: Annotated[tuple[str, ...], tyro.conf.Positional],
+    out: Path,
     format: Literal["npz", "bvh", "csv", "amass"] | None = None,
     fps: float | None = None,
     onto: str | None = None,
@@ -29,59 +64,25 @@ def data(
     metres: float | None = None,
     up: Literal["y", "z"] | None = None,
     recorded: float | None = None,
-    url: str | None = None,
     skip_bad: bool = False,
     missing: Missing = False,
 ) -> None:
-    """Inspect motion files and tables, convert motion, or download it.
-
-    info describes motion files: splits, clips, skeleton, units, axes, bone lengths and labels.
-    info guesses the columns of a table and prints a schema; --out riders.toml writes it to a file that you can edit.
-    convert writes all clips to one file (--out motion.npz), or one file per clip to a folder (--out and --format).
-    get cmu downloads recordings of the CMU Graphics Lab to the folder --out and verifies them.
+    """Convert motion files: all clips to one file (--out motion.npz), or one file per clip to a folder.
 
     Args:
-        action: what to do.
-        table: for info: columns of the tables.
-        files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), or "simulated"; for get: cmu.
+        files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), or "simulated".
         out: file or folder to write.
-        format: for convert: format to write, by default from the name of --out.
-        fps: for convert: frames per second to write.
-        onto: for convert: target skeleton: walker, human36m, humaneva, or the path of a skeleton.json.
-        jobs: for convert: number of processes; -1 for one per core.
+        format: format to write, by default from the name of --out.
+        fps: frames per second to write.
+        onto: target skeleton: walker, human36m, humaneva, or the path of a skeleton.json.
+        jobs: number of processes; -1 for one per core.
         metres: metres per unit of the files, instead of the detected value.
         up: vertical axis of the files, instead of the detected one.
         recorded: frames per second of the files, if they state a wrong rate.
-        url: for get: address to download from, instead of the original site.
         skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
     """
-    if table != tables.ColumnOptions() and (action != "info" or not all(map(tables.is_table, files))):
-        raise UsageError("options of columns are about tables, and of info")
-    if action == "info":
-        if format or fps or onto or url:
-            raise UsageError("--format, --fps, --onto and --url are of convert and get")
-        found = [file for file in files if tables.is_table(file)]
-        if out and len(found) < len(files):
-            raise UsageError("--out takes the schema that info proposes for a table; of motion info writes nothing")
-        if found:
-            tables.info(found, out, table)
-        for file in files if not found else [file for file in files if file not in found]:
-            OUT.print(_read(file, metres, up, recorded, skip_bad, missing).info())
-        return
-    if out is None:
-        raise UsageError(f"data {action} writes files; say where, by --out")
-    if action == "get":
-        from ..motion.files.getting import COLLECTIONS, get
-
-        if len(files) != 1 or files[0] not in COLLECTIONS:
-            raise UsageError(f"get what? Known is {', '.join(COLLECTIONS)}")
-        got = get(files[0], out, url)
-        ERROR.print(f"{len(got)} files of {files[0]} in {out}; dvae data info {out}", markup=False)
-        return
-    if url:
-        raise UsageError("--url is of get")
     known = _skeleton(onto)
-    if files == (SIMULATED,):
+    if files in ((), (SIMULATED,)):
         if metres or up or recorded:
             raise UsageError("--metres, --up and --recorded are of files, which may be wrong about them")
         people = motion.simulate() if fps is None else motion.simulate().resampled(fps)
@@ -92,6 +93,24 @@ def data(
         paths = [Path(file) for file in files]
         said = writing.convert(paths, out, format, fps, known, jobs, **told)  # type: ignore[arg-type]
     ERROR.print(f"wrote {out}: {said}", markup=False)
+
+
+def get(
+    collection: Annotated[Literal["cmu"], tyro.conf.Positional],
+    out: Path,
+    url: str | None = None,
+) -> None:
+    """Download public recordings to a folder and verify them.
+
+    Args:
+        collection: cmu, recordings of the CMU Graphics Lab.
+        out: folder to write.
+        url: address to download from, instead of the original site.
+    """
+    from ..motion.files.getting import get as downloaded
+
+    got = downloaded(collection, out, url)
+    ERROR.print(f"{len(got)} files of {collection} in {out}; dvae data info {out}", markup=False)
 
 
 def _read(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields, make_dataclass
 from functools import reduce
@@ -36,10 +36,11 @@ from ..runs.kinds import DATA
 from ..runs.sweep import sweep as sweep_methods
 from ..tables.dataset import PanelData
 from .console import ERROR, OUT, Missing, UsageError, arguments, at_least
+from .help import EXPERT, Expert
 from .tables import ColumnOptions, is_table
 
 
-def options_of(name: str, kind: type[Any], *aside: str) -> Any:
+def options_of(name: str, kind: type[Any], *aside: str, common: Collection[str] | None = None) -> Any:
     """A dataclass of the options of another that can be written as words, but those that are left aside.
 
     Options are None where they are not given, and flags False.
@@ -48,6 +49,7 @@ def options_of(name: str, kind: type[Any], *aside: str) -> Any:
         name: of the class.
         kind: whose options.
         aside: names of options.
+        common: names of the options that `--help` shows; all by default.
     """
     hints = get_type_hints(kind, include_extras=True)
     found, schedules = [], {*get_args(Schedule)}
@@ -55,8 +57,9 @@ def options_of(name: str, kind: type[Any], *aside: str) -> Any:
         hint = hints[option.name]
         if schedules & {*get_args(hint)}:
             hint = reduce(or_, [part for part in get_args(hint) if part not in schedules])
-        flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-        found.append((option.name, flag, False) if hint is bool else (option.name, hint | None, None))
+        given: Any = Annotated[bool, tyro.conf.FlagCreatePairsOff] if hint is bool else hint | None
+        shown = given if common is None or option.name in common else Annotated[given, EXPERT]
+        found.append((option.name, shown, False if hint is bool else None))
     kept = [option for option in found if option[0] not in aside]
     return make_dataclass(name, kept, frozen=True, namespace={"__doc__": kind.__doc__})
 
@@ -78,8 +81,9 @@ else:
     ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
     SweptMethod = tyro.extras.literal_type_from_choices([name for name in methods() if name != "equations"])
     MethodOptions = options_of("MethodOptions", LatentMethod, "latent")
-    TrainingOptions = options_of("TrainingOptions", Training, "self_feeding", "progress")
-    SweepOptions = options_of("SweepOptions", Training, "self_feeding", "progress", "seed", "devices")
+    COMMON = ("steps", "batch_size", "learning_rate", "patience", "seed", "accelerator")
+    TrainingOptions = options_of("TrainingOptions", Training, "self_feeding", "progress", common=COMMON)
+    SweepOptions = options_of("SweepOptions", Training, "self_feeding", "progress", "seed", "devices", common=COMMON)
 
 
 @dataclass(frozen=True)
@@ -107,20 +111,20 @@ class DataOptions(ColumnOptions):
     """
 
     data: str = SIMULATED
-    skip_bad: bool = False
+    skip_bad: Expert[bool] = False
     protocol: ProtocolName | None = None
-    representation: Representation = "positions"
+    representation: Expert[Representation] = "positions"
     missing: Missing = False
-    cut: Segmentation = "gait"
-    scaling: Literal["identity", "deviation"] = "identity"
-    warped: bool = False
-    bodies: Amount = 1.0
+    cut: Expert[Segmentation] = "gait"
+    scaling: Expert[Literal["identity", "deviation"]] = "identity"
+    warped: Expert[bool] = False
+    bodies: Expert[Amount] = 1.0
     observed: int | None = None
     horizon: int | None = None
-    stride: int | None = None
+    stride: Expert[int | None] = None
     split: Literal["sequence", "time", "group"] | None = None
-    validation: Share | None = None
-    test: Share | None = None
+    validation: Expert[Share | None] = None
+    test: Expert[Share | None] = None
     season: Frames | None = None
 
     def open(self, *methods: Trainable) -> Any:
@@ -166,7 +170,7 @@ OF_KINDS = {
     ),
 }
 """Options by the kind of data that has them."""
-SAID = {"motion": "motion", "segments": "segments of motion", "panel": "a table"}
+SAID = {"windows": "windows", "motion": "motion", "segments": "segments of motion", "panel": "a table"}
 
 
 def fit(
@@ -177,8 +181,6 @@ def fit(
     tensorboard: bool = False,
 ) -> None:
     """Fit a method, or equations of your own, to motion or to a table.
-
-    Options may stand before or after the method; `dvae fit METHOD --help` lists those of a method.
 
     Args:
         method: what to fit.
@@ -335,17 +337,11 @@ def _use(name: str, run: Path) -> str:
         what = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"
         return f"score {what} with: dvae evaluate RUN {option} {run}"
+    scored = f"score it with: dvae evaluate {run}"
     if Run(run).config["data"].get("kind") == "panel":
-        return (
-            f"score it with: dvae evaluate {run}, forecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
-        )
+        return f"{scored}, forecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
     if methods()[name].fitted_on == "segments":
-        between = f"go from one segment to another with: dvae interpolate {run} --from CLIP --to CLIP"
-        return (
-            f"score it with: dvae evaluate {run}, {between}, recover one from a part of it with: dvae recover {run} "
-            "--from CLIP --seen markers"
-        )
+        return f"{scored}, recover a segment from a part of it with: dvae impute {run} --from CLIP --seen markers"
     if issubclass(methods()[name], TrajectoryMethod):
-        joints = f"{run} --joints JOINT …"
-        return f"score it with: dvae evaluate {joints}, move it with: dvae complete {joints}"
-    return f"score it with: dvae evaluate {run}"
+        return f"{scored} --joints JOINT …, move it with: dvae forecast {run} --joints JOINT … --out FILE.npz"
+    return scored

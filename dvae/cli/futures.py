@@ -1,9 +1,9 @@
-"""Commands that make motion and show it: forecast, complete, impute, animate."""
+"""Commands that use runs: forecast, impute, animate."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
@@ -23,7 +23,9 @@ from ..options import nearest
 from ..runs import directory as runs
 from . import tables
 from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, save_figure
-from .opening import data_of, kind_of, load_run
+from .help import Expert
+from .opening import data_of, forecaster, kind_of, load_run
+from .segments import Recovery
 
 SAMPLES = 10
 """Futures and fillings of motion where nobody says how many."""
@@ -31,65 +33,95 @@ EMISSIONS = {"drawn": "draws of the emission", "mean": "means of the emission", 
 """What the emission of futures is called."""
 
 
+@dataclass(frozen=True)
+class Paths:
+    """Paths to follow, for methods that take trajectories (trajevae, cvae-rnn, motion-infilling).
+
+    Args:
+        joints: joints that follow their own paths in the window.
+        paths: file of paths: an npz of one array (frames, 3) for each joint, or a csv with columns such as LWrist_x,
+            LWrist_y, LWrist_z and one row for each frame, in metres from the pelvis of the first pose; empty or nan
+            where a path is not known.
+        window: number of the window whose first pose motions start from, from 0; by default the one that moves most.
+        exact: put the given joints on their paths with bones at their lengths, by optimising the motions' latents and
+            then their poses; not for motion-infilling, which has no latents.
+        temperature: factor of the scale of the latents; 0 for the motion of the prior's mean.
+    """
+
+    joints: tuple[str, ...] = ()
+    paths: Path | None = None
+    window: Expert[int | None] = None
+    exact: Expert[bool] = False
+    temperature: Expert[float] = 1.0
+
+
 def forecast(
     run: Annotated[Path, tyro.conf.Positional],
     out: Path,
+    along: Paths,
     clip: str | None = None,
     horizon: int | None = None,
     samples: int | None = None,
-    fix: tuple[str, ...] = (),
-    draw_emission: bool | None = None,
+    fix: Expert[tuple[str, ...]] = (),
+    draw_emission: Expert[bool | None] = None,
     seed: int = 0,
     data: str | None = None,
-    missing: Missing = False,
-    failed: Failed = False,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
     figure: Path | None = None,
     beyond: bool = False,
 ) -> None:
     """Forecast the test windows, or those of one clip or sequence, many times each.
 
-    Of a table, a CSV or Parquet gets a row for each window, step and column, with mean and quantiles, an npz the draws;
-    --figure draws their fans.
+    Of a table, a CSV or Parquet file gets a row for each window, step and column, with mean and quantiles, and an npz
+    the draws; --figure draws their fans.
 
-    A name that ends in .bvh gets the first future of the window that moves most, after what was observed of it; one
-    without an ending is a new folder, and gets a BVH file for every window and future: Blender opens these. They hold
-    the observed frames and then the future, in the place and at the height of the clip if the protocol keeps the root's
-    path. If it removes that, all frames are relative to the root, which stays at the origin.
-
-    The npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
+    Of motion, an npz holds, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
     (windows, frames, joints, 3), NaN where a joint was missing, `split`, `clip` and `start` of each window, the
-    skeleton, and `emission`: whether futures are "drawn" or "mean". `dvae animate` plays it,
-    `dvae.motion.Forecasts.load` reads it.
+    skeleton, and `emission`: whether futures are "drawn" or "mean". `dvae animate` plays it, and
+    `dvae.motion.Forecasts.load` reads it. A name that ends in .bvh gets the first future of the window that moves most;
+    a name without an ending is a new folder with a BVH file for every window and future. BVH files hold the observed
+    frames and then the future, at the place of the clip if the protocol keeps the root's path.
+
+    With --joints or --paths, motions start at the first pose of one window and follow these paths.
 
     Args:
         run: the run directory.
-        out: the npz file to write, a BVH file, or a folder of these.
+        out: the file or folder to write.
+        along: paths of joints.
         clip: name of a clip, or split/name where the name is not unique; of a table, of a sequence; of any split.
         horizon: frames to forecast; by default those of the protocol.
-        beyond: of a table: what comes after its last row with a target, from rows behind that with known covariates.
-        samples: forecasts of each window; by default 10, and of a table, of which quantiles are written, 100.
-        fix: parts of the body, such as lower, or static latents, of which all forecasts of a window share one draw.
+        samples: number of forecasts of each window; by default 10, and 100 of a table, whose quantiles are written.
+        fix: parts of the body, such as lower, or static latents, that all forecasts of a window share.
         draw_emission: of motion: futures with the noise of the emission, or its means given draws of the latents. By
-            default draws in an npz, and means in BVH, which is played, unless nothing is latent.
-        seed: of the draws.
-        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+            default draws in an npz, and means in BVH, unless the model has no latents.
+        seed: seed of the draws.
+        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
         figure: save a figure of the first window's futures.
+        beyond: of a table: forecast what comes after its last row with a target, from later rows with known covariates.
     """
     at_least(1, samples=samples, horizon=horizon)
+    at_least(0, window=along.window)
     check_files(out, figure)
-    if kind_of([run], data) == "panel":
+    loaded, opened = forecaster(run, data, missing, failed)
+    if loaded.config.kind == "panel":
         of_motion = {"fix": bool(fix), "missing": missing, "draw-emission": draw_emission is not None}
+        of_motion |= {name: value != getattr(Paths, name) for name, value in vars(along).items()}
         if given := [name for name, is_given in of_motion.items() if is_given]:
             raise UsageError(f"--{given[0]} is about motion, and {run} is of a table")
-        tables.forecast(run, out, clip, horizon, samples, seed, data, figure, beyond, failed)
+        tables.forecast(loaded, opened, out, clip, horizon, samples, seed, figure, beyond)
         return
-    samples = samples or SAMPLES
     if beyond:
         raise UsageError(f"--beyond is about tables, and {run} is of motion")
+    windows, samples = windows_of(opened, clip), samples or SAMPLES
+    if along != Paths():
+        check_files(out, figure, ".npz")
+        if horizon or fix or draw_emission is not None:
+            raise UsageError("--horizon, --fix and --draw-emission do not apply to motion along --joints or --paths")
+        _completed(loaded, windows, along, samples, seed, out, figure)
+        return
     suffix = out.suffix.lower()
     check_files(out, figure, ".npz", ".bvh", "")
-    loaded = load_run(run, data, failed=failed)
-    windows = windows_of(loaded, data, clip, missing)
     chosen: Sequence[int] = range(len(windows))
     if suffix == ".bvh":
         chosen = [_liveliest(windows.positions(gapped(windows.all())).numpy(), None)]
@@ -115,58 +147,19 @@ def forecast(
     _save_futures(futures, figure)
 
 
-def complete(
-    run: Annotated[Path, tyro.conf.Positional],
-    out: Path,
-    joints: tuple[str, ...] = (),
-    paths: Path | None = None,
-    clip: str | None = None,
-    window: int | None = None,
-    samples: int = 5,
-    exact: bool = False,
-    temperature: float = 1.0,
-    seed: int = 0,
-    data: str | None = None,
-    missing: Missing = False,
-    failed: Failed = False,
-    figure: Path | None = None,
+def _completed(
+    loaded: runs.Loaded, windows: motion.Windows, paths: Paths, samples: int, seed: int, out: Path, figure: Path | None
 ) -> None:
-    """Complete motion along paths of some joints, from a clip or from a file.
-
-    The motions start at the first pose of a window, and follow its own `--joints`, or the paths of a file. That is an
-    npz of one array (frames, 3) for each joint, or a csv with a header such as LWrist_x,LWrist_y,LWrist_z and one row
-    for each frame: metres, with the pelvis of the first pose at the origin; empty or nan where a path is not known.
-    What is written is what `dvae forecast` writes.
-
-    Args:
-        run: the run directory of a trajevae, cvae-rnn or motion-infilling.
-        out: the npz file to write.
-        joints: joints whose way in the window is given.
-        paths: file of other paths.
-        clip: name of a clip, or split/name where the name is not unique; by default any test window.
-        window: which of its windows, from 0; by default the one that moves most.
-        samples: motions.
-        exact: have the given joints on their paths, with bones at their lengths, by moving the motions' latents and, by
-            what that leaves, their poses; not of motion-infilling, which has none.
-        temperature: of the latents' scale; 0 for the motion of the prior's mean.
-        seed: of the draws.
-        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
-        figure: save a figure of the motions; crosses are the given paths.
-    """
-    at_least(1, samples=samples)
-    at_least(0, window=window)
-    check_files(out, figure, ".npz")
-    loaded = load_run(run, data, failed=failed)
+    """Draw motions along given paths, from the first pose of one window, and write them."""
     if not isinstance(loaded.model, TrajectoryModel):
-        raise UsageError(f"{run} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
-    if exact and not (joints or paths):
+        raise UsageError(f"{loaded.path} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
+    if paths.exact and not (paths.joints or paths.paths):
         raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
-    windows = windows_of(loaded, data, clip, missing)
     positions = windows.positions(gapped(windows.all())).numpy()
-    chosen = _liveliest(positions, window)
+    chosen = _liveliest(positions, paths.window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
-    given = _told(joint_names(joints), truth, paths, windows.skeleton)
-    how: dict[str, Any] = {"exact": exact, "temperature": temperature, "progress": True}
+    given = _told(joint_names(paths.joints), truth, paths.paths, windows.skeleton)
+    how: dict[str, Any] = {"exact": paths.exact, "temperature": paths.temperature, "progress": True}
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         done = loaded.model.complete(pose, given, None if given else len(truth), samples, **how)
@@ -182,43 +175,64 @@ def complete(
 
 def impute(
     run: Annotated[Path, tyro.conf.Positional],
+    recovery: Recovery,
     out: Path | None = None,
     filled: Path | None = None,
     clip: str | None = None,
     samples: int | None = None,
-    particles: int = 1,
-    draw_emission: bool | None = None,
+    particles: Expert[int] = 1,
+    draw_emission: Expert[bool | None] = None,
     seed: int = 0,
     data: str | None = None,
-    missing: Missing = False,
-    failed: Failed = False,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
 ) -> None:
-    """Fill in the joints that test windows lack, or those of a whole clip, several times each.
+    """Draw what is missing: joints of motion, entries of a table, or whole segments from parts of them.
 
-    The npz of --out holds, in metres, `filled` (samples, windows, frames, joints, 3), positions as windows have them,
-    with joints as they were observed, or else filled in; `observed` (windows, frames, joints), which were; `spread`,
-    how far the samples' places of a joint are from their mean; `split`, `clip` and `start` of each window, the
-    skeleton, and `emission`: whether fillings are "drawn" or "mean". --filled is the motion itself, where it was in the
-    world, with the gaps in these windows filled once: for `dvae evaluate --data`, or other programs.
+    Of motion, the npz of --out holds, in metres, `filled` (samples, windows, frames, joints, 3), `observed` (windows,
+    frames, joints), `spread`, the mean distance of the samples of a joint from their mean; `split`, `clip` and `start`
+    of each window, the skeleton, and `emission`: whether fillings are "drawn" or "mean". --filled is the motion itself,
+    in the world, with the missing joints of these windows filled once.
+
+    Of a motion-latent run, segments are recovered with their timing and bodies, either known ones (--from NAME --seen
+    markers), to see how well that works, or from a --file: an npz of `times` (K,) in seconds or `frames` (K,) of 100,
+    and some of `surfaces` (K, vertices, 3), `points` (K, any, 3) and `markers` (K, 16, 3) in metres, NaN where nothing
+    was seen; `beta` (S,) where the body is known; or (B, K, ...) of several segments. Prints duration and distance with
+    intervals, the distance from what was seen and, where known, from the truth. --out is an npz of the most probable
+    segments and posterior draws; of one segment also .html or .bvh; a name without an ending is a folder of BVH files.
 
     Args:
         run: the run directory.
-        out: the npz file to write.
-        filled: motion to write, an npz of all clips, BVH or csv of one; a name without an ending is a folder of BVH.
+        recovery: options for motion-latent.
+        out: the file to write.
+        filled: of motion: file of the filled motion, an npz of all clips, BVH or csv of one; a name without an ending
+            is a folder of BVH files.
         clip: name of a clip, or split/name where the name is not unique; of any split, filled as one window.
-        samples: fillings of each window; by default 10, and of a table, of which quantiles are written, 100.
-        particles: of a table, draws for each filling, of which those are taken that what was observed makes likely.
+        samples: number of fillings of each window; by default 10, 100 of a table, and 5 of segments.
+        particles: of a table: number of draws for each filling, of which one is resampled by its weight.
         draw_emission: of motion: fill with the noise of the emission, or with its means given draws of the latents. By
-            default draws in --out, and means in --filled, unless nothing is latent.
-        seed: of the draws.
-        data: where the data lie now, if the path in the run no longer leads there; or other data of the same joints.
+            default draws in --out, and means in --filled, unless the model has no latents.
+        seed: seed of the draws.
+        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
     """
-    at_least(1, samples=samples, particles=particles)
+    kind = kind_of([run], data)
+    at_least(1, particles=particles)
+    at_least(0 if kind == "segments" else 1, samples=samples)
     check_files(out, None)
-    if kind_of([run], data) == "panel":
-        if out is None or filled is not None or clip is not None or draw_emission is not None:
+    options = {"filled": filled, "clip": clip, "draw-emission": draw_emission}
+    given = [name for name, value in options.items() if value is not None]
+    if kind == "segments":
+        if given or particles > 1 or missing:
+            raise UsageError(f"--{[*given, 'particles' if particles > 1 else 'missing'][0]} is not for segments")
+        recovery.run(run, out, 5 if samples is None else samples, seed, data, failed)
+        return
+    if recovery != Recovery():
+        raise UsageError(f"--from, --file and --seen are for runs of motion-latent, and {run} is not one")
+    loaded, opened = forecaster(run, data, missing, failed)
+    if kind == "panel":
+        if out is None or given:
             raise UsageError("of a table, impute writes draws to --out FILE.csv, .parquet or .npz")
-        tables.impute(run, out, samples, particles, seed, data, failed)
+        tables.impute(loaded, opened, out, samples, particles, seed)
         return
     samples = samples or SAMPLES
     if particles > 1:
@@ -226,14 +240,12 @@ def impute(
     check_files(out, None, ".npz")
     if out is None and filled is None:
         raise UsageError("impute writes files; say which, by --out or --filled")
-    kind = None if filled is None else format_of(filled, None if filled.suffix else "bvh")
-    loaded = load_run(run, data, failed=failed)
-    windows = windows_of(loaded, data, clip, missing, whole=clip is not None)
-    if filled is not None and filled.suffix and kind != "npz" and len(windows.clips) > 1:
+    form = None if filled is None else format_of(filled, None if filled.suffix else "bvh")
+    windows, model = windows_of(opened, clip, whole=clip is not None), loaded.model
+    if filled is not None and filled.suffix and form != "npz" and len(windows.clips) > 1:
         raise UsageError(
             f"--filled {filled} holds one clip, of {len(windows.clips)}; say which by --clip, or end it in .npz"
         )
-    model = loaded.model
     if out is not None:
         found = _fillings(model, windows, samples, seed, model.is_drawn() if draw_emission is None else draw_emission)
         seen = found.observed
@@ -247,7 +259,7 @@ def impute(
         drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
         found = _fillings(model, windows, 1, seed, drawn)
         whole = windows.filled(torch.from_numpy(found.filled[0]))
-        motion.write_motion(filled, whole, kind)
+        motion.write_motion(filled, whole, form)
         left = sum(int(np.isnan(each.positions).any(-1).sum()) for each in whole)
         ERROR.print(
             f"wrote {filled}: {len(whole)} clips"
@@ -284,12 +296,12 @@ def animate(
     clip: str | None = None,
     window: int | None = None,
     samples: int | None = None,
-    fix: tuple[str, ...] = (),
+    fix: Expert[tuple[str, ...]] = (),
     seed: int = 0,
     data: str | None = None,
-    missing: Missing = False,
-    failed: Failed = False,
-    every: int | None = None,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
+    every: Expert[int | None] = None,
     figure: Path | None = None,
 ) -> None:
     """Play forecasts beside what happened, or a clip, as moving skeletons.
@@ -322,7 +334,7 @@ def animate(
                 f"{source}/FILE.bvh"
             )
         loaded = load_run(Path(source), data, failed=failed)
-        windows = windows_of(loaded, data, clip, missing)
+        windows = windows_of(data_of(data, loaded, missing=missing), clip)
         chosen = _liveliest(windows.positions(gapped(windows.all())).numpy(), window)
         futures = draw_futures(loaded, windows, [chosen], samples or 5, seed, fix=fix)
     elif fix:
@@ -388,11 +400,8 @@ def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
     return found[0]
 
 
-def windows_of(
-    loaded: runs.Loaded, data: str | None, clip: str | None, missing: bool = False, whole: bool = False
-) -> motion.Windows:
-    """The test windows of a run's data or of others, or all windows of one clip, of any split; or one, of it all."""
-    opened = data_of(data, loaded, missing=missing)
+def windows_of(opened: Any, clip: str | None, whole: bool = False) -> motion.Windows:
+    """The test windows of data, or all windows of one clip, of any split; or one window of the whole clip."""
     if clip is None:
         return opened.windows("test")  # type: ignore[no-any-return]
     found, own = _clip(opened.motion, clip), opened.motion

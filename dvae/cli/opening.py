@@ -6,34 +6,43 @@ import json
 import re
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from .. import motion
 from ..data.views import View
+from ..inference.evaluation.scores import Scores
 from ..inference.training.checkpoints import Run
 from ..models.family.equations import Equations
 from ..models.registry import judges
 from ..options import flat
 from ..runs import directory as runs
+from ..tables.scoring import panel_scores
+from . import tables
 from .console import UsageError, note
 
 USES = {
-    "motion": "forecasts and has no segments; use dvae forecast, complete, animate or evaluate",
-    "panel": "is of a table; use dvae forecast, impute, evaluate, compare, criticise or report",
-    "segments": "makes whole segments and forecasts nothing; use dvae evaluate, interpolate or recover",
+    "motion": "forecasts and has no segments; use dvae forecast, animate, evaluate, compare or check",
+    "panel": "is of a table; use dvae forecast, impute, evaluate, compare, check or report",
+    "segments": "makes whole segments and forecasts nothing; use dvae evaluate or impute",
 }
-"""What there is for runs, by the kind of their data."""
+"""Commands for runs, by the kind of their data."""
+FORECASTING = ("motion", "panel")
+"""Kinds of data of which runs forecast."""
+SCORES: Mapping[str, Scores] = {"motion": motion.scores, "panel": panel_scores}
+"""Scores of forecasts, by the kind of data."""
 
 
-def load_run(path: Path, data: str | None, kind: str = "motion", failed: bool = False) -> runs.Loaded:
-    """A run of a method that is fitted on data of a kind: if nothing is said, of one that forecasts.
+def load_run(path: Path, data: str | None, kinds: Collection[str] = ("motion",), failed: bool = False) -> runs.Loaded:
+    """Load a run that was fitted on data of one of some kinds.
 
     Raises:
         ValueError: another run, or a failed one unless `failed`.
     """
     loaded = load(path, data, failed)
-    if loaded.config.kind != kind and (use := USES.get(loaded.config.kind)):
+    if loaded.config.kind not in kinds and (use := USES.get(loaded.config.kind)):
         raise ValueError(f"{path} is a fitted {loaded.method.name}, which {use}")
     if loaded.method.name in judges():
         raise ValueError(
@@ -73,6 +82,8 @@ def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> An
     With them comes what any of the runs sees of them.
     """
     most = next((run for run in shared if type(run.schema.view) is not View), shared[0])
+    if missing and most.config.kind == "panel":
+        raise UsageError(f"--missing is about motion, and {most.path} is of a table")
     if path is None:
         if missing and not most.data.motion.missing:
             raise UsageError("--missing is about other data (--data); those of the run have no joint missing")
@@ -86,14 +97,41 @@ def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> An
     return found
 
 
-def alike(paths: Sequence[Path], path: str | None, kind: str = "motion", failed: bool = False) -> list[runs.Loaded]:
+def windows_to_test(loaded: runs.Loaded, opened: Any, stride: int | None = None, whole: bool = True) -> Any:
+    """The test windows of data, cut as those of a run.
+
+    Args:
+        loaded: the run.
+        opened: its data, or others.
+        stride: steps between the starts of windows, in place of the run's.
+        whole: whether whole sequences of a table, of which nothing is forecast, may come in place of windows.
+    """
+    if loaded.config.kind == "panel":
+        if not whole or opened.schema.cut.length is not None:
+            return tables.windows(loaded, opened, stride=stride)
+        if stride is not None:
+            raise UsageError(f"--stride is between windows, and {loaded.path} was fitted on whole sequences")
+        return opened.windows("test")
+    protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
+    return motion.windows(opened.motion, protocol, "test")
+
+
+def forecaster(path: Path, data: str | None, missing: bool = False, failed: bool = False) -> tuple[runs.Loaded, Any]:
+    """Load a run that forecasts, and its data or others; see `load_run` and `data_of`."""
+    loaded = load_run(path, data, FORECASTING, failed)
+    return loaded, data_of(data, loaded, missing=missing)
+
+
+def alike(
+    paths: Sequence[Path], path: str | None, kinds: Collection[str] = FORECASTING, failed: bool = False
+) -> list[runs.Loaded]:
     """Runs that share their test windows: those of the data that all were fitted on, or of other data."""
     if not paths:
         raise UsageError("give at least one run directory")
     twice, count = Counter(map(str, paths)).most_common(1)[0]
     if count > 1:
         raise UsageError(f"a run is named twice: {twice}")
-    loaded = [load_run(each, path, kind, failed) for each in paths]
+    loaded = [load_run(each, path, kinds, failed) for each in paths]
     first = loaded[0]
     for other in loaded[1:]:
         if not (other.alike(first) if path is None else other.schema.windows == first.schema.windows):

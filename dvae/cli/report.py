@@ -52,7 +52,7 @@ def report(
     bound_windows: int = 64,
     particles: int = 64,
     seed: int = 0,
-    ablation: Path | None = None,
+    edges: Path | None = None,
     data: str | None = None,
     missing: Missing = False,
     failed: Failed = False,
@@ -71,15 +71,15 @@ def report(
         bound_windows: test windows, evenly spread, of which bounds, KL and latents are shown.
         particles: of the importance-weighted bound.
         seed: of the draws.
-        ablation: the file of `dvae ablate`, whose table and drawing are shown too.
+        edges: the file of `dvae check edges`, whose table and drawing are shown too.
         data: where the data lie now, if the path in the runs no longer leads there; or other data of the same joints.
     """
     at_least(0, windows=windows)
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
     check_files(out, None, ".html", ".htm")
-    ablated = None if ablation is None else _ablation(ablation)
-    kind = opening.kind_of(run, data)
-    loaded = opening.alike(run, data, kind if kind == "panel" else "motion", failed)
+    ablated = None if edges is None else _ablation(edges)
+    loaded = opening.alike(run, data, failed=failed)
+    of_table = loaded[0].config.kind == "panel"
     if evaluate:
         evaluate_runs(run, Control(), data=data, missing=missing, failed=failed, seed=seed)
     named = dict(zip(opening.names(loaded), loaded, strict=True))
@@ -96,9 +96,9 @@ def report(
     else:
         few = sections.Few(test, bound_windows)
         shown += [sections.weighed(named, few, particles, seed), sections.posteriors(named, few, seed)]
-        futures = _fans if kind == "panel" else _futures
+        futures = _fans if of_table else _futures
         shown += [futures(named, test, windows, samples, seed)] if windows else []
-    text = document("Report: " + ", ".join(named), shown, [] if kind == "panel" else [SCRIPT])
+    text = document("Report: " + ", ".join(named), shown, [] if of_table else [SCRIPT])
     with files.written(out) as file:
         file.write(text.encode(errors="replace"))
     ERROR.print(f"wrote {out}: {', '.join(named)}, {len(text) / 1e6:.1f} MB")
@@ -108,7 +108,7 @@ def _ablation(path: Path) -> Ablation:
     try:
         return Ablation.from_json(files.read(path, sections.LARGEST, links=True).decode())
     except ValueError as error:
-        raise UsageError(f"--ablation {path}: {reason(error)}") from error
+        raise UsageError(f"--edges {path}: {reason(error)}") from error
 
 
 def _fans(named: Mapping[str, Any], windows: PanelWindows, count: int, samples: int, seed: int) -> Section:

@@ -1,9 +1,9 @@
-"""Commands on latent spaces of segments: interpolate, recover."""
+"""Recovery of whole segments of motion, for `dvae impute`."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import pi
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,81 +21,21 @@ from ..motion.segments.completion import Deviations, glimpsed
 from ..motion.segments.dataset import thinned
 from ..motion.segments.embodied import SHAPE
 from ..motion.segments.frames import resting_offsets
-from ..motion.segments.interpolation import Interpolation
-from ..motion.segments.interpolation import interpolate as interpolate_segments
 from ..motion.segments.recovery import Recovered, read_seen
 from ..motion.segments.recovery import recover as recover_segments
 from ..options import Positive, Range, check
 from ..runs import directory as runs
 from . import opening
-from .console import ERROR, OUT, Failed, UsageError, at_least, check_files, note
+from .console import ERROR, OUT, UsageError, check_files, note
+from .help import Expert
 
-MOST_STEPS = MOST_DRAWS = 100
+MOST_DRAWS = 100
 
 MOST_KNOWN = 500
 """Segments for training, of whose latents the prior is, and where a search may start."""
 
 APART, FARTHER = 3.0, 1.3
 """Nats by which a search may still fall, and deviations that segments may be from what was seen, without a note."""
-
-
-def interpolate(
-    run: Annotated[Path, tyro.conf.Positional],
-    first: Annotated[str, tyro.conf.arg(name="from")],
-    second: Annotated[str, tyro.conf.arg(name="to")],
-    out: Path | None = None,
-    steps: int = 9,
-    fps: float | None = None,
-    data: str | None = None,
-    failed: Failed = False,
-) -> None:
-    """Go from one segment to another on the straight line in the latent space of a run, motion and body together.
-
-    Prints how long each step lasts, how far it gets, and how far its poses are from those of the first.
-
-    A name that ends in .npz gets all steps as clips of a motion file, which `dvae animate` plays, in .html a page on
-    which they move side by side. BVH is of one body: .bvh gets the step in the middle, and a name without an ending is
-    a new folder with a file for each step.
-
-    Args:
-        run: the run directory of a motion-latent.
-        first: name of the segment to start from; or of a take, of which it is the first one; or split/name.
-        second: likewise where to go.
-        out: the file to write.
-        steps: both ends included.
-        fps: frames per second of what is written; by default those of the data that the run was fitted on.
-        data: where the data lie now, if the path in the run no longer leads there; or other data.
-    """
-    at_least(2, steps=steps)
-    if steps > MOST_STEPS:
-        raise UsageError(f"--steps is {steps}; it must be at most {MOST_STEPS}")
-    if fps is not None and not 1 <= fps <= 1000:
-        raise UsageError(f"--fps is {fps:g}; it must be between 1 and 1000")
-    check_files(out, None, ".npz", ".html", ".htm", ".bvh", "")
-    loaded = opening.load_run(run, data, "segments", failed)
-    opened = opening.data_of(data, loaded)
-    ends = [opened.found(name) for name in (first, second)]
-    found = interpolate_segments(loaded.model, ends[0].all(), ends[1].all(), steps)
-    if out is not None:
-        _write(out, found, fps)
-        names = " to ".join(end.motion.clips[0].name for end in ends)
-        ERROR.print(f"wrote {out}: {steps} steps from {names}")
-    OUT.print(found.table())
-
-
-def _write(out: Path, found: Interpolation, fps: float | None) -> None:
-    """Steps as a motion file, a page, the middle one as BVH, or a folder of these."""
-    steps, suffix = found.motion(fps=fps), out.suffix.lower()
-    if suffix == ".npz":
-        motion.write_motion(out, steps)
-    elif suffix in (".html", ".htm"):
-        told = zip(found.shares.tolist(), found.durations[0].tolist(), strict=True)
-        _save_page(out, steps, [f"{share:.2f}: {seconds:.2f} s" for share, seconds in told])
-    elif suffix:
-        motion.write_motion(out, _alone(steps, steps.clips[len(steps) // 2]))
-    else:
-        for clip in steps:
-            motion.write_motion(out / f"{clip.name}.bvh", _alone(steps, clip))
 
 
 def _save_page(out: Path, made: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None) -> None:
@@ -162,86 +102,63 @@ class Glimpse:
         return found | ({SHAPE: shape} if self.known_body else {})
 
 
-def recover(
-    run: Annotated[Path, tyro.conf.Positional],
-    glimpse: Glimpse,
-    deviations: Deviations,
-    descent: Descent,
-    source: Annotated[tuple[str, ...], tyro.conf.arg(name="from")] = (),
-    file: Path | None = None,
-    aggregate: bool = True,
-    draws: int = 5,
-    out: Path | None = None,
-    seed: int = 0,
-    data: str | None = None,
-    failed: Failed = False,
-) -> None:
-    """Recover whole segments, with their timing and bodies, from what was seen of them.
-
-    What was seen is a glimpse of known segments (--from NAME --seen KIND), to see how well the rest is found: their
-    first quarter of a second (--seen surfaces --seconds .25), a few points of the surface, markers, or some frames at
-    unknown times. Or it is a --file of somebody's own: an npz of arrays `times` (K,) in seconds or `frames` (K,) of
-    100, and some of `surfaces` (K, vertices, 3), `points` (K, any, 3) and `markers` (K, 16, 3) in metres, NaN where
-    nothing was seen; `beta` (S,) where the body is known; or of several segments, (B, K, ...). Somebody starts at the
-    origin, facing heading zero.
-
-    Prints what was found: how long it lasts and how far it gets, with intervals, how far it is from what was seen and,
-    where that is known, from the truth, and how surely it is the most probable one.
-
-    A name that ends in .npz gets the most probable segments and draws from the posterior as clips of a motion file. Of
-    one segment, .html gets a page on which truth, the most probable and draws move side by side, .bvh the most
-    probable. A name without an ending is a new folder, with a BVH file for each clip.
+@dataclass(frozen=True)
+class Recovery:
+    """How segments of a motion-latent are recovered.
 
     Args:
-        run: the run directory of a motion-latent.
         glimpse: what is seen of known segments.
-        deviations: how far what was seen is from what the model makes, standard deviations.
+        deviations: standard deviations of what was seen from what the model makes.
         descent: how the most probable segments are looked for.
-        source: names of segments; or of takes, of which it is the first one; or split/name.
-        file: what somebody has seen, instead.
-        aggregate: z has for its prior a normal of all latents of known segments, in place of N(0, I).
-        draws: from the posterior, to write.
-        out: the file to write.
-        seed: of starts, draws and glimpses.
-        data: where the data lie now, if the path in the run no longer leads there; or other data. Latents of known
-            segments, of other takes, are starts of the search, and make the prior.
+        source: names of segments; or of takes, whose first segment is taken; or split/name.
+        file: observations of your own, instead.
+        aggregate: the prior of z is a normal fitted to the latents of known segments, in place of N(0, I).
     """
-    at_least(0, draws=draws)
-    if draws > MOST_DRAWS:
-        raise UsageError(f"--draws is {draws}; it must be at most {MOST_DRAWS}")
-    check_files(out, None, ".npz", ".html", ".htm", ".bvh", "")
-    if bool(source) == (file is not None):
-        raise UsageError("give what was seen, either of the run's segments (--from NAME --seen KIND) or as a --file")
-    if file is not None and glimpse != Glimpse():
-        raise UsageError("a --file says all that was seen; --seen and what goes with it are about segments of --from")
-    loaded = opening.load_run(run, data, "segments", failed)
-    model, truth, takes = loaded.model, None, set()
-    if file is None:
-        opened = opening.data_of(data, loaded)
-        chosen = [opened.found(name) for name in source]
-        clips = [clip for each in chosen for clip in each.motion]
-        keys, takes = [clip.key for clip in clips], {clip.labels["source"] for clip in clips}
-        if len({*keys}) < len(keys):
-            raise UsageError(f"--from {' '.join(source)} names a segment twice")
-        truth = {name: torch.cat([each.all()[name] for each in chosen]) for name in (WHOLE, SHAPE)}
-        seen = glimpse.of(model, truth, seed)
-    else:
-        seen, opened = read_seen(file, model), _known_data(loaded, data)
-        keys = [("seen", f"segment-{n:02d}") for n in range(len(next(iter(seen.values()))))]
-    if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
-        raise UsageError(f"--out {out} shows one segment, of {len(keys)}; end its name in .npz, or in nothing")
-    known = None if opened is None else _known(opened, takes)
-    how: dict[str, Any] = {"truth": truth, "deviations": deviations, "known": known, "descent": descent}
-    how["aggregate"] = aggregate
-    found = recover_segments(model, seen, keys, **how, seed=seed, progress=True)
-    for doubt in _doubts(found, deviations):
-        note(doubt)
-    if out is not None:
-        drawn = 0 if out.suffix.lower() == ".bvh" else draws
-        _write_recovered(out, found, drawn)
-        names = ", ".join(map("/".join, keys))
-        ERROR.print(f"wrote {out}: {names}, the most probable" + f" and {drawn} draws of each" * (drawn > 0))
-    OUT.print(found.table())
+
+    glimpse: Glimpse = Glimpse()
+    deviations: Expert[Deviations] = field(default_factory=Deviations)
+    descent: Expert[Descent] = field(default_factory=Descent)
+    source: Annotated[tuple[str, ...], tyro.conf.arg(name="from")] = ()
+    file: Path | None = None
+    aggregate: Expert[bool] = True
+
+    def run(self, run: Path, out: Path | None, draws: int, seed: int, data: str | None, failed: bool) -> None:
+        """Recover segments, print what was found and how sure it is, and write them."""
+        if draws > MOST_DRAWS:
+            raise UsageError(f"--samples is {draws}; it must be at most {MOST_DRAWS}")
+        check_files(out, None, ".npz", ".html", ".htm", ".bvh", "")
+        if bool(self.source) == (self.file is not None):
+            raise UsageError("give what was seen: --from NAME --seen KIND of the run's segments, or a --file")
+        if self.file is not None and self.glimpse != Glimpse():
+            raise UsageError("--file says all that was seen; --seen and its options are about segments of --from")
+        loaded = opening.load_run(run, data, ("segments",), failed)
+        model, truth, takes = loaded.model, None, set()
+        if self.file is None:
+            opened = opening.data_of(data, loaded)
+            chosen = [opened.found(name) for name in self.source]
+            clips = [clip for each in chosen for clip in each.motion]
+            keys, takes = [clip.key for clip in clips], {clip.labels["source"] for clip in clips}
+            if len({*keys}) < len(keys):
+                raise UsageError(f"--from {' '.join(self.source)} names a segment twice")
+            truth = {name: torch.cat([each.all()[name] for each in chosen]) for name in (WHOLE, SHAPE)}
+            seen = self.glimpse.of(model, truth, seed)
+        else:
+            seen, opened = read_seen(self.file, model), _known_data(loaded, data)
+            keys = [("seen", f"segment-{n:02d}") for n in range(len(next(iter(seen.values()))))]
+        if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
+            raise UsageError(f"--out {out} shows one segment, of {len(keys)}; end its name in .npz, or in nothing")
+        known = None if opened is None else _known(opened, takes)
+        how: dict[str, Any] = {"truth": truth, "deviations": self.deviations, "known": known}
+        how |= {"descent": self.descent, "aggregate": self.aggregate}
+        found = recover_segments(model, seen, keys, **how, seed=seed, progress=True)
+        for doubt in _doubts(found, self.deviations):
+            note(doubt)
+        if out is not None:
+            drawn = 0 if out.suffix.lower() == ".bvh" else draws
+            _write_recovered(out, found, drawn)
+            names = ", ".join(map("/".join, keys))
+            ERROR.print(f"wrote {out}: {names}, the most probable" + f" and {drawn} draws of each" * (drawn > 0))
+        OUT.print(found.table())
 
 
 def _known_data(loaded: runs.Loaded, data: str | None) -> Any:

@@ -19,7 +19,7 @@ from ..tables.forecasts import BANDS, FORMATS, QUANTILES, column_of, needed
 from ..tables.reading import SUFFIXES, is_domain, schema_beside, written_schema
 from ..tables.windows import PanelWindows
 from .console import ERROR, OUT, UsageError, arguments, check_files, note, save_figure
-from .opening import data_of, load_run
+from .help import Expert
 
 OF_MOTION = {".amc", ".bvh", ".c3d", ".npz"}
 """Ends of names of files that make a folder one of motion, whatever else lies in it."""
@@ -47,14 +47,14 @@ class ColumnOptions:
 
     columns: tuple[str, ...] = ()
     covariates: tuple[str, ...] = ()
-    past: tuple[str, ...] = ()
-    attributes: tuple[str, ...] = ()
+    past: Expert[tuple[str, ...]] = ()
+    attributes: Expert[tuple[str, ...]] = ()
     id: tuple[str, ...] = ()
     time: tuple[str, ...] = ()
-    group: str | None = None
-    zone: str | None = None
-    na_values: tuple[str, ...] = ()
-    decimal: Literal[".", ","] | None = None
+    group: Expert[str | None] = None
+    zone: Expert[str | None] = None
+    na_values: Expert[tuple[str, ...]] = ()
+    decimal: Expert[Literal[".", ","] | None] = None
 
     def given(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, under the names that `PanelData.open` gives them."""
@@ -106,21 +106,18 @@ def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: 
 
 
 def forecast(
-    path: Path,
+    loaded: runs.Loaded,
+    opened: PanelData,
     out: Path,
     sequence: str | None,
     horizon: int | None,
     samples: int | None,
     seed: int,
-    data: str | None,
     figure: Path | None,
     beyond: bool,
-    failed: bool,
 ) -> None:
-    """Forecasts test windows, those of one sequence, or what comes after the end of the table."""
+    """Forecast test windows, those of one sequence, or what comes after the end of the table."""
     check_files(out, figure, *FORMATS)
-    loaded = load_run(path, data, "panel", failed)
-    opened = data_of(data, loaded)
     opened = opened if sequence is None else opened.only([sequence])
     samples = samples or SAMPLES
     split = "test" if sequence is None else "all"
@@ -133,13 +130,10 @@ def forecast(
         save_figure(found.plot(), figure)
 
 
-def impute(
-    path: Path, out: Path, samples: int | None, particles: int, seed: int, data: str | None, failed: bool
-) -> None:
-    """Fills what the sequences of a table lack, in a table of every missing entry."""
+def impute(loaded: runs.Loaded, opened: PanelData, out: Path, samples: int | None, particles: int, seed: int) -> None:
+    """Draw the missing entries of a table's sequences, in a table of them."""
     check_files(out, None, *FORMATS)
-    loaded, samples = load_run(path, data, "panel", failed), samples or SAMPLES
-    held = data_of(data, loaded).whole()
+    samples, held = samples or SAMPLES, opened.whole()
     with arguments():
         found = held.impute(loaded.model, samples, seed, particles)
     found.save(out)

@@ -68,9 +68,9 @@ def test_wrong_arguments_exit_with_2(capsys, tmp_path):
     assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
     unknown = failure(capsys, "fit", "hitdvae", *out, code=2)
     assert all(name in unknown for name in dvae.methods())
-    for command in ("fit", "resume", "data"):
-        assert f"dvae {command} --help" in failure(capsys, command, code=2)
-    assert "did you mean 'info'" in failure(capsys, "data", "inf", code=2)
+    for command in ("fit", "resume", "data get"):
+        assert f"dvae {command} --help" in failure(capsys, *command.split(), code=2)
+    assert "did you mean 'data info'" in failure(capsys, "data", "inf", code=2)
     assert "--step is no option of dvae sweep (did you mean '--steps'" in failure(
         capsys, "sweep", "--step", "4", code=2
     )
@@ -262,7 +262,7 @@ def tracker(people, tmp_path_factory):
 @pytest.mark.filterwarnings("ignore:only .* of the bones")  # hardly fitted
 def test_motion_is_completed_along_the_paths_of_a_clip_or_a_file(capsys, tracker, tmp_path):
     out, figure = tmp_path / "walk.npz", tmp_path / "walk.png"
-    run = ["complete", str(tracker), "--clip", "person_0003"]
+    run = ["forecast", str(tracker), "--clip", "person_0003"]
 
     def complete(*options):
         assert main([*run, "--out", str(out), *options]) == 0
@@ -318,8 +318,8 @@ def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
 
 
 def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, tracker, tmp_path):
-    out = tmp_path / "criticism.json"
-    assert main(["criticise", str(tracker), "--samples", "19", "--out", str(out)]) == 0
+    out = tmp_path / "calibration.json"
+    assert main(["check", "calibration", str(tracker), "--samples", "19", "--out", str(out)]) == 0
     assert "no calibration" in capsys.readouterr().err
     document = json.loads(out.read_text())
     assert list(document) == ["predictive"]
@@ -328,11 +328,12 @@ def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, track
 
 def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
     out = ["--out", str(tmp_path / "walk.npz")]
-    assert "which takes no paths" in failure(capsys, "complete", str(fitted), *out, code=2)
-    assert "by --joints or --paths" in failure(capsys, "complete", str(tracker), *out, "--exact", code=2)
-    assert "no joint 'tail'" in failure(capsys, "complete", str(tracker), *out, "--joints", "tail")
-    assert "at least 1" in failure(capsys, "complete", str(tracker), *out, "--samples", "0", code=2)
-    assert "none.csv" in failure(capsys, "complete", str(tracker), *out, "--paths", str(tmp_path / "none.csv"))
+    along = ["--joints", "LWrist"]
+    assert "which takes no paths" in failure(capsys, "forecast", str(fitted), *out, *along, code=2)
+    assert "by --joints or --paths" in failure(capsys, "forecast", str(tracker), *out, "--exact", code=2)
+    assert "no joint 'tail'" in failure(capsys, "forecast", str(tracker), *out, "--joints", "tail")
+    assert "at least 1" in failure(capsys, "forecast", str(tracker), *out, "--samples", "0", code=2)
+    assert "none.csv" in failure(capsys, "forecast", str(tracker), *out, "--paths", str(tmp_path / "none.csv"))
     error = failure(capsys, "fit", "trajevae", "--data", str(people), "--out", str(tmp_path / "run"), "--steps", "2")
     assert "observed=1, such as" in error
     assert "simulated-trajectories" in error
@@ -552,7 +553,13 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
     other = ["--data", "other/people.npz"]
     assert dvae.load("run").model.sizes["x"] == 48
     capsys.readouterr()
-    for command in ("forecast run --out f.npz", "evaluate run", "compare run", "criticise run", "resume run --steps 6"):
+    for command in (
+        "forecast run --out f.npz",
+        "evaluate run",
+        "compare run",
+        "check calibration run",
+        "resume run --steps 6",
+    ):
         assert "or other data (--data)" in failure(capsys, *command.split())
     assert "own/people.npz is not here" in failure(capsys, "resume", "run", "--data", "own/people.npz")
     assert "has changed since" in failure(capsys, "resume", "run", *other)
@@ -560,7 +567,7 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
         "forecast run --out f.npz --samples 2",
         "evaluate run second --samples 2",
         "compare run second --samples 2 --particles 4 --contrasts 0 --filter-particles 2",
-        "criticise run --simulations 20 --draws 9 --samples 19",
+        "check calibration run --simulations 20 --draws 9 --samples 19",
         "animate run --out f.html",
     ):
         capsys.readouterr()
@@ -576,15 +583,15 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
 def test_a_guide_is_put_beside_its_posterior(capsys, run, tmp_path):
     """Of so few draws the reference says that it has not converged; of the frames alone latents are inferred."""
     few = ["--windows", "2", "--frames", "2", "--draws", "4", "--chains", "2", "--warmup", "1", "--stein-draws", "9"]
-    assert main(["reference", str(run), *few, "--figure", str(tmp_path / "a.png")]) == 0
-    document = json.loads((run / "reference.json").read_text())
-    reference = ReferencePosterior.from_json(json.dumps(document["reference"]))
+    assert main(["check", "posterior", str(run), *few, "--figure", str(tmp_path / "a.png")]) == 0
+    document = json.loads((run / "posterior.json").read_text())
+    reference = ReferencePosterior.from_json(json.dumps(document["posterior"]))
     assert reference.shapes == {"z": (2, 3)}
     assert reference.sequences == (0, 1)
     assert len(document["windows"]) == 2
     assert SteinDiscrepancy.from_json(json.dumps(document["stein"])).numbers.tolist() == [6, 6]
     assert "did not converge" in capsys.readouterr().out
-    assert {path.name for path in tmp_path.glob("*.png")} == {"a-stein.png", "a-reference.png"}
+    assert {path.name for path in tmp_path.glob("*.png")} == {"a-stein.png", "a-posterior.png"}
 
 
 def test_a_run_of_another_format_is_refused(capsys, run):
@@ -718,20 +725,20 @@ def test_forecasts_become_tubes_on_validation_windows_or_on_clips_of_a_label(cap
     motion.save(tmp_path / "people.npz", motion.MotionSet(styled, clips.skeleton, clips.name))
     run = tmp_path / "run"
     assert main(["fit", "vae", "--data", str(tmp_path / "people.npz"), "--out", str(run), "--steps", "5", *SMALL]) == 0
-    assert main(["tubes", str(run), "--samples", "4", "--level", ".5"]) == 0
+    assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5"]) == 0
     opened = dvae.load(run).data
-    assert dvae.Tubes.load(run / "tubes.json").clips == len(opened.windows("validation").clips)
+    assert dvae.Tubes.load(run / "coverage.json").clips == len(opened.windows("validation").clips)
     told = ["--label", "style", "--values", "a", "--out", str(tmp_path / "a.json"), "--figure", str(tmp_path / "a.png")]
-    assert main(["tubes", str(run), "--samples", "4", "--level", ".5", *told]) == 0
+    assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5", *told]) == 0
     assert "held 50 %, future" in capsys.readouterr().out
     test = opened.windows("test").clips
     assert dvae.Tubes.load(tmp_path / "a.json").clips == sum(clip.labels["style"] == "a" for clip in test)
     assert (tmp_path / "a.png").stat().st_size
     for wrong, said in (
-        (["--label", "style"], "tell together"),
+        (["--label", "style"], "are given together"),
         (["--label", "style", "--values", "c"], "no test clip has style c; there are a, b"),
         (["--label", "style", "--values", "a", "b"], "all test clips would calibrate"),
         (["--level", ".9"], "90 % need 9 clips"),
     ):
-        assert main(["tubes", str(run), "--samples", "4", *wrong])
+        assert main(["check", "coverage", str(run), "--samples", "4", *wrong])
         assert said in " ".join(capsys.readouterr().err.split())

@@ -82,31 +82,12 @@ def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder,
     assert list(Reconstruction.load(second / "evaluation-people.json").rows) == ["motion-latent"]
 
 
-def test_one_segment_becomes_another(capsys, folder, tmp_path):
-    command = ["interpolate", str(folder / "run"), "--from", "person_0001", "--to", "test/person_0007", "--steps", "3"]
-    assert main([*command, "--out", str(tmp_path / "a.npz"), "--fps", "50"]) == 0
-    assert "duration (s)" in capsys.readouterr().out
-    steps = motion.read_motion(tmp_path / "a.npz")
-    assert [clip.name for clip in steps] == ["step-00", "step-01", "step-02"]
-    assert steps.skeleton.fps == 50
-    for name in ("a.html", "middle.bvh", "folder"):
-        assert main([*command, "--out", str(tmp_path / name)]) == 0
-    assert "plotly" in (tmp_path / "a.html").read_text()
-    assert len(list((tmp_path / "folder").iterdir())) == 3
-    (middle,), (first, between, _) = (
-        [motion.read_motion(path) for path in paths]
-        for paths in ([tmp_path / "middle.bvh"], sorted((tmp_path / "folder").iterdir()))
-    )
-    assert middle.skeleton.rest == between.skeleton.rest != first.skeleton.rest
-    assert "no segment or take 'person_01'" in failure(capsys, *command[:3], "person_01", "--to", "person_0001")
-
-
 BRIEF = ["--steps", "3", "--starts", "2", "--candidates", "2", "--newton", "0"]
 
 
 def recovered(capsys, folder, *arguments):
-    """What `dvae recover` prints of the run, the notes and what was written."""
-    assert main(["recover", str(folder / "run"), *map(str, arguments), *BRIEF]) == 0
+    """What `dvae impute` prints of the run, the notes and what was written."""
+    assert main(["impute", str(folder / "run"), *map(str, arguments), *BRIEF]) == 0
     printed = capsys.readouterr()
     return " ".join(printed.out.split()), " ".join(printed.err.split())
 
@@ -121,7 +102,7 @@ def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
         "0.25",
         "--gaps",
         "0.2",
-        "--draws",
+        "--samples",
         "2",
         "--marker",
         "0.01",
@@ -144,7 +125,7 @@ def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
     recovered(capsys, folder, *one, "--no-aggregate", "--out", tmp_path / "a.bvh")
     assert len(motion.read_motion(tmp_path / "a.bvh")) == 1
     several = ["--from", "person_0001", "test/person_0007", "--seen", "markers", "--frames", "3"]
-    table, said = recovered(capsys, folder, *several, "--draws", "0", "--out", tmp_path / "b.npz")
+    table, said = recovered(capsys, folder, *several, "--samples", "0", "--out", tmp_path / "b.npz")
     assert "train/person_0001" in table
     assert "test/person_0007" in table
     assert said.endswith("train/person_0001, test/person_0007, the most probable")
@@ -218,10 +199,8 @@ def test_files_of_what_nobody_can_have_seen_are_refused(opened, tmp_path, change
     "command",
     [
         "forecast RUN --out f.npz",
-        "complete RUN --out f.npz",
-        "impute RUN --out f.npz",
         "compare RUN",
-        "criticise RUN",
+        "check calibration RUN",
         "animate RUN --out f.html",
         "report RUN --out f.html --evaluate",
     ],
@@ -230,14 +209,12 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     error = failure(capsys, *command.replace("RUN", str(folder / "run")).split())
     assert "is a fitted motion-latent, which makes whole segments and forecasts nothing; use dvae evaluate" in error
-    assert "recover" in error
+    assert "impute" in error
     assert not list(tmp_path.iterdir())
 
 
 def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
-    for command in (["interpolate", fitted, "--from", "a", "--to", "b"], ["recover", fitted, "--from", "a"]):
-        error = failure(capsys, *command)
-        assert "is a fitted vae, which forecasts and has no segments; use dvae forecast, complete" in error
+    assert "are for runs of motion-latent" in failure(capsys, "impute", fitted, "--from", "a", code=2)
 
 
 @pytest.mark.parametrize(
@@ -246,29 +223,28 @@ def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
         ("fit motion-latent --protocol cmu8 --out new", "--protocol is about motion, and motion-latent is fitted on"),
         ("fit vae --cut clips --out new", "--cut is about segments of motion, and vae is fitted on motion"),
         ("fit motion-latent --cut clip --out new", "did you mean 'clips'"),
-        ("sweep motion-latent vae --out new", "motion-latent on segments and vae on motion; give those of one kind"),
+        (
+            "sweep motion-latent vae --out new",
+            "motion-latent on segments of motion and vae on windows; give those of one kind",
+        ),
         ("evaluate RUN --samples 3", "--samples is about forecasts"),
         ("evaluate RUN --joints left_wrist", "--joints, --exchange and --temperature are about forecasts"),
         ("evaluate RUN FITTED", "on data of several kinds"),
-        ("interpolate RUN --from a --to b --steps 1", "--steps is 1; it must be at least 2"),
-        ("interpolate RUN --from a --to b --steps 1000", "--steps is 1000; it must be at most 100"),
-        ("interpolate RUN --from a --to b --fps 0", "--fps is 0; it must be between 1 and 1000"),
-        ("interpolate RUN --from a --to b --out a.mp4", "end its name in .npz or .html or"),
-        ("recover RUN", "either of the run's segments (--from NAME --seen KIND) or as a --file"),
-        ("recover RUN --from a --file b.npz", "either of the run's segments"),
-        ("recover RUN --from person_0001", "--seen what of it: surfaces, points or markers"),
-        ("recover RUN --from person_0001 --seen marker", "did you mean 'markers'"),
-        ("recover RUN --file b.npz --seen points", "a --file says all that was seen"),
-        ("recover RUN --from a --seen markers --frames 3 --fps 10", "--frames are seen at unknown times"),
-        ("recover RUN --from person_0001 --seen markers --frames 101", "segments of this run have 100"),
-        ("recover RUN --from a --seen markers --gaps 1", "gaps is 1.0; it must be at least 0 and below 1"),
-        ("recover RUN --from person_0001 --seen markers --points 9", "--points says how many are seen of a surface"),
-        ("recover RUN --from person_0001 --seen surfaces --gaps .1", "surfaces are seen as a whole"),
-        ("recover RUN --from a --seen markers --marker 0", "marker is 0.0; it must be"),
-        ("recover RUN --from a --seen markers --draws 101", "--draws is 101; it must be at most 100"),
-        ("recover RUN --from person_0001 person_0001 --seen markers", "names a segment twice"),
-        ("recover RUN --from person_0001 person_0002 --seen markers --out a.html", "shows one segment, of 2"),
-        ("recover RUN --from a --seen markers --out a.gif", "end its name in .npz or .html or"),
+        ("impute RUN", "--from NAME --seen KIND of the run's segments, or a --file"),
+        ("impute RUN --from a --file b.npz", "give what was seen"),
+        ("impute RUN --from person_0001", "--seen what of it: surfaces, points or markers"),
+        ("impute RUN --from person_0001 --seen marker", "did you mean 'markers'"),
+        ("impute RUN --file b.npz --seen points", "--file says all that was seen"),
+        ("impute RUN --from a --seen markers --frames 3 --fps 10", "--frames are seen at unknown times"),
+        ("impute RUN --from person_0001 --seen markers --frames 101", "segments of this run have 100"),
+        ("impute RUN --from a --seen markers --gaps 1", "gaps is 1.0; it must be at least 0 and below 1"),
+        ("impute RUN --from person_0001 --seen markers --points 9", "--points says how many are seen of a surface"),
+        ("impute RUN --from person_0001 --seen surfaces --gaps .1", "surfaces are seen as a whole"),
+        ("impute RUN --from a --seen markers --marker 0", "marker is 0.0; it must be"),
+        ("impute RUN --from a --seen markers --samples 101", "--samples is 101; it must be at most 100"),
+        ("impute RUN --from person_0001 person_0001 --seen markers", "names a segment twice"),
+        ("impute RUN --from person_0001 person_0002 --seen markers --out a.html", "shows one segment, of 2"),
+        ("impute RUN --from a --seen markers --out a.gif", "end its name in .npz or .html or"),
     ],
 )
 def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypatch, arguments, message):

@@ -78,7 +78,7 @@ def test_every_section_is_there_and_what_is_missing_has_its_command(page, fitted
     text = is_harmless(page.read_text(encoding="utf-8")).text
     for title in ("Run", "Equations", "Learning curves", "Scores", "Posterior against prior", "Futures"):
         assert title in text
-    for name, file in (("evaluate", "evaluation.json"), ("criticise", "criticism.json")):
+    for name, file in (("evaluate", "evaluation.json"), ("check calibration", "calibration.json")):
         assert f"The run has no {file}" in text
         assert f"dvae {name} {fitted}" in text
     assert "finished at step 10 of 10, seed 0" in text
@@ -155,12 +155,12 @@ def scored(fitted, tmp_path_factory):
     """A run with all that can be beside it."""
     run = shutil.copytree(fitted, tmp_path_factory.mktemp("scored") / "run")
     assert main(["evaluate", str(run), "--samples", "2"]) == 0
-    assert main(["criticise", str(run), "--simulations", "20", "--draws", "9", "--ranked-steps", "1"]) == 0
+    assert main(["check", "calibration", str(run), "--simulations", "20", "--draws", "9", "--ranked-steps", "1"]) == 0
     few = ["--temperatures", "2", "--chains", "2", "--particles", "2", "--fitting", "2"]
-    assert main(["bracket", str(run), "--count", "2", *few]) == 0
-    assert main(["tubes", str(run), "--samples", "4", "--level", "0.4"]) == 0
+    assert main(["check", "gap", str(run), "--count", "2", *few]) == 0
+    assert main(["check", "coverage", str(run), "--samples", "4", "--level", "0.4"]) == 0
     few = ["--draws", "8", "--chains", "2", "--warmup", "2", "--stein-draws", "9"]
-    assert main(["reference", str(run), "--windows", "1", "--frames", "2", *few]) == 0
+    assert main(["check", "posterior", str(run), "--windows", "1", "--frames", "2", *few]) == 0
     return run
 
 
@@ -174,7 +174,7 @@ def test_records_beside_a_run_are_shown(scored):
     assert "lowest" in facts or "best bound" in facts
     for row in evaluation.rows:
         assert str(evaluation[row]["ADE"]) in scores
-    assert json.loads((scored / "criticism.json").read_text())["calibration"]["verdict"] in criticism
+    assert json.loads((scored / "calibration.json").read_text())["calibration"]["verdict"] in criticism
     assert "bone stretch (%)" in criticism
     assert "changed" not in scores
 
@@ -185,7 +185,7 @@ def test_what_the_bench_left_beside_a_run_is_shown(scored, tmp_path):
     bracket, beside, tubes = (Tags(document("a", [make(run)])) for make in made)
     assert "AIS, L = 2, K = 2" in bracket.text
     assert "amortisation" in bracket.text
-    assert json.loads((scored / "reference.json").read_text())["stein"]["verdict"] in beside.text
+    assert json.loads((scored / "posterior.json").read_text())["stein"]["verdict"] in beside.text
     assert "beside the posterior of 1 sequences" in beside.text
     assert "held 40 %" in tubes.text
     pair = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})")
@@ -194,7 +194,7 @@ def test_what_the_bench_left_beside_a_run_is_shown(scored, tmp_path):
     assert "z_{t-1} to z_t" in Tags(arrows).text
     assert "<img" in arrows
     (tmp_path / "none.json").write_text("{}")
-    assert main(["report", str(scored), "--out", "a.html", "--ablation", str(tmp_path / "none.json")]) == 2
+    assert main(["report", str(scored), "--out", "a.html", "--edges", str(tmp_path / "none.json")]) == 2
 
 
 def test_scores_of_another_state_of_the_run_are_told_apart(scored, tmp_path):
@@ -240,7 +240,7 @@ def test_a_run_without_its_data_or_its_log_is_shown_as_far_as_it_goes(run, tmp_p
     (run / "config.json").write_text(json.dumps(config))
     (run / "log.jsonl").unlink()
     (run / "evaluation.json").write_text("[1")
-    (run / "criticism.json").symlink_to(run / "config.json")
+    (run / "calibration.json").symlink_to(run / "config.json")
     report(run, "--out", tmp_path / "a.html")
     text = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
     for said in ("say where they are with --data", "no log.jsonl", "not an evaluation", "is a link"):
@@ -254,12 +254,12 @@ def test_text_of_a_hostile_run_is_text(scored, tmp_path, tab):
     for name in ("zero velocity", "nearest neighbours", "mm/frame", "ADE", "nats/frame"):
         text = text.replace(json.dumps(name), json.dumps(f"{name}{EVIL}"))
     (run / "evaluation.json").write_text(text)
-    criticism = json.loads((run / "criticism.json").read_text())
+    criticism = json.loads((run / "calibration.json").read_text())
     criticism["calibration"]["quantities"][EVIL] = criticism["calibration"]["quantities"].pop("log joint")
     criticism["calibration"]["equations"] = {"inference": EVIL}
     criticism["predictive"]["programs"][EVIL] = EVIL
     criticism["predictive"]["checks"] = {EVIL: criticism["predictive"]["checks"]["vae"]}
-    (run / "criticism.json").write_text(json.dumps(criticism))
+    (run / "calibration.json").write_text(json.dumps(criticism))
     rows = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     (run / "log.jsonl").write_text("".join(json.dumps({**row, f"kl/{EVIL}": 1.0}) + "\n" for row in rows))
     report(run, "--out", tmp_path / "a.html")

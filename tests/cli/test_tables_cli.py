@@ -115,7 +115,7 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     told = capsys.readouterr().out
     assert 'na_values = ["-999", "?"]' in told
     assert "riders" not in told.partition("a schema")[2].partition("columns")[2]
-    assert "are about tables, and of info" in failure(capsys, "data", "info", "simulated", "--id", "s", code=2)
+    assert "options of columns are about tables" in failure(capsys, "data", "info", "simulated", "--id", "s", code=2)
     assert schema.read_text() in printed
     schema.write_text(schema.read_text().replace('family = "count"', 'family = "overdispersed"\nunit = "people"'))
     assert main(["data", "info", str(path)]) == 0
@@ -320,7 +320,7 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
     few = ["--particles", "2", "--samples", "2", "--contrasts", "0", "--stride", "4"]
     assert main(["compare", *both, *few, "--out", str(tmp_path / "a.json")]) == 0
     assert {*json.loads((tmp_path / "a.json").read_text())["rows"]} == {"vae", "autoregressive"}
-    assert main(["criticise", both[1], "--samples", "19"]) == 0
+    assert main(["check", "calibration", both[1], "--samples", "19"]) == 0
     said = capsys.readouterr()
     assert "no calibration" in said.err
     assert "windows of 2 sequences" in said.out

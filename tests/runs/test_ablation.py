@@ -104,14 +104,14 @@ def test_factors_read_the_covariates_of_data_as_those_of_the_method_do():
 
 
 def test_an_ablation_by_the_command_line(fitted):
-    found = dvae.Ablation.load(fitted / "ablation.json")
+    found = dvae.Ablation.load(fitted / "edges.json")
     runs = {arrow.run for arrow in found.arrows}
     left_out = {"model-without-x_t-1-to-x_t"}
     assert found.notes.keys() >= left_out
     assert "residual" in found.notes[left_out.copy().pop()]
     assert found.differences.keys() == runs - left_out
     assert {path.name for path in fitted.iterdir()} == {
-        "ablation.json",
+        "edges.json",
         *(f"{run}-seed{seed}" for run in runs - left_out | {WHOLE} for seed in (0, 1)),
     }
     for run, estimate in found.differences.items():
@@ -132,12 +132,12 @@ def test_the_same_command_continues_it(fitted, people, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/*")}
     assert main(command(people, out)) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    again, first = (json.loads((each / "ablation.json").read_text()) for each in (out, fitted))
+    again, first = (json.loads((each / "edges.json").read_text()) for each in (out, fitted))
     assert again == first
 
 
 def test_it_comes_back_from_json(fitted, priced):
-    for found in (priced, Ablation.load(fitted / "ablation.json")):
+    for found in (priced, Ablation.load(fitted / "edges.json")):
         again = Ablation.from_json(found.to_json())
         assert (str(again), again.to_json()) == (str(found), found.to_json())
 
@@ -177,7 +177,7 @@ def test_prices_that_do_not_belong_together_are_refused(priced):
 
 
 def test_a_comparison_of_other_models_is_refused(fitted):
-    document = json.loads((fitted / "ablation.json").read_text())
+    document = json.loads((fitted / "edges.json").read_text())
     rows = document["comparison"]["rows"]
     rows["another"] = rows.pop(WHOLE)
     with pytest.raises(ValueError, match="not an ablation written by"):
@@ -201,7 +201,7 @@ def test_a_comparison_of_other_models_is_refused(fitted):
 )
 def test_wrong_arguments_are_told_before_any_work(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["ablate", *arguments]) == 2
+    assert main(["check", "edges", *arguments]) == 2
     assert message in capsys.readouterr().err
     assert not [*tmp_path.iterdir()]
 

@@ -105,13 +105,13 @@ def test_nothing_is_written_through_a_link(run, canary, name):
         assert runs.resume(run, steps=6, progress=False).step == 6
 
 
-@pytest.mark.parametrize("names", [["evaluation.json", "scores.png"], ["criticism.json"]])
+@pytest.mark.parametrize("names", [["evaluation.json", "scores.png"], ["calibration.json"]])
 def test_results_take_the_place_of_a_link(run, canary, names):
     for name in names:
         (run / name).symlink_to(canary)
-    if "criticism.json" in names:
+    if "calibration.json" in names:
         few = ("--simulations", "20", "--draws", "19", "--ranked-steps", "1", "--samples", "19")
-        assert main(["criticise", str(run), *few]) == 0
+        assert main(["check", "calibration", str(run), *few]) == 0
     else:
         assert main(["evaluate", str(run), "--samples", "1", "--figure", str(run / "scores.png")]) == 0
     for name in names:
@@ -491,9 +491,9 @@ def test_nothing_is_suggested_where_nothing_is_near(capsys):
     ("arguments", "end"),
     [
         ("forecast RUN --out f.txt", ".npz"),
-        ("complete RUN --out f.json", ".npz"),
+        ("forecast RUN --out f.json", ".npz"),
         ("evaluate RUN --out scores.csv", ".json"),
-        ("criticise RUN --out f.npz", ".json"),
+        ("check calibration RUN --out f.npz", ".json"),
         ("compare RUN --out f.txt", ".json"),
         ("animate RUN --out f.png", ".html"),
     ],

@@ -204,8 +204,8 @@ def calibration(runs: Runs) -> Section:
     """Ranks of simulated latents among draws from the guide, and predictive checks."""
 
     def cell(run: Loaded) -> Markup:
-        if (text := _record(run, "criticism.json")) is None:
-            return _missing(run, "criticism.json", "calibration and no predictive checks", "criticise")
+        if (text := _record(run, "calibration.json")) is None:
+            return _missing(run, "calibration.json", "calibration and no predictive checks", "check calibration")
         document, parts = json.loads(text), []
         if "calibration" in document:
             found = Calibration.from_json(json.dumps(document["calibration"]))
@@ -224,8 +224,8 @@ def bracketed(runs: Runs) -> Section:
     """The evidence between two bounds, and where the ELBO loses what it lacks."""
 
     def cell(run: Loaded) -> Markup:
-        if (text := _record(run, "bracket.json")) is None:
-            return _missing(run, "bracket.json", "bounds from both sides", "bracket")
+        if (text := _record(run, "gap.json")) is None:
+            return _missing(run, "gap.json", "bounds from both sides", "check gap")
         found = Bracket.from_json(text)
         return picture(found.plot(), "bounds of the evidence from both sides") + tabulated(found.table())
 
@@ -239,11 +239,11 @@ def yardsticks(runs: Runs) -> Section:
     """The guide beside reference posteriors of some windows."""
 
     def cell(run: Loaded) -> Markup:
-        if (text := _record(run, "reference.json")) is None:
-            return _missing(run, "reference.json", "reference posteriors", "reference")
+        if (text := _record(run, "posterior.json")) is None:
+            return _missing(run, "posterior.json", "reference posteriors", "check posterior")
         document, parts = json.loads(text), Markup()
         kinds: dict[str, type[SteinDiscrepancy | ReferencePosterior]]
-        kinds = {"stein": SteinDiscrepancy, "reference": ReferencePosterior}
+        kinds = {"stein": SteinDiscrepancy, "posterior": ReferencePosterior}
         for name in [name for name in kinds if name in document]:
             found = kinds[name].from_json(json.dumps(document[name]))
             parts += picture(found.plot(), found.verdict) + tabulated(found.table())
@@ -257,9 +257,9 @@ def tubes(runs: Runs) -> Section:
     """How forecasts are widened to hold the future as often as they say, and how often they do."""
 
     def cell(run: Loaded) -> Markup:
-        if (text := _record(run, "tubes.json")) is None:
-            return _missing(run, "tubes.json", "tubes around forecasts", "tubes")
-        found, held = Tubes.from_json(text), _record(run, "tubes-coverage.json")
+        if (text := _record(run, "coverage.json")) is None:
+            return _missing(run, "coverage.json", "tubes around forecasts", "check coverage")
+        found, held = Tubes.from_json(text), _record(run, "coverage-test.json")
         shown = picture(found.plot(), "factors over the horizon") + tabulated(found.table())
         return shown + (tabulated(Evaluation.from_json(held).table()) if held is not None else "")
 
@@ -390,7 +390,7 @@ def _missing(run: Loaded, file: str, what: str, name: str) -> Markup:
 
 
 def _command(run: Loaded, name: str) -> Markup:
-    return command("dvae", name, shlex.quote(str(run.path)))
+    return command("dvae", *name.split(), shlex.quote(str(run.path)))
 
 
 def _record(run: Loaded, name: str) -> str | None:

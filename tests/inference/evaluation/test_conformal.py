@@ -112,8 +112,8 @@ def test_tubes_hold_what_exact_forecasts_say_and_narrow_ones_do_not(fitted):
 def test_tubes_are_kept_and_put_around_forecasts(fitted, tmp_path):
     model, kept, new = fitted
     tubes = conformal(model, kept, 0.8, samples=20, progress=False)
-    tubes.save(tmp_path / "tubes.json")
-    again = Tubes.load(tmp_path / "tubes.json")
+    tubes.save(tmp_path / "coverage.json")
+    again = Tubes.load(tmp_path / "coverage.json")
     assert again.to_json() == tubes.to_json()
     x = new.all()["x"]
     forecasts = model.forecast({"x": x[:, :2]}, 4, 20, draw_emission=True)["x"]

@@ -781,7 +781,7 @@ def test_a_run_is_judged_and_shown_on_other_motion_with_gaps(tmp_path, capsys):
     assert main(["evaluate", run, *other, *few, "--log-score-particles", "2", "--out", str(tmp_path / "e.json")]) == 0
     assert np.isfinite(json.loads((tmp_path / "e.json").read_text())["rows"]["vae"]["scores"]["log score"]["mean"])
     criticise = ["--simulations", "2", "--draws", "2", "--samples", "19", "--out", str(tmp_path / "c.json")]
-    assert main(["criticise", run, *other, *criticise]) == 0
+    assert main(["check", "calibration", run, *other, *criticise]) == 0
     assert main(["compare", run, *other, *few, "--particles", "2", "--contrasts", "2"]) == 0
     page = ["--out", str(tmp_path / "r.html"), "--windows", "1", *few, "--bound-windows", "2", "--particles", "2"]
     assert main(["report", run, *other, *page, "--evaluate"]) == 0

@@ -1,0 +1,358 @@
+"""Commands that check runs: check calibration, posterior, gap, coverage and edges."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from .. import files, motion
+from ..data.sequences import each as of_each
+from ..factorization.inversion import FAITHFUL
+from ..inference.diagnostics.bracket import bracket
+from ..inference.diagnostics.calibration import calibrate
+from ..inference.diagnostics.checks import predictive_checks
+from ..inference.diagnostics.stein import stein_discrepancy
+from ..inference.diagnostics.yardstick import reference_posterior
+from ..inference.evaluation.conformal import conformal
+from ..models import registry
+from ..models.family.equations import Equations
+from ..models.method import LatentMethod
+from ..models.motion.trajectories import TrajectoryModel
+from ..runs import directory as runs
+from ..runs.ablation import ablate, as_equations
+from . import opening, tables
+from .console import (
+    ERROR,
+    Failed,
+    Missing,
+    UsageError,
+    arguments,
+    at_least,
+    check_figure,
+    check_files,
+)
+from .fitting import DataOptions, MethodOptions, SweepOptions, given_options, options_of
+from .help import Expert
+from .judging import keep
+
+if TYPE_CHECKING:
+    EquationOptions = Any
+else:
+    SHARED = [option.name for option in fields(LatentMethod)]
+    EquationOptions = options_of("EquationOptions", Equations, "generative", "inference", *SHARED)
+
+
+def calibration(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
+    simulations: int = 200,
+    draws: Expert[int] = 99,
+    ranked_steps: Expert[int] = 4,
+    samples: int = 20,
+    draw_emission: Expert[bool] = True,
+    seed: int = 0,
+    batch_size: Expert[int] = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Run simulation-based calibration of a run's guide, and predictive checks on the test windows.
+
+    Prints both tables, and writes each to calibration.json in the run, or to --out, as soon as it is computed.
+
+    Args:
+        run: the run directory.
+        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        simulations: number of sequences drawn from the model, as long as its windows.
+        draws: number of draws from the guide for each simulation.
+        ranked_steps: number of time steps, evenly spaced, at which local latents are ranked.
+        samples: number of replicates of each test window, at least 19.
+        draw_emission: replicate draws of x, or its means, which have no emission noise. Methods that follow given
+            paths (trajevae, cvae-rnn, motion-infilling) always give means.
+        seed: seed of the draws.
+        batch_size: number of windows replicated at once.
+        out: file to write instead of calibration.json in the run.
+        figure: save the figures, with -calibration and -checks added to this name.
+    """
+    at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
+    at_least(19, samples=samples)
+    check_files(out, figure, ".json")
+    loaded, opened = opening.forecaster(run, data, missing, failed)
+    model, windows = loaded.model, opening.windows_to_test(loaded, opened, whole=False)
+    steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
+    document: dict[str, Any] = {}
+    path = out or run / f"{opening.record('calibration', loaded, opened)}.json"
+    if model.context:
+        given = ", ".join(model.context)
+        ERROR.print(f"no calibration: {loaded.method.name} is given {given}, which nothing simulates")
+    elif not model.latents:
+        ERROR.print(f"no calibration: {loaded.method.name} has no latents, and so no guide")
+    else:
+        ranks = calibrate(model, windows.length, simulations, draws, steps=steps, seed=seed)
+        _add(document, "calibration", ranks, path, figure, "calibration")
+    checks = predictive_checks(
+        {loaded.method.name: model},
+        windows,
+        motion.statistics(windows) if loaded.config.kind == "motion" else None,
+        samples=samples,
+        draw_emission=draw_emission and not isinstance(model, TrajectoryModel),
+        seed=seed,
+        batch_size=batch_size,
+    )
+    _add(document, "predictive", checks, path, figure, "checks")
+
+
+def posterior(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
+    windows: int = 3,
+    frames: int | None = None,
+    draws: int = 1000,
+    chains: int = 4,
+    warmup: Expert[int] = 500,
+    stein_draws: Expert[int] = 500,
+    seed: int = 0,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Compare a run's guide with the posterior of the latents of some test windows.
+
+    Computes the kernel Stein discrepancy of the guide in moments, and then means, deviations and correlations of the
+    guide and of NUTS, which takes minutes for each window: begin with a few frames. Prints both tables, and writes each
+    to posterior.json in the run, or to --out, as soon as it is computed.
+
+    Args:
+        run: the run directory.
+        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        windows: number of test windows, evenly spaced.
+        frames: number of frames of a window, from its first one, whose latents are inferred; all by default.
+        draws: number of draws of each NUTS chain.
+        chains: number of chains for each window.
+        warmup: number of warm-up draws of each chain.
+        stein_draws: number of draws from the guide for the kernel Stein discrepancy.
+        seed: seed of the draws.
+        out: file to write instead of posterior.json in the run.
+        figure: save the figures, with -stein and -posterior added to this name.
+    """
+    at_least(1, windows=windows, frames=frames, warmup=warmup)
+    at_least(2, chains=chains, stein_draws=stein_draws)
+    at_least(4, draws=draws)
+    check_files(out, figure, ".json")
+    loaded, opened = opening.forecaster(run, data, missing, failed)
+    batch = opened.windows("test").all()
+    some = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
+    kept = of_each(batch, lambda value: value[some, :frames] if value.dim() == 3 else value[some])
+    if "lengths" in kept and frames is not None:
+        kept = {**kept, "lengths": kept["lengths"].clamp(max=frames)}
+    document: dict[str, Any] = {"windows": some.tolist(), "frames": frames}
+    path = out or run / f"{opening.record('posterior', loaded, opened)}.json"
+    stein = stein_discrepancy(loaded.model, kept, draws=stein_draws, seed=seed)
+    _add(document, "stein", stein, path, figure, "stein")
+    reference = reference_posterior(loaded.model, kept, draws=draws, chains=chains, warmup=warmup, seed=seed)
+    _add(document, "posterior", reference, path, figure, "posterior")
+
+
+def _add(document: dict[str, Any], part: str, result: Any, path: Path, figure: Path | None, suffix: str) -> None:
+    """Add a part to a document, write it, and print the part."""
+    document[part] = result.document()
+    with files.written(path) as file:
+        file.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    ERROR.print(f"wrote {path}: {part}")
+    keep(result, [], figure and figure.with_stem(f"{figure.stem}-{suffix}"))
+
+
+def gap(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
+    count: int = 32,
+    particles: int = 64,
+    temperatures: int = 50,
+    chains: Expert[int] = 8,
+    fitting: Expert[int] = 300,
+    reach: Expert[int | None] = None,
+    seed: int = 0,
+    batch_size: Expert[int] = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Bound a run's evidence from both sides, and divide the gap of its ELBO: amortisation, dependencies, family.
+
+    Prints bounds of some test windows and of as many windows simulated from the model, and the parts of the gap.
+    Writes them to gap.json in the run, or to --out.
+
+    Args:
+        run: the run directory.
+        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        count: number of test windows, drawn at random; the time is proportional to it.
+        particles: number of particles of IWAE and FIVO, and of draws over which ELBOs are averaged.
+        temperatures: number of temperatures of annealed importance sampling; more give closer bounds.
+        chains: number of chains for each window.
+        fitting: steps of the guides of single windows; 0 leaves out the parts of the gap.
+        reach: steps between latents that these guides read linearly; by default all that the equations allow.
+        seed: seed of the draws.
+        batch_size: number of windows at once.
+        out: file to write instead of gap.json in the run.
+        figure: save all bounds on one axis.
+    """
+    at_least(1, count=count, particles=particles, temperatures=temperatures, chains=chains, batch_size=batch_size)
+    at_least(0, fitting=fitting, reach=reach)
+    check_files(out, figure, ".json")
+    loaded, opened = opening.forecaster(run, data, missing, failed)
+    result = bracket(
+        loaded.model,
+        opening.windows_to_test(loaded, opened),
+        count=count,
+        particles=particles,
+        temperatures=temperatures,
+        chains=chains,
+        fitting=fitting,
+        reach=reach,
+        seed=seed,
+        batch_size=batch_size,
+    )
+    keep(result, [out or run / f"{opening.record('gap', loaded, opened)}.json"], figure)
+
+
+def coverage(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str | None = None,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
+    level: float = 0.9,
+    label: str | None = None,
+    values: tuple[str, ...] = (),
+    samples: int = 50,
+    seed: int = 0,
+    batch_size: Expert[int] = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Widen a run's forecasts to bands that contain whole futures with a given probability, and test them.
+
+    Calibrates on the validation windows, by which training chose its weights, and tests on the test windows. With
+    --label style --values feminine it calibrates on the test clips of these styles and tests on the others. Prints the
+    factors and the coverage before and after. Writes coverage.json and coverage-test.json in the run, or to --out:
+    `dvae.Tubes.load` reads the first, and its `tube` gives the band of forecasts.
+
+    Args:
+        run: the run directory.
+        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        level: share of futures that bands contain.
+        label: label of test clips that divides them into those for calibration and those for the test.
+        values: values of the label of the clips for calibration.
+        samples: number of forecasts of each window.
+        seed: seed of the draws.
+        batch_size: number of windows forecast at once.
+        out: file to write instead of coverage.json in the run.
+        figure: save the factors over the horizon.
+    """
+    at_least(1, samples=samples, batch_size=batch_size)
+    check_files(out, figure, ".json")
+    if bool(values) != (label is not None):
+        raise UsageError("--label and --values are given together, to say which test clips calibrate")
+    loaded, opened = opening.forecaster(run, data, missing, failed)
+    kept, tested = _kept_and_tested(loaded, opened, label, values)
+    found = conformal(loaded.model, kept, level, samples=samples, seed=seed, batch_size=batch_size)
+    path = out or run / f"{opening.record('coverage', loaded, opened)}.json"
+    keep(found, [path], figure)
+    keep(found.coverage({loaded.method.name: loaded.model}, tested), [path.with_stem(f"{path.stem}-test")], None)
+
+
+def _kept_and_tested(loaded: runs.Loaded, opened: Any, label: str | None, values: Sequence[str]) -> Any:
+    """Windows to calibrate on, and to test on."""
+    if loaded.config.kind == "panel":
+        if label is not None:
+            raise UsageError(f"--label is of clips of motion, and {loaded.path} is of a table")
+        return [tables.windows(loaded, opened, split) for split in ("validation", "test")]
+    if label is None:
+        return [opened.windows(split) for split in ("validation", "test")]
+    clips, whole = opened.windows("test").clips, opened.motion
+    found = {clip.labels.get(label, "") for clip in clips}
+    if unknown := sorted({*values} - found):
+        raise UsageError(f"no test clip has {label} {', '.join(unknown)}; there are {', '.join(sorted(found))}")
+    test = motion.MotionSet(clips, whole.skeleton, opened.path, missing=whole.missing)
+    others = tuple(sorted(found - {*values}))
+    if not others:
+        raise UsageError(f"all test clips would calibrate, of {label} {', '.join(values)}; leave some to test on")
+    return [
+        motion.windows(test, replace(opened.protocol, split_by=label, train=(), test=part), "test")
+        for part in (tuple(values), others)
+    ]
+
+
+def edges(
+    method: Annotated[str | None, tyro.conf.Positional] = None,
+    *,
+    model: MethodOptions,
+    networks: EquationOptions,
+    training: SweepOptions,
+    source: DataOptions,
+    generative: str | None = None,
+    inference: str | None = None,
+    latent: int | None = None,
+    out: Path | None = None,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    jobs: int = 2,
+    bound_particles: Expert[int] = 64,
+    twin_steps: Expert[int] = 5,
+    twins: Expert[int] = 5,
+    figure: Path | None = None,
+) -> None:
+    """Leave out every edge of a model and its guide in turn, and report what each is worth in nats.
+
+    Without --out this is computed on linear-Gaussian surrogates alone. With --out every reduced pair of equations is
+    also fitted to data, with networks of one kind, and compared on the test windows. The table is written to edges.json
+    there. The same command continues after an interruption and keeps finished runs.
+
+    Args:
+        method: name of a method, or give --generative instead.
+        model: options of all models, in place of the method's.
+        networks: options of the networks of every factor.
+        training: options of the runs.
+        source: the data.
+        generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
+        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; by default "faithful", a guide with all dependencies
+            of the posterior, derived anew for every reduced model; "" of a model without latents.
+        latent: size of the latents.
+        out: directory of the run directories, such as whole-seed0 and model-without-z_t-1-to-z_t-seed0.
+        seeds: seeds of initial weights, batches and draws, a run for each.
+        jobs: number of runs at a time.
+        bound_particles: number of particles of the importance-weighted bound.
+        twin_steps: time steps of the linear-Gaussian surrogates.
+        twins: number of random linear-Gaussian surrogates.
+        figure: save model and guide of one step, with edges as thick as their worth.
+    """
+    at_least(1, jobs=jobs, bound_particles=bound_particles, twin_steps=twin_steps, twins=twins)
+    check_figure(figure, "figure")
+    if (method is None) == (generative is None):
+        raise UsageError("give the name of a method, or --generative, with --inference for a guide of your own")
+    if method is not None and inference is not None:
+        raise UsageError(f"--inference is the guide of --generative; {method} has its own")
+    trained = [value for value in vars(training).values() if value not in (None, False)]
+    if out is None and (trained or source != DataOptions()):
+        raise UsageError("fits need a directory for their runs: give --out DIR")
+    if out is not None and (out.is_file() or not seeds):
+        raise UsageError(f"give at least one seed, and a directory for the runs: --out {out} --seeds {seeds}")
+    with arguments():
+        guide = FAITHFUL if inference is None else inference
+        named = registry.method(method) if method else Equations(generative=generative or "", inference=guide)
+        given = {**vars(model), **vars(networks), "latent": latent}
+        chosen = {name: value for name, value in given.items() if value is not None}
+        replace(as_equations(named), **chosen).check()
+        how = given_options(training)
+    opened = None if out is None else source.open(named)
+    whole = replace(as_equations(named, None if opened is None else opened.schema), **chosen)
+    settings: dict[str, Any] = {"steps": twin_steps, "twins": twins, "bound_particles": bound_particles}
+    result = ablate(whole, opened, out, seeds, how, jobs, **settings)
+    keep(result, [] if out is None else [out / "edges.json"], figure)

@@ -1,0 +1,148 @@
+"""Help of one command: its common options with the defaults that apply, or all options.
+
+Help is printed from a copy of the command's signature, which is never called: options marked `Expert` are left out
+unless all are asked for, and an option without a value of its own says where its value comes from.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import tyro
+
+from ..inference.training.options import Training
+from ..inference.training.recipe import Trainable
+from .console import OUT
+
+T = TypeVar("T")
+EXPERT = "expert"
+Expert = Annotated[T, EXPERT]
+"""An option that `--help` leaves out and `--help-all` shows."""
+
+
+def described(function: Callable[..., None], given: Sequence[str], everything: bool) -> tuple[Callable[..., None], str]:
+    """Return a stand-in for a command, to print its help, and the method that it is about, if any.
+
+    Args:
+        function: the command.
+        given: arguments, which may name a method to fit.
+        everything: whether to show the options of experts.
+    """
+    from ..models.registry import judges, methods
+
+    hints = get_type_hints(function, include_extras=True)
+    known: dict[str, type[Trainable]] = {**methods(), **judges()} if function.__name__ == "fit" else {}
+    kind = next((known[word] for word in given if word in known), None)
+    if known and kind is None:
+        _list_methods(known)
+    own = dict.fromkeys((option.name for option in fields(Training)), "default: the method's")
+    defaults = own if kind is None else _trainings(kind)
+    kept = []
+    for parameter in inspect.signature(function).parameters.values():
+        hint = hints[parameter.name]
+        if known and parameter.name == "method":
+            if kind is None:
+                continue
+            hint = _of_method(kind, everything)
+        elif EXPERT in get_args(hint) and not everything:
+            continue
+        elif is_dataclass(hint):
+            hint = _copied(hint, everything, defaults)
+        else:
+            hint = _hinted(hint, parameter.default)
+        kept.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+
+    def shown(**_: Any) -> None:
+        """The help alone is printed."""
+
+    shown.__doc__ = function.__doc__
+    shown.__signature__ = inspect.Signature(kept)  # type: ignore[attr-defined]
+    shown.__annotations__ = {parameter.name: parameter.annotation for parameter in kept}
+    return shown, "" if kind is None else f" {kind.name}"
+
+
+def _hinted(hint: Any, default: Any, said: str | None = None) -> Any:
+    """An option whose help says its default, where that is not a value."""
+    if not (default is None or default is False or default == ()):
+        return hint
+    words = said or ("default: no" if default is False else "optional")
+    return Annotated[hint, tyro.conf.arg(help_behavior_hint=f"({words})")]
+
+
+def _copied(kind: Any, everything: bool, defaults: Mapping[str, str], expert: Sequence[str] = ()) -> Any:
+    """A subclass of a dataclass of options whose fields are shown as `described` says."""
+    hints = get_type_hints(kind, include_extras=True)
+    annotations, values = {}, {}
+    for option in fields(kind):
+        hint: Any = hints[option.name]
+        default = option.default_factory() if option.default_factory is not MISSING else option.default
+        hidden = not everything and (option.name in expert or EXPERT in get_args(hint))
+        plain = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        if is_dataclass(plain):
+            hint = _copied(plain, everything, defaults)
+            values[option.name] = field(default_factory=hint)
+            hint = Annotated[hint, tyro.conf.Suppress] if hidden else hint
+        else:
+            if hidden:
+                hint = Annotated[hint, tyro.conf.Suppress]
+            if default is not MISSING:
+                hint = _hinted(hint, default, defaults.get(option.name))
+                values[option.name] = field(default=default)
+        annotations[option.name] = hint
+    body = {"__annotations__": annotations, "__doc__": kind.__doc__, "__post_init__": lambda self: None, **values}
+    return dataclass(frozen=True)(type(kind.__name__, (kind,), body))
+
+
+def _of_method(kind: type[Trainable], everything: bool) -> Any:
+    """The options of a method; those that it shares with others are for experts."""
+    own = {name for each in kind.__mro__ if each.__module__ == kind.__module__ for name in each.__annotations__}
+    shared = [option.name for option in fields(kind) if option.name not in own and option.name != "latent"]
+    presets: Mapping[str, Mapping[str, Any]] = getattr(kind, "presets", {})
+    defaults = {}
+    for option in fields(kind):
+        by_data = {name: preset[option.name] for name, preset in presets.items() if option.name in preset}
+        if by_data:
+            defaults[option.name] = _by_preset(by_data)
+    return _copied(kind, everything, defaults, shared)
+
+
+def _trainings(kind: type[Trainable]) -> dict[str, str]:
+    """The training defaults of a method, in words."""
+    names = [option.name for option in fields(next(iter(kind.trainings.values())))]
+    return {
+        name: _by_preset({of or kind.name: getattr(training, name) for of, training in kind.trainings.items()})
+        for name in names
+    }
+
+
+def _by_preset(values: Mapping[str, Any]) -> str:
+    """Values by preset of data; one where all agree."""
+    said = {name: "none" if value is None else str(value) for name, value in values.items()}
+    if len({*said.values()}) == 1:
+        name, value = next(iter(said.items())) if len(said) == 1 else ("", next(iter(said.values())))
+        return f"default: {value}" + (f" ({name})" if name else "")
+    return "default: " + ", ".join(f"{value} ({name or 'other data'})" for name, value in said.items())
+
+
+def _list_methods(known: Mapping[str, type[Trainable]]) -> None:
+    """Print the methods by group, one line each."""
+    groups: dict[str, list[type[Trainable]]] = {}
+    for kind in known.values():
+        groups.setdefault(_group(kind), []).append(kind)
+    OUT.print("usage: dvae fit METHOD --out RUN [options]; `dvae fit METHOD --help` shows the options of a method.\n")
+    for group, kinds in groups.items():
+        OUT.print(group, style="bold", highlight=False)
+        for kind in kinds:
+            OUT.print(f"  {kind.name:<18} {kind.source}", highlight=False)
+    OUT.print()
+
+
+GROUPS = {"family": "classical DVAEs", "motion": "human motion", "baselines": "baselines"}
+
+
+def _group(kind: type[Trainable]) -> str:
+    parts = kind.__module__.split(".")
+    return GROUPS.get(parts[2], parts[2]) if parts[1] == "models" else "evaluation networks"
