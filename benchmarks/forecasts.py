@@ -34,7 +34,7 @@ def scores(file: Path, steps: int, batch_size: int) -> dict[str, tuple[float, st
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         training = dvae.Training(steps=steps, batch_size=batch_size, decay=0.5, validate_every=max(steps // 12, 1))
-        runs.fit_run(dvae.method("hit-dvae", loss="evidence"), data, Path(folder) / "run", training)
+        dvae.fit(dvae.method("hit-dvae", loss="evidence"), data, out=Path(folder) / "run", **vars(training))
         model = runs.load(Path(folder) / "run").model
         minutes = (time.perf_counter() - start) / 60
     test = data.windows("test")

@@ -83,7 +83,7 @@ def fitted(people: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "fitted"
     training = dvae.Training(steps=10, batch_size=4, validate_every=5, progress=False)
     method = dvae.method("vae", latent=3, warm_up=4)
-    dvae.runs.directory.fit_run(method, dvae.motion.MotionData.open(people), out, training)
+    dvae.fit(method, dvae.motion.MotionData.open(people), out=out, **vars(training))
     return out
 
 

@@ -348,7 +348,7 @@ def recurrent(data: SegmentData, seed: int, out: Path, budget: Budget) -> Any:
     resume, every = (out / "state.json").exists(), max(budget.steps // 3, 1)
     recipe = method.train(windows, None, budget.steps)
     told: dict[str, Any] = {"config": method.config(), "validate_every": every, "progress": False, **TRAINING}
-    recipe.fit(model, out=out, resume=resume, seed=seed, **told)
+    dvae.fit(model, recipe, out=out, resume=resume, seed=seed, **told)
     load_weights(model, out / LAST)
     return model.eval()
 

@@ -24,7 +24,7 @@ from dvae.inference.training.checkpoints import Run
 from dvae.inference.training.fit import Fit
 from dvae.inference.training.recipe import Trainable
 from dvae.motion.drawing.plot import futures
-from dvae.runs.directory import fit_run, read_config, resume
+from dvae.runs.directory import read_config, resume
 from dvae.runs.kinds import Dataset
 
 STEPS = {"hit-dvae": 400, "srnn": 700}
@@ -94,7 +94,7 @@ def fitted(method: Trainable, data: Dataset, run: Path, training: dvae.Training)
         if (before.training.steps, before.data.fingerprint) == (training.steps, data.fingerprint):
             return resume(run)
         shutil.rmtree(run)
-    return fit_run(method, data, run, training)
+    return dvae.fit(method, data, out=run, **vars(training))
 
 
 if __name__ == "__main__":

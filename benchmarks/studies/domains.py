@@ -295,7 +295,7 @@ def fitted(section: Section, data: Data, case: str, seed: int, out: Path) -> Any
         source = Alike(windows) if "lengths" in windows.all() else windows
         recipe = method.train(source, data.training.windows("validation"), training.steps)
         kept = Config(method, data.training.schema, data.training.kind, data.training.recorded(), training).written()
-        recipe.fit(model, out=out, resume=resumed, config=kept, **vars(training))
+        dvae.fit(model, recipe, out=out, resume=resumed, config=kept, **vars(training))
         seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
         file.write_text(json.dumps({"seconds": seconds}))
     return dvae.load(out).model, json.loads(file.read_text())["seconds"]

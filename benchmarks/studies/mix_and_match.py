@@ -201,8 +201,9 @@ def fitted(
     model = method.build(windows["train"])
     watch = CodeDiversity(observations(windows["test"], budget), every=max(budget.steps // 15, 1))
     start = time.process_time()
-    result = method.train(windows["train"], None, budget.steps).fit(
+    result = dvae.fit(
         model,
+        method.train(windows["train"], None, budget.steps),
         out=out,
         resume=(out / "state.json").exists(),
         seed=seed,

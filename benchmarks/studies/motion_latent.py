@@ -147,7 +147,7 @@ def run(section: str, case: str, seed: int, out: Path, file: Path, other: Path |
     model = method.build(data.schema)
     start, resumed = time.process_time(), Run(out).exists
     recipe = method.train(data.windows("train"), data.windows("validation"), steps)
-    recipe.fit(model, out=out, resume=resumed, config=config, **vars(training))
+    dvae.fit(model, recipe, out=out, resume=resumed, config=config, **vars(training))
     seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
     tests = {SAME: data.windows("test")}
     if other is not None and section == HELD:

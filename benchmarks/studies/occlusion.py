@@ -92,7 +92,7 @@ def fitted(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
     method = dvae.method(name, **METHODS[name], warm_up=steps // 3).suited(train)
     model = method.build(data.schema)
     recipe = method.train(train, None, steps)
-    recipe.fit(model, batch_size=32, learning_rate=2e-3, decay=0.5, seed=seed, progress=False)
+    dvae.fit(model, recipe, batch_size=32, learning_rate=2e-3, decay=0.5, seed=seed, progress=False)
     return model.eval()
 
 

@@ -24,7 +24,6 @@ from dvae.inference.evaluation.held import Held, clip_places, hold, reproducibly
 from dvae.inference.evaluation.references import References
 from dvae.inference.evaluation.scores import clip_means, over_horizon
 from dvae.motion.data.dataset import MotionData
-from dvae.runs.directory import fit_run
 
 from .pages import DOCS, table, write
 
@@ -121,7 +120,7 @@ def main(
         opened = MotionData.open(str(data), replace(protocol, train=styles, test=unseen))
         out = runs / "-".join(styles)
         if not out.exists():
-            fit_run(dvae.method("srnn", self_feeding=1.0), opened, out, SRNN)
+            dvae.fit(dvae.method("srnn", self_feeding=1.0), opened, out=out, **vars(SRNN))
         apart = replace(opened.protocol, train_stride=EVERY, test_stride=EVERY)
         windows, training = (motion.windows(opened.motion, apart, split) for split in ("test", "train+validation"))
         model = dvae.load(out, data).model

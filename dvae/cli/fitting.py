@@ -17,6 +17,7 @@ from joblib import parallel_config
 from .. import motion
 from ..inference.training.checkpoints import Run
 from ..inference.training.fit import Fit, Interrupted
+from ..inference.training.fit import fit as fit_method
 from ..inference.training.options import Accelerator, Training
 from ..inference.training.processes import restartable
 from ..inference.training.recipe import Trainable
@@ -201,7 +202,7 @@ def fit(
         how = given_options(training)
     opened = source.open(method)
     with _reported():
-        _report(runs.fit_run(method, opened, out, how, trackers=[TensorBoard(out)] if tensorboard else []))
+        _report(fit_method(method, opened, out=out, trackers=[TensorBoard(out)] if tensorboard else [], **how))
 
 
 def resume(

@@ -1,4 +1,4 @@
-"""Runs of methods on data: fit, resume and load a run directory that says all it takes to do so.
+"""Runs of methods on data: resume and load a run directory, which says all it takes to do so.
 
 `config.json` of such a run (format 2) holds the method with its options; the schema of the data, from which the model
 is built again without them; where the data were, with the fingerprint of their content; and the options of training. A
@@ -11,7 +11,7 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -20,18 +20,15 @@ from typing import Any
 
 from ..data.schema import Schema
 from ..inference.training.checkpoints import CONFIG, ENDED, CheckpointError, Run, at_most, load_weights
-from ..inference.training.fit import Callback, Fit
+from ..inference.training.fit import Callback, Fit, fit
 from ..inference.training.options import Training
-from ..inference.training.recipe import Trainable
+from ..inference.training.recipe import FORMAT, Trainable, run_config
 from ..inference.training.schedules import from_config as option_from_config
 from ..inference.training.trackers import Tracker
 from ..models.registry import configured
 from ..options import flat
 from ..turns import alone
 from .kinds import DATA, SCHEMAS, Dataset, opened
-
-FORMAT = 2
-"""Of the config of a run."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +50,8 @@ class Config:
     training: Training
 
     def written(self) -> dict[str, Any]:
-        """It in the present format and JSON's types, but for the training, which `fit` adds."""
-        schema = {"kind": self.schema.kind, **self.schema.config()}
-        data = {"kind": self.kind, **asdict(self.data)}
-        return {"format": FORMAT, "method": self.method.config(), "schema": schema, "data": data}
+        """Return it in JSON's types, but for the training, which `fit` adds."""
+        return run_config(self.method, self.schema, self.kind, self.data)
 
 
 @dataclass
@@ -144,36 +139,6 @@ def advice(path: str | os.PathLike[str]) -> str:
     return f"continue it at a lower learning rate with: dvae resume {path} --learning-rate {lower}"
 
 
-@alone
-def fit_run(
-    method: Trainable,
-    data: Dataset,
-    out: str | os.PathLike[str],
-    training: Training | Mapping[str, Any] | None = None,
-    callbacks: Sequence[Callback] = (),
-    trackers: Sequence[Tracker] = (),
-) -> Fit:
-    """Fits a method to data, in a run directory that `load` and `resume` read.
-
-    Args:
-        method: such as `dvae.method("hit-dvae", latent=8)`; it tells objective and self-feeding.
-        data: training and validation windows are taken from it.
-        out: the run directory.
-        training: the other options, or some of them beside the method's own (`Trainable.training`); its seed is also
-            that of the initial weights.
-        callbacks: hooks of the loop.
-        trackers: further receivers of the log's rows.
-
-    Raises:
-        ValueError: `training` sets the self-feeding, which is the method's to tell; or the pseudo-sequences of a
-            prior are longer than the windows.
-    """
-    training = training_of(method, data, training)
-    method = method.suited(data.windows("train"))
-    config = Config(method, data.schema, data.kind, data.recorded(), training).written()
-    return method.fit(data, out=out, config=config, callbacks=callbacks, trackers=trackers, **vars(training))
-
-
 def training_of(method: Trainable, data: Dataset, training: Training | Mapping[str, Any] | None) -> Training:
     """How a method is fitted to data: as is said, or by the method's own options but for those that are said."""
     return training if isinstance(training, Training) else replace(method.training(data.schema), **(training or {}))
@@ -206,8 +171,8 @@ def resume(
     training = replace(run.config.training, self_feeding=0.0, **options)
     train, validation = run.data.windows("train"), run.data.windows("validation")
     recipe = run.config.method.train(train, validation, training.steps)
-    told = {"out": path, "config": run.config.written(), "trackers": trackers, "callbacks": callbacks}
-    return recipe.fit(run.model, resume=True, **told, **vars(training))
+    told: dict[str, Any] = {"out": path, "config": run.config.written(), "trackers": trackers, "callbacks": callbacks}
+    return fit(run.model, recipe, resume=True, **told, **vars(training))
 
 
 @alone
@@ -227,9 +192,9 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
         >>> import tempfile
         >>> clips = dvae.motion.simulate(clips=8, frames=90)
         >>> people = dvae.motion.MotionData("simulated", clips, dvae.motion.PROTOCOLS["simulated"])
-        >>> training = dvae.Training(steps=1, batch_size=2, progress=False)
+        >>> training = {"steps": 1, "batch_size": 2, "progress": False}
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = dvae.runs.directory.fit_run(dvae.method("vae", latent=2), people, folder + "/a", training)
+        ...     _ = dvae.fit(dvae.method("vae", latent=2), people, out=folder + "/a", **training)
         ...     dvae.load(folder + "/a").method.name
         'vae'
     """

@@ -1,6 +1,6 @@
 """Sweeps: methods x seeds fitted in parallel by joblib, one process and one torch thread per run.
 
-Every run has a directory of its own, as `fit_run` writes it, with the same weights bit for bit. The same call again
+Every run has a directory of its own, as `dvae.fit` writes it, with the same weights bit for bit. The same call again
 continues a sweep: finished runs are skipped, others continue from their last checkpoint.
 """
 
@@ -29,7 +29,7 @@ from .. import files
 from ..data.schema import Schema
 from ..inference.evaluation.result import Plain, Table, reason
 from ..inference.training.checkpoints import ENDED, Run
-from ..inference.training.fit import Callback, Fit
+from ..inference.training.fit import Callback, Fit, fit
 from ..inference.training.options import Training
 from ..inference.training.processes import by_torchrun
 from ..inference.training.recipe import Trainable
@@ -39,7 +39,7 @@ from ..inference.training.trackers import LARGEST_LOG, JSONLines, row_of
 from ..models.method import Method
 from ..options import flat, require
 from ..turns import alone
-from .directory import fit_run, read_config, resume, training_of
+from .directory import read_config, resume, training_of
 from .kinds import Dataset
 
 
@@ -207,7 +207,7 @@ def _fit(run: _Run) -> tuple[Outcome, list[str]]:
                 ended = resume(run.path, run.source, callbacks=[_EndsWithParent()], progress=False, accelerator=where)
             else:
                 training = replace(run.training, progress=False)
-                ended = fit_run(run.method, run.data, run.path, training, callbacks=[_EndsWithParent()])
+                ended = fit(run.method, run.data, out=run.path, callbacks=[_EndsWithParent()], **vars(training))
         except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
             ended = Fit([], 0, None, None, "failed", run.path)
             error = f"{type(failure).__name__}: {reason(failure)}"

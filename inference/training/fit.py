@@ -7,15 +7,17 @@ checkpoint: a resumed run repeats, bit for bit on a CPU, what the uninterrupted 
 import os
 import signal
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
 
+from ...data.schema import Schema
 from ...data.sequences import Fingerprinted, InBatches, Source, as_source, in_batches, is_divided, take_split
 from ...data.views import WHOLE
 from ...program.batch import check_scale
@@ -29,6 +31,7 @@ from .checkpoints import CONFIG, CheckpointError, Run
 from .last_value import last_value_bound
 from .objectives import Objective
 from .options import Stage, Training, recorded
+from .recipe import Recipe, Trainable, run_config
 from .resuming import marking_failure, restore, store
 from .signals import Signals
 from .svi import SVI, State
@@ -165,8 +168,8 @@ class Interrupted(KeyboardInterrupt):
 @alone
 @torch.inference_mode(False)  # which enables gradients too
 def fit(
-    model: nn.Module,
-    train: Any,
+    model: nn.Module | Trainable,
+    data: Any,
     validation: Any = None,
     *,
     objective: Objective | None = None,
@@ -178,30 +181,34 @@ def fit(
     callbacks: Sequence[Callback] = (),
     **options: Any,
 ) -> Fit:
-    """Fit a model and its guide.
+    """Fit a model and its guide, or build and fit a method.
 
     Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
     or without validation data the last ones. The caller's random state is left as it was. Threads take turns, as Pyro's
     handlers and torch's random state are the process's: another fit or forecast waits until this one is done.
 
     Args:
-        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
-        train: x as a tensor (N, T, D), a batch of N sequences, an object with `sample(batch_size, generator)`, or
-            data with parts, such as `dvae.tables.PanelData`, whose validation windows are used too.
+        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes; or a method, such as `dvae.method("srnn")`,
+            whose model is built for the data and trained by its recipe, with its own defaults of `Training`.
+        data: x as a tensor (N, T, D), a batch of N sequences, an object with `sample(batch_size, generator)`, or
+            data with parts, such as `dvae.tables.PanelData`, whose validation windows are used too; or a `Recipe`,
+            which says what is trained, on which data.
         validation: x as a tensor, a batch, or an object whose `all()` returns a batch, or whose `batches(size)` are
             some sequences after the others.
         objective: what to minimise; `Evidence()` by default.
         stages: objectives one after the other, in place of `objective`; their steps are those of the run.
-        out: run directory for checkpoints and `log.jsonl` (see `checkpoints`).
+        out: run directory for checkpoints and `log.jsonl` (see `checkpoints`). A method that was fitted to data which
+            can be opened again leaves a run that `dvae.load` and `dvae.resume` read.
         resume: continue the run in `out` from its last checkpoint up to `steps`.
         config: what is run, in JSON's types, for `config.json`, to which the training options are added; a resumed run
             keeps its own where none is given.
         trackers: further receivers of the log's rows.
         callbacks: hooks after steps, after validations and at the end.
-        **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3.
+        **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3. The seed of a method is
+            that of its initial weights too.
 
     Returns:
-        The history, and the best bound and its step.
+        The history, the best bound and its step, and the `model`.
 
     Raises:
         NonFiniteError: when a loss or gradient is NaN or infinite, naming step, site and term; the last
@@ -210,7 +217,8 @@ def fit(
         CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
             fitted on training data with another `fingerprint`.
         TypeError: a model or data of another kind, such as a table, whose columns need roles.
-        ValueError: the first batch varies by less than float32 resolves.
+        ValueError: the first batch varies by less than float32 resolves; options that a method or a recipe sets itself;
+            or data without windows of some part.
         LostProcess: another one of several processes has ended, or does not answer; the last checkpoint stays.
 
     Example:
@@ -222,6 +230,68 @@ def fit(
         >>> result.status, result.best_step
         ('finished', 20)
     """
+    loop: dict[str, Any] = {"out": out, "resume": resume, "config": config, "trackers": trackers}
+    loop["callbacks"] = callbacks
+    if not isinstance(model, Trainable) and not isinstance(data, Recipe):
+        return _fit(model, data, validation, objective=objective, stages=stages, **loop, **options)
+    if objective is not None or stages:
+        raise ValueError("a method or a recipe has its own objective; leave out objective and stages")
+    if not isinstance(model, Trainable):
+        if validation is not None:
+            raise ValueError("a recipe has its own validation data; leave out validation")
+        return _follow(data, model, **loop, **options)
+    if resume:
+        raise ValueError(f"dvae.resume({os.fspath(out or 'RUN')!r}) continues the run of a method")
+    if validation is None and is_divided(data):
+        validation = data
+    train = as_source(take_split(data, "train"))
+    schema = Schema.of(data if is_divided(data) else train)
+    if too_short := getattr(train, "too_short", ""):
+        warnings.warn(f"training leaves out {too_short}", stacklevel=4)
+    names = Training.__dataclass_fields__.keys() & options
+    training = replace(model.training(schema), **{name: options.pop(name) for name in names})
+    method = model.suited(train)
+    if out is not None and config is None and hasattr(data, "recorded"):
+        loop["config"] = run_config(method, schema, data.kind, data.recorded())
+    recipe = method.train(train, take_split(validation, "validation"), training.steps)
+    with torch.random.fork_rng():
+        torch.manual_seed(training.seed)
+        return _follow(recipe, method.build(schema), **loop, **vars(training), **options)
+
+
+def _follow(recipe: Recipe, model: nn.Module, **options: Any) -> Fit:
+    """Fit a model by a recipe, prepared first unless a run is resumed."""
+    steps = sum(stage.steps for stage in recipe.stages)
+    if options.get("steps", steps) != steps:
+        raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
+    if options.get("self_feeding", 0.0) != 0.0:
+        raise ValueError(
+            f"self-feeding is an option of the method, which tells its recipe; instead of self_feeding="
+            f"{options['self_feeding']} here write dvae.method(…, self_feeding=…)"
+        )
+    if not options["resume"]:
+        run_directory(options["out"], False, {})  # which is refused before what may take long
+        with torch.random.fork_rng():
+            recipe.prepare(model)
+    options |= {"steps": steps, "self_feeding": recipe.feeding, "stages": recipe.stages}
+    return _fit(model, recipe.batches, recipe.validation, objective=None, **options)
+
+
+def _fit(
+    model: nn.Module,
+    train: Any,
+    validation: Any,
+    *,
+    objective: Objective | None,
+    stages: Sequence[Stage],
+    out: str | os.PathLike[str] | None,
+    resume: bool,
+    config: Mapping[str, Any] | None,
+    trackers: Sequence[Tracker],
+    callbacks: Sequence[Callback],
+    **options: Any,
+) -> Fit:
+    """Run the loop; see `fit`."""
     svi = SVI(model, objective, stages, **options)
     training = svi.training
     if validation is None and is_divided(train):

@@ -1,24 +1,23 @@
-"""Recipes: how a model is trained on some data, and what builds and trains one."""
+"""Recipes: how a model is trained on some data; and methods, which build a model and its recipe."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Self
 
-import torch
 from torch import nn
 
 from ...data.schema import Schema, SchemaError
-from ...data.sequences import Source, as_source, is_divided, take_split
+from ...data.sequences import Source
 from ...options import check
-from ...turns import alone
-from .fit import Fit, fit, run_directory
 from .objectives import Objective
 from .options import Stage, Training
 from .schedules import Schedule
+
+FORMAT = 2
+"""Format of the config of a run."""
 
 
 def _as_it_is(model: nn.Module) -> None:
@@ -27,7 +26,7 @@ def _as_it_is(model: nn.Module) -> None:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a model is trained: what `fit` is told beside the options of a run.
+    """How a model is trained: `dvae.fit(model, recipe)` follows it.
 
     Args:
         batches: where training draws from: the data, and what the objective needs beside them.
@@ -47,34 +46,6 @@ class Recipe:
     def objective(self) -> Objective:
         """What the last stage minimises."""
         return self.stages[-1].objective
-
-    def fit(self, model: nn.Module, *, resume: bool = False, **options: Any) -> Fit:
-        """Fits a model so, prepared first unless a run is resumed.
-
-        Args:
-            model: as the method has built it.
-            resume: continue the run in `out`.
-            **options: of `dvae.inference.training.fit.fit`: out, config, trackers, callbacks, and those of `Training`;
-                steps and self-feeding are the recipe's.
-
-        Raises:
-            ValueError: other steps than the recipe's, which are laid out over its own, or a self-feeding.
-            CheckpointError: when `out` holds a run and `resume` is False.
-        """
-        steps = sum(stage.steps for stage in self.stages)
-        if options.get("steps", steps) != steps:
-            raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
-        if options.get("self_feeding", 0.0) != 0.0:
-            raise ValueError(
-                f"self-feeding is an option of the method, which tells its recipe; instead of self_feeding="
-                f"{options['self_feeding']} here write dvae.method(…, self_feeding=…)"
-            )
-        if not resume:
-            run_directory(options.get("out"), False, {})  # which is refused before what may take long
-            with torch.random.fork_rng():
-                self.prepare(model)
-        options |= {"steps": steps, "self_feeding": self.feeding}
-        return fit(model, self.batches, self.validation, stages=self.stages, resume=resume, **options)
 
 
 @dataclass(frozen=True)
@@ -117,42 +88,6 @@ class Trainable:
         """How the model is fitted to these data, where nothing else is said."""
         return self.trainings.get(Schema.of(data).preset, self.trainings[""])
 
-    @alone
-    @torch.inference_mode(False)
-    def fit(self, data: Any, validation: Any = None, **options: Any) -> Fit:
-        """Builds the model for data and fits it to them: in one call, in memory.
-
-        `dvae.runs.directory.fit_run` keeps a run that can be loaded and resumed.
-
-        Args:
-            data: with a `schema`, and `windows` to train and to validate on, such as `dvae.tables.PanelData`;
-                or training windows; or x as a tensor or array (N, T, D), or a batch, whose
-                values are fitted in their own unit.
-            validation: windows, x or a batch to validate on; of data with parts their own, where it is None.
-            **options: of `Recipe.fit`; those of `Training` that are not given are the method's own (`training`). Its
-                seed is that of the initial weights too.
-
-        Returns:
-            The fit; its `model` has the best weights.
-
-        Raises:
-            TypeError: a table, whose columns need roles, or data of another kind.
-            ValueError: see `Recipe.fit`, or data without windows of these parts.
-        """
-        if validation is None and is_divided(data):
-            validation = data
-        train = as_source(take_split(data, "train"))
-        schema = Schema.of(data if is_divided(data) else train)
-        if too_short := getattr(train, "too_short", ""):
-            warnings.warn(f"training leaves out {too_short}", stacklevel=2)
-        names = Training.__dataclass_fields__.keys() & options
-        training = replace(self.training(schema), **{name: options.pop(name) for name in names})
-        method = self.suited(train)
-        recipe = method.train(train, take_split(validation, "validation"), training.steps)
-        with torch.random.fork_rng():
-            torch.manual_seed(training.seed)
-            return recipe.fit(method.build(schema), **vars(training), **options)
-
     def check(self) -> None:
         """Refuses options that do not fit together, before any data are read.
 
@@ -165,3 +100,16 @@ class Trainable:
     def config(self) -> dict[str, Any]:
         """Name and options in JSON's types."""
         return {"method": self.name, **asdict(self)}
+
+
+def run_config(method: Trainable, schema: Schema, kind: str, source: Any) -> dict[str, Any]:
+    """Return what `config.json` of a method's run says, but for the options of training, which `fit` adds.
+
+    Args:
+        method: with its options.
+        schema: of the data.
+        kind: of the data, by its name.
+        source: a dataclass that says where the data are.
+    """
+    described = {"kind": schema.kind, **schema.config()}
+    return {"format": FORMAT, "method": method.config(), "schema": described, "data": {"kind": kind, **asdict(source)}}

@@ -28,6 +28,7 @@ from typing_extensions import override
 
 from ...data.views import WHOLE
 from ...inference.training.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
+from ...inference.training.fit import fit
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...inference.training.trackers import Bar
@@ -150,7 +151,7 @@ class ModesMethod(FutureMethod):
         method = CVAE(**{name: getattr(self, name) for name in OF_CVAE})
         model, seed = method.build(train), int(torch.randint(2**31, ()))
         training = replace(method.training(train), steps=steps, seed=seed, progress=False)
-        method.train(train, validation, steps).fit(model, trackers=[Bar("cvae", steps, True)], **vars(training))
+        fit(model, method.train(train, validation, steps), trackers=[Bar("cvae", steps, True)], **vars(training))
         return model
 
 

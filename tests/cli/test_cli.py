@@ -342,7 +342,7 @@ def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
 def test_a_loaded_run_forecasts_as_the_fitted_model_does(people, tmp_path):
     data = MotionData.open(people)
     training = dvae.Training(steps=5, batch_size=4, validate_every=5, progress=False)
-    runs.fit_run(dvae.method("vrnn", latent=3, width=8, warm_up=4), data, tmp_path / "a", training)
+    dvae.fit(dvae.method("vrnn", latent=3, width=8, warm_up=4), data, out=tmp_path / "a", **vars(training))
     loaded = dvae.load(tmp_path / "a")
     x = data.windows("test").all()["x"][:, :15]
     draws = []
@@ -369,9 +369,9 @@ def test_a_resumed_run_is_the_uninterrupted_one(people, tmp_path, capsys):
     method = dvae.method("vrnn", latent=3, width=8, warm_up=8, self_feeding=0.5)
     training = dvae.Training(steps=12, batch_size=4, validate_every=5, decay=0.5, progress=False)
     data = MotionData.open(people)
-    runs.fit_run(method, data, tmp_path / "whole", training)
+    dvae.fit(method, data, out=tmp_path / "whole", **vars(training))
     with pytest.raises(KeyboardInterrupt, match="interrupted after step 7"):
-        runs.fit_run(method, data, tmp_path / "parts", training, callbacks=[Stop()])
+        dvae.fit(method, data, out=tmp_path / "parts", callbacks=[Stop()], **vars(training))
     assert main(["resume", str(tmp_path / "parts")]) == 0
     assert "finished at step 12" in capsys.readouterr().out
     whole, parts = ((tmp_path / name / "last.safetensors").read_bytes() for name in ("whole", "parts"))
@@ -453,14 +453,16 @@ def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeyp
     known = {**dvae.methods(), "plain": Plain}
     monkeypatch.setattr("dvae.models.registry.methods", lambda: known)
     training = dvae.Training(steps=3, batch_size=4, progress=False)
-    runs.fit_run(Plain(latent=3), MotionData.open(people), tmp_path / "run", training)
+    dvae.fit(Plain(latent=3), MotionData.open(people), out=tmp_path / "run", **vars(training))
     runs.resume(tmp_path / "run", steps=5)
     assert seen == [0, 1, 2, 3, 4]
 
 
 def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
     with pytest.raises(ValueError, match=r"instead of self_feeding=0\.5 here write dvae\.method\(…, self_feeding=…\)"):
-        runs.fit_run(dvae.method("vrnn"), MotionData.open(people), tmp_path / "run", dvae.Training(self_feeding=0.5))
+        dvae.fit(
+            dvae.method("vrnn"), MotionData.open(people), out=tmp_path / "run", **vars(dvae.Training(self_feeding=0.5))
+        )
 
 
 def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path):

@@ -18,7 +18,6 @@ from dvae.inference.evaluation.evaluation import Evaluation
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.drawing.player import SCRIPT, player
 from dvae.motion.drawing.plot import staged
-from dvae.runs import directory as runs
 from dvae.runs.report import Section, document, lacking, sections
 from dvae.runs.report.sections import Few
 
@@ -210,7 +209,7 @@ def test_scores_of_another_state_of_the_run_are_told_apart(scored, tmp_path):
 def test_runs_stand_side_by_side_with_a_table_first(people, fitted, tmp_path):
     other = tmp_path / "other"
     training = dvae.Training(steps=1, batch_size=4, progress=False)
-    runs.fit_run(dvae.method("storn", latent=3, warm_up=1), MotionData.open(people), other, training)
+    dvae.fit(dvae.method("storn", latent=3, warm_up=1), MotionData.open(people), out=other, **vars(training))
     report(fitted, other, "--out", tmp_path / "a.html")
     found = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8"))
     titles = [place.start() for place in re.finditer("Runs|Equations|Scores|Futures", found.text)]

@@ -14,7 +14,6 @@ from dvae.cli.fitting import DataOptions
 from dvae.cli.tables import is_table
 from dvae.inference.training.options import Training
 from dvae.models.registry import judges, methods
-from dvae.runs import directory
 from dvae.tables import Cut, PanelData
 
 pd = pytest.importorskip("pandas")
@@ -251,7 +250,7 @@ def test_runs_of_whole_sequences_are_reported_without_futures(table, tmp_path, c
     run, page = str(tmp_path / "run"), tmp_path / "a.html"
     data = PanelData.open(str(table), cut=Cut())
     training = dvae.Training(steps=2, batch_size=4, validate_every=2)
-    fit = directory.fit_run(dvae.method("vae", latent=2, warm_up=1), data, run, training)
+    fit = dvae.fit(dvae.method("vae", latent=2, warm_up=1), data, out=run, **vars(training))
     assert re.fullmatch(r"best bound -\d+\.\d+ nats a step at step 2", fit.best)
     assert main(["report", run, "--out", str(page), "--particles", "2", "--bound-windows", "2"]) == 0
     text = page.read_text()

@@ -72,7 +72,7 @@ def fitted(model, data, **options):
 
 
 def fitted_by_method(model, data, **options):
-    return METHOD.fit(data, steps=1, **options, **QUIET)
+    return dvae.fit(METHOD, data, steps=1, **options, **QUIET)
 
 
 ENTRIES = {
@@ -118,7 +118,7 @@ def test_a_method_is_fitted_to_arrays_as_to_their_sizes(data):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         recipe = METHOD.train(dvae.data.Sequences({"x": X}), {"x": X}, 1)
-        told = recipe.fit(METHOD.build({"x": 3}), decay=0.5, **QUIET)
+        told = dvae.fit(METHOD.build({"x": 3}), recipe, decay=0.5, **QUIET)
     assert found.best_bound == told.best_bound
 
 

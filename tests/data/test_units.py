@@ -250,7 +250,7 @@ def test_a_method_with_units_is_fitted_to_arrays_far_from_zero():
     x, futures = torch.randn(8, 7, 2, dtype=torch.float64), []
     for mean in (0.0, 1e9):
         torch.manual_seed(0)
-        model = dvae.method("erd").fit(mean + x, steps=1, progress=False).model
+        model = dvae.fit(dvae.method("erd"), mean + x, steps=1, progress=False).model
         torch.manual_seed(2)
         futures.append(model.forecast(mean + x[:, :4], 3)["x"] - mean)
     torch.testing.assert_close(*futures, rtol=0, atol=1e-3)

@@ -147,7 +147,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
     still = dvae.Training(steps=1, batch_size=2, learning_rate=0.0, progress=False, validate_every=2)
     starts = []
     for seed, name in ((0, "a"), (0, "b"), (1, "c")):
-        runs.fit_run(method, data, tmp_path / name, dvae.Training(**{**vars(still), "seed": seed}))
+        dvae.fit(method, data, out=tmp_path / name, **vars(dvae.Training(**{**vars(still), "seed": seed})))
         starts.append(dvae.load(tmp_path / name).model.generator["w"].law.pseudo["x"])
     assert torch.equal(starts[0], starts[1])
     assert not torch.equal(starts[0], starts[2])
@@ -156,7 +156,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
         assert (windows == pseudo).flatten(1).all(1).any()
 
     training = {**vars(still), "learning_rate": 0.01}
-    runs.fit_run(method, data, tmp_path / "whole", dvae.Training(**{**training, "steps": 2}))
-    runs.fit_run(method, data, tmp_path / "parts", dvae.Training(**{**training, "steps": 1}))
+    dvae.fit(method, data, out=tmp_path / "whole", **vars(dvae.Training(**{**training, "steps": 2})))
+    dvae.fit(method, data, out=tmp_path / "parts", **vars(dvae.Training(**{**training, "steps": 1})))
     runs.resume(tmp_path / "parts", steps=2)
     assert weights(tmp_path / "parts") == weights(tmp_path / "whole")

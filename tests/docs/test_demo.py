@@ -5,15 +5,16 @@ from functools import partial
 import pytest
 from stopping import At, interrupt
 
+import dvae
 from benchmarks.studies import demo
 from dvae import Evaluation
-from dvae.runs.directory import fit_run, resume
+from dvae.runs.directory import resume
 
 
 def test_demo_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
     resumed = []
     with monkeypatch.context() as patch:
-        patch.setattr(demo, "fit_run", partial(fit_run, callbacks=[At(1, interrupt)]))
+        patch.setattr(demo.dvae, "fit", partial(dvae.fit, callbacks=[At(1, interrupt)]))
         with pytest.raises(KeyboardInterrupt):
             demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
     monkeypatch.setattr(demo, "resume", lambda run: resumed.append(resume(run)) or resumed[-1])

@@ -215,10 +215,10 @@ def test_runs_go_on_or_are_refused(tmp_path):
     motion.save(tmp_path / "people.npz", motion.simulate(clips=12, frames=76, seed=1))
     method = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)
     training = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, progress=False)
-    runs.fit_run(method, MotionData.open(tmp_path / "people.npz"), tmp_path / "fitted", training)
+    dvae.fit(method, MotionData.open(tmp_path / "people.npz"), out=tmp_path / "fitted", **vars(training))
     latent = dvae.method("motion-latent", latent=2, widths=(4,))
     cut = SegmentData.open(tmp_path / "people.npz", cut="clips", scaling="deviation", warped=True)
-    runs.fit_run(latent, cut, tmp_path / "latent", training)
+    dvae.fit(latent, cut, out=tmp_path / "latent", **vars(training))
     changes = st.lists(mutations(), min_size=1, max_size=2)
     examples = st.tuples(st.sampled_from(CALLS), st.sampled_from(["fitted", "latent"]), changes)
     with Isolated(check, tmp_path) as isolated:

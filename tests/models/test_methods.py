@@ -233,7 +233,7 @@ def test_a_method_takes_an_option_or_says_why_not(name, option):
     model = method.build({"x": 3})
     before = [parameter.detach().clone() for parameter in model.parameters()]
     recipe = method.train(Sequences({"x": torch.randn(4, 6, 3)}), steps=2)
-    result = recipe.fit(model, batch_size=2, log_every=1, accelerator="cpu", progress=False)
+    result = dvae.fit(model, recipe, batch_size=2, log_every=1, accelerator="cpu", progress=False)
     assert len(result.history) == 2
     assert any(not torch.equal(old, new) for old, new in zip(before, model.parameters(), strict=True))
     assert torch.isfinite(torch.cat([parameter.flatten() for parameter in model.parameters()])).all()
@@ -448,7 +448,7 @@ def test_training_on_real_motion_stays_finite(name, people):
     method = small(name, 4, warm_up=20)
     model = method.build({"x": people.size})
     recipe = method.train(people, steps=30)
-    result = recipe.fit(model, batch_size=4, accelerator="cpu", progress=False)
+    result = dvae.fit(model, recipe, batch_size=4, accelerator="cpu", progress=False)
     assert result.history
     assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
     x = people.sample(2, torch.Generator().manual_seed(0))["x"]

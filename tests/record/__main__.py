@@ -257,7 +257,7 @@ def numbers(name: str, options: Mapping[str, Any], data: Any, whole: bool) -> di
         found["imputation"] = "refused"
     torch.manual_seed(7)
     recipe = replace(recipe, batches=Doubled(source), prepare=lambda model: None)  # it is prepared already
-    fit = recipe.fit(model, batch_size=4, log_every=1, seed=1, accelerator="cpu", progress=False)
+    fit = dvae.fit(model, recipe, batch_size=4, log_every=1, seed=1, accelerator="cpu", progress=False)
     found["losses"] = [row["loss"] for row in fit.history]
     if whole and observed is not None and name != "motion-latent":
         few = {"samples": 4, "batch_size": 8, "progress": False}

@@ -46,7 +46,7 @@ TRAINING = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, p
 @pytest.fixture(scope="module")
 def fitted(people, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "fitted"
-    runs.fit_run(METHOD, MotionData.open(people), out, TRAINING)
+    dvae.fit(METHOD, MotionData.open(people), out=out, **vars(TRAINING))
     return out
 
 
@@ -150,7 +150,7 @@ def test_the_directory_that_the_user_names_may_be_a_link(run, tmp_path):
 
 def test_a_fit_in_memory_is_that_of_a_run_of_the_same_seed(fitted, people):
     kept, before = dvae.load(fitted).model, torch.random.get_rng_state()
-    fit = METHOD.fit(MotionData.open(people), **vars(TRAINING))
+    fit = dvae.fit(METHOD, MotionData.open(people), **vars(TRAINING))
     assert torch.equal(torch.random.get_rng_state(), before)
     assert not fit.model.training
     assert fit.run is None
@@ -476,7 +476,7 @@ def test_a_run_that_is_longer_than_asked_for_says_so(run, capsys):
         ("fit vae --out x --protocol cmu", "--protocol 'cmu' is unknown (did you mean 'cmu8'?)"),
         ("fit vae --emission nrmal --out x", "--emission 'nrmal' is unknown (did you mean 'normal'?)"),
         ("sweep vae srn --out x", "'srn' is unknown (did you mean 'srnn'?)"),
-        ("data inf", "'inf' is unknown (did you mean 'info'?)"),
+        ("data inf", "did you mean 'data info'?"),
     ],
 )
 def test_the_name_that_was_meant_is_told(capsys, arguments, meant):
@@ -570,7 +570,9 @@ def test_threads_take_turns(people, fitted, tmp_path):
         except BaseException as error:
             errors.append(error)
 
-    actions = {name: lambda name=name: runs.fit_run(METHOD, data, tmp_path / name, TRAINING) for name in ("a", "b")}
+    actions = {
+        name: lambda name=name: dvae.fit(METHOD, data, out=tmp_path / name, **vars(TRAINING)) for name in ("a", "b")
+    }
     actions["forecast"] = lambda: model.forecast({"x": x}, 4, 2)["x"].shape
     threads = [threading.Thread(target=work, args=each) for each in actions.items()]
     for thread in threads:

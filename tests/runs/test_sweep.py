@@ -18,7 +18,6 @@ from dvae import motion
 from dvae.cli import main
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.judges.action_classifier import ActionClassifier
-from dvae.runs import directory as runs
 from dvae.runs import sweep as sweeps
 from dvae.runs.sweep import Outcome, SweepInterrupted, sweep
 
@@ -65,7 +64,9 @@ def test_a_run_of_a_sweep_is_bit_for_bit_what_it_is_alone(swept, data, tmp_path,
     out, methods, results = swept
     assert [result.path.name for result in results] == ["vae-z3-seed0", "vae-z2-seed0", "vae-z3-seed1", "vae-z2-seed1"]
     for result in results:
-        alone = runs.fit_run(result.method, data, tmp_path / result.path.name, replace(TRAINING, seed=result.seed))
+        alone = dvae.fit(
+            result.method, data, out=tmp_path / result.path.name, **vars(replace(TRAINING, seed=result.seed))
+        )
         assert weights(result.path) == weights(alone.run)
         assert (result.status, result.step, result.best_bound) == ("finished", 6, alone.best_bound)
         assert result.path.parent == out

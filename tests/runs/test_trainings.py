@@ -46,7 +46,7 @@ def test_a_run_that_is_told_some_options_has_the_method_s_own_beside_them(people
     kind = type(dvae.method("cvae"))
     monkeypatch.setattr(kind, "trainings", {"": Training(3, 5, 1e-4, 0.2)})
     quiet = {"progress": False, "accelerator": "cpu"}
-    directory.fit_run(dvae.method("cvae", **SMALL), people, tmp_path / "run", {"batch_size": 2, **quiet})
+    dvae.fit(dvae.method("cvae", **SMALL), people, out=tmp_path / "run", **{"batch_size": 2, **quiet})
     kept = directory.read_config(tmp_path / "run").training
     assert (kept.steps, kept.batch_size, kept.learning_rate, kept.decay) == (3, 2, 1e-4, 0.2)
     methods = [dvae.method("cvae", **SMALL), dvae.method("vae", latent=2, hidden=(4,), warm_up=1)]
@@ -59,7 +59,7 @@ def test_a_run_that_is_told_some_options_has_the_method_s_own_beside_them(people
             training.learning_rate,
             training.decay,
         )
-    assert dvae.method("cvae", **SMALL).fit(people, **quiet).step == 3
+    assert dvae.fit(dvae.method("cvae", **SMALL), people, **quiet).step == 3
 
 
 def test_show_says_how_a_method_is_fitted(capsys):

@@ -86,7 +86,7 @@ def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_mis
     method = dvae.method(name, **options(name)).suited(windows)
     model = method.build(data.schema)
     recipe = method.train(windows, data.windows("validation"), 2)
-    recipe.fit(model, steps=2, batch_size=4, validate_every=2, progress=False)
+    dvae.fit(model, recipe, steps=2, batch_size=4, validate_every=2, progress=False)
     model.eval()
     assert {"c", "s", "d"} <= {*model.context}
     batch = data.windows("test").all()
@@ -120,7 +120,7 @@ def test_the_mean_of_a_column_changes_neither_fit_nor_forecasts_nor_scores(name,
         torch.manual_seed(0)
         method = dvae.method(name, **options(name)).suited(windows)
         model = method.build(data.schema)
-        method.train(windows, None, 2).fit(model, steps=2, batch_size=4, progress=False)
+        dvae.fit(model, method.train(windows, None, 2), steps=2, batch_size=4, progress=False)
         forecasts = test.forecast(model, samples=4)
         forecasts.save(tmp_path / "forecasts.csv")
         read = pd.read_csv(tmp_path / "forecasts.csv", dtype=str).astype({"truth": float})
@@ -163,7 +163,7 @@ def test_equations_read_covariates_and_gaps_where_they_name_them(data):
 def test_a_run_is_fitted_loaded_resumed_and_refused_where_it_was_tampered_with(data, tmp_path):
     out = tmp_path / "run"
     training = dvae.Training(steps=2, batch_size=4, validate_every=2, progress=False)
-    runs.fit_run(dvae.method("vrnn", **SMALL), data, out, training)
+    dvae.fit(dvae.method("vrnn", **SMALL), data, out=out, **vars(training))
     loaded = runs.load(out)
     assert loaded.schema == data.schema
     assert loaded.data.fingerprint == data.fingerprint

@@ -80,7 +80,7 @@ def test_what_a_group_shares_is_learned_and_told_by_its_sequences(tmp_path):
     )
     model = method.build(data.schema)
     recipe = method.train(data.windows("train"), data.windows("validation"), 150)
-    recipe.fit(model, batch_size=32, learning_rate=1e-2, progress=False)
+    dvae.fit(model, recipe, batch_size=32, learning_rate=1e-2, progress=False)
     batch = data.windows("test").all()
     together = dvae.importance_bound(model, batch, particles=200).bound.mean()
     apart = dvae.importance_bound(model, {"x": batch["x"]}, particles=200).bound.mean()

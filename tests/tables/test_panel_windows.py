@@ -276,7 +276,7 @@ def test_sequences_that_are_too_short_are_listed():
     assert [*data.windows("train").skipped] == short
     named = ", ".join(f"{name}: {round(0.7 * steps[name])}" for name in short)
     with pytest.warns(UserWarning, match=rf"training leaves out .* fewer than 7 steps there \({named}\)"):
-        fit = dvae.method("autoregressive", width=4).fit(data, steps=1, batch_size=2, progress=False)
+        fit = dvae.fit(dvae.method("autoregressive", width=4), data, steps=1, batch_size=2, progress=False)
     with pytest.warns(UserWarning, match=rf"forecasts leave out .* fewer than 7 steps there \({named}\)"):
         data.windows("train").forecast(fit.model, 1)
     said = data.parts()

@@ -32,6 +32,7 @@ from torch import Tensor, nn
 from ...data.sequences import Batch, bridged
 from ...distributions import QRFlow, Shape
 from ...inference.training.checkpoints import Run, load_weights
+from ...inference.training.fit import fit
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe, Trainable
 from ...inference.training.trackers import Bar
@@ -201,8 +202,9 @@ def fit_pose_prior(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         model = method.build(windows)
-        method.train(windows, steps=steps).fit(
+        fit(
             model,
+            method.train(windows, steps=steps),
             seed=seed,
             learning_rate=1e-2,
             decay=0.8,

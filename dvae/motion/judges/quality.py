@@ -51,6 +51,7 @@ from ...inference.evaluation.held import Held, clip_places, hold, on_device_of, 
 from ...inference.evaluation.references import last_value
 from ...inference.evaluation.result import Result, Table, progress_bar
 from ...inference.evaluation.scores import clip_means
+from ...inference.training.fit import fit
 from ...inference.training.options import Stage
 from ...inference.training.recipe import Recipe, Trainable
 from ...inference.training.trackers import Bar
@@ -337,7 +338,7 @@ def quality(
                 judge = method.build(train)
             bar = Bar(f"judge of {name}, seed {number}", steps, progress)
             options = {**TRAINING, "seed": number, "progress": False, "trackers": [bar], **training}
-            method.train(learned, steps=steps).fit(judge, **options)
+            fit(judge, method.train(learned, steps=steps), **options)
             real, made = (_taken_for_real(judge, x) for x in (judged.real, judged.made))
             for score, values in zip(SCORES, ((1 - real + made) / 2, made), strict=True):
                 found[score].append(clip_means(100 * values, places))

@@ -57,7 +57,7 @@ def fitted(name, data, **options):
     torch.manual_seed(0)
     model = method.build(data.schema)
     recipe = method.train(train, data.windows("validation"), 3)
-    recipe.fit(model, batch_size=4, validate_every=3, progress=False)
+    dvae.fit(model, recipe, batch_size=4, validate_every=3, progress=False)
     return model.eval()
 
 

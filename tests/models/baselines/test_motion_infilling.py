@@ -127,6 +127,6 @@ def test_a_batch_is_read_without_what_is_hidden(windows):
 
 def test_a_run_goes_through_its_curriculum(windows):
     recipe = small(curriculum=0.5).train(windows, windows, 8)
-    fit = recipe.fit(small().build(windows), batch_size=4, log_every=1, validate_every=8, progress=False)
+    fit = dvae.fit(small().build(windows), recipe, batch_size=4, log_every=1, validate_every=8, progress=False)
     assert fit.series("curriculum")[1] == [0, 0.25, 0.5, 0.75, 1, 1, 1, 1]
     assert fit.best_step == 8

@@ -26,7 +26,7 @@ def prior_run(walkers, tmp_path_factory):
     """A run of a pose prior, of two steps."""
     out = tmp_path_factory.mktemp("prior") / "run"
     method = judge("pose-prior", heading=True)
-    runs.fit_run(method, walkers, out, dvae.Training(steps=2, progress=False, accelerator="cpu"))
+    dvae.fit(method, walkers, out=out, **vars(dvae.Training(steps=2, progress=False, accelerator="cpu")))
     return str(out)
 
 
@@ -172,8 +172,8 @@ def test_forecasts_that_cannot_be(windows, call, message):
 def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, walkers, prior_run):
     method = dvae.method("gsps", **{**SMALL, "pose_prior": 0.01, "pose_prior_run": prior_run, "draws": (2, 2)})
     options = {"batch_size": 4, "validate_every": 3, "progress": False, "accelerator": "cpu"}
-    whole = runs.fit_run(method, walkers, tmp_path / "whole", dvae.Training(steps=6, **options))
-    runs.fit_run(method, walkers, tmp_path / "half", dvae.Training(steps=3, **options))
+    whole = dvae.fit(method, walkers, out=tmp_path / "whole", **vars(dvae.Training(steps=6, **options)))
+    dvae.fit(method, walkers, out=tmp_path / "half", **vars(dvae.Training(steps=3, **options)))
     resumed = runs.resume(tmp_path / "half", steps=6, progress=False)
     losses = whole.series("validation/loss")[1]
     assert whole.best_bound == -min(losses)

@@ -240,7 +240,7 @@ def test_an_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
     data = dvae.motion.MotionData.open(people)
     method = small(warm_up=1, **ABLATIONS[ablation])
     training = dvae.Training(steps=4, validate_every=2, batch_size=2, progress=False, accelerator="cpu")
-    result = runs.fit_run(method, data, tmp_path / "run", training)
+    result = dvae.fit(method, data, out=tmp_path / "run", **vars(training))
     rows = [row for row in result.history if any(name.startswith("validation/") for name in row)]
     assert all(("validation/loss" in row) == (method.loss == "best-of-many") for row in rows)
     assert ("validation loss" in result.best) == (method.loss == "best-of-many")

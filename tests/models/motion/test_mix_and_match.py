@@ -143,7 +143,7 @@ def test_every_way_is_trained_by_the_shared_loop_and_scored_in_metres(windows, n
     method = small(noise=noise)
     model = method.build(windows["train"])
     recipe = method.train(windows["train"], windows["test"], steps=6)
-    result = recipe.fit(model, batch_size=4, validate_every=3, log_every=1, progress=False)
+    result = dvae.fit(model, recipe, batch_size=4, validate_every=3, log_every=1, progress=False)
     rows = [row for row in result.history if "loss" in row]
     assert all(np.isfinite(row["loss"]) for row in rows)
     assert [row.get("curriculum") for row in rows][:3] == ([0.0, 1 / 3, 2 / 3] if noise == "mix" else [None] * 3)

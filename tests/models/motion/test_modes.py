@@ -64,7 +64,7 @@ def cvae_run(people, tmp_path_factory):
     """A run of a CVAE, of two steps."""
     out = tmp_path_factory.mktemp("modes") / "cvae"
     training = dvae.Training(steps=2, batch_size=4, progress=False, accelerator="cpu")
-    runs.fit_run(dvae.method("cvae", **OF_CVAE), people, out, training)
+    dvae.fit(dvae.method("cvae", **OF_CVAE), people, out=out, **vars(training))
     return str(out)
 
 
@@ -160,7 +160,7 @@ def test_a_run_has_the_decoder_of_the_cvae_and_does_without_its_run(people, cvae
     own = shutil.copytree(cvae_run, tmp_path / "cvae")
     method = dvae.method(name, cvae_run=str(own), modes=3, sampler_width=8, sampler_hidden=(7, 6))
     training = dvae.Training(steps=2, batch_size=4, progress=False, accelerator="cpu")
-    runs.fit_run(method, people, tmp_path / "run", training)
+    dvae.fit(method, people, out=tmp_path / "run", **vars(training))
     cvae = runs.load(own).model.generator["x"]
     shutil.rmtree(own)
     run = runs.load(tmp_path / "run")

@@ -61,7 +61,7 @@ def test_training_has_two_phases_of_adaptive_weights(segments, tmp_path):
     assert isinstance(first.objective, GradNorm)
     assert (first.objective.tasks, second.objective.tasks) == (PARTS, (SURFACE, "time"))
     model = made(segments)
-    result = recipe.fit(model, out=tmp_path, batch_size=8, validate_every=6, log_every=1, progress=False)
+    result = dvae.fit(model, recipe, out=tmp_path, batch_size=8, validate_every=6, log_every=1, progress=False)
     assert result.best_step >= 18
     for row in result.history:
         weights = [value for name, value in row.items() if name.startswith("weight/")]

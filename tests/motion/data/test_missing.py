@@ -531,7 +531,7 @@ def test_every_method_goes_the_whole_way_with_gaps(name):
     train, validation, test = map(data.windows, ("train", "validation", "test"))
     torch.manual_seed(0)
     model, recipe = method.build(data.schema), method.train(train, validation, 1)
-    recipe.fit(model, steps=1, batch_size=3, validate_every=1, progress=False)
+    dvae.fit(model, recipe, steps=1, batch_size=3, validate_every=1, progress=False)
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
     scores = dvae.evaluate(model, test, scores=motion.displacements, samples=2, training_windows=train, progress=False)
     assert all(np.isfinite(score.mean) for score in scores["model"].values())
@@ -571,7 +571,7 @@ def test_a_method_whose_density_is_of_whole_frames_says_so_of_gaps():
     method = dvae.method("moglow", width=4, flow_steps=1)
     recipe = method.train(data.windows("train"), None, 1)
     with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide them together"):
-        recipe.fit(method.build(data.schema), progress=False)
+        dvae.fit(method.build(data.schema), recipe, progress=False)
 
 
 def still_gsps():

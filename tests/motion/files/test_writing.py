@@ -270,7 +270,7 @@ def test_forecasts_are_bvh_where_the_clip_is_if_the_protocol_keeps_the_root(tmp_
     protocol = replace(PROTOCOLS["simulated-trajectories"], observed=3, predicted=5, test_stride=40)
     data = MotionData.open(tmp_path / "people.npz", protocol)
     training = dvae.Training(steps=1, batch_size=2, progress=False)
-    dvae.runs.directory.fit_run(dvae.method("vae", latent=2, warm_up=1), data, tmp_path / "run", training)
+    dvae.fit(dvae.method("vae", latent=2, warm_up=1), data, out=tmp_path / "run", **vars(training))
     one = ["--samples", "1"]
     assert main(["forecast", str(tmp_path / "run"), "--out", str(tmp_path / "all"), *one]) == 0
     assert "removes" not in capsys.readouterr().err

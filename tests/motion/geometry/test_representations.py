@@ -149,7 +149,7 @@ def test_a_model_of_turns_is_fitted_and_scored_in_metres(people_of_two_sizes):
     train, test = (motion.windows(people_of_two_sizes, protocol, split) for split in ("train", "test"))
     method = dvae.method("vae", latent=2, warm_up=2)
     model = method.build(train)
-    result = method.train(train, None, steps=3).fit(model, batch_size=2, log_every=1, progress=False)
+    result = dvae.fit(model, method.train(train, None, steps=3), batch_size=2, log_every=1, progress=False)
     assert all(np.isfinite(row["loss"]) for row in result.history if "loss" in row)
     table = dvae.evaluate(model, test, scores=motion.scores, samples=3, training_windows=train, progress=False)
     positions = motion.windows(people_of_two_sizes, PROTOCOL, "test")
@@ -162,7 +162,7 @@ def test_a_run_of_turns_is_kept_with_its_rest_pose(people_of_two_sizes, tmp_path
     motion.save(tmp_path / "people.npz", people_of_two_sizes)
     data = motion.MotionData.open(tmp_path / "people.npz", replace(PROTOCOL, representation="6d"))
     training = dvae.Training(steps=2, batch_size=2, progress=False)
-    dvae.runs.directory.fit_run(dvae.method("vae", latent=2, warm_up=1), data, tmp_path / "run", training)
+    dvae.fit(dvae.method("vae", latent=2, warm_up=1), data, out=tmp_path / "run", **vars(training))
     loaded = dvae.load(tmp_path / "run")
     view = loaded.model.view
     assert isinstance(view, Rotations)
@@ -177,7 +177,7 @@ def run_of_turns(people_of_two_sizes, tmp_path_factory):
     motion.save(folder / "people.npz", twisted(people_of_two_sizes))
     data = motion.MotionData.open(folder / "people.npz", replace(PROTOCOL, representation="6d"))
     training = dvae.Training(steps=5, batch_size=4, progress=False)
-    dvae.runs.directory.fit_run(dvae.method("srnn", latent=2, warm_up=1), data, folder / "run", training)
+    dvae.fit(dvae.method("srnn", latent=2, warm_up=1), data, out=folder / "run", **vars(training))
     return folder / "run"
 
 

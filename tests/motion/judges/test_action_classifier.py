@@ -18,7 +18,6 @@ from dvae.inference.evaluation.references import nearest_neighbours
 from dvae.models.registry import configured, judge
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.judges.action_classifier import ActionClassifier, ActionClassifierModel
-from dvae.runs import directory as runs
 
 SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6)
 SMALL = {"label": "way", "hidden": 8, "layers": 2, "features": 3}
@@ -166,13 +165,13 @@ def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsy
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     method = judge("action-classifier", **SMALL)
     training = replace(method.trainings[""], steps=20, batch_size=16, validate_every=10, progress=False)
-    result = runs.fit_run(method, MotionData.open(file), whole, training)
+    result = dvae.fit(method, MotionData.open(file), out=whole, **vars(training))
     assert "nats a window" in result.best
     x = loaded.data.windows("test").all()["x"][:, 15:]
     logits = loaded.model.logits(loaded.model.features(x))
     other = dvae.load(whole).model
     assert torch.equal(other.logits(other.features(x)), logits)
-    runs.fit_run(method, MotionData.open(file), parts, replace(training, steps=10))
+    dvae.fit(method, MotionData.open(file), out=parts, **vars(replace(training, steps=10)))
     assert main(["resume", str(parts), "--steps", "20"]) == 0
     assert f"score forecasts with: dvae evaluate RUN --classifier {parts}" in " ".join(capsys.readouterr().out.split())
     rows = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]

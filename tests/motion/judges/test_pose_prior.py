@@ -14,7 +14,6 @@ from dvae.cli import main
 from dvae.models.registry import configured, judge
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.judges.pose_prior import PosePrior, PosePriorModel, fit_pose_prior
-from dvae.runs import directory as runs
 
 CHAIN = motion.Skeleton(("root", "middle", "end"), (-1, 0, 1), name="chain")
 SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6)
@@ -143,9 +142,9 @@ def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     method, data = judge("pose-prior", noise=0.005), MotionData.open(people)
     training = replace(method.trainings[""], steps=12, batch_size=4, validate_every=4, progress=False)
-    runs.fit_run(method, data, whole, training)
+    dvae.fit(method, data, out=whole, **vars(training))
     assert torch.equal(dvae.load(whole).model.log_prob(x), loaded.model.log_prob(x))
-    runs.fit_run(method, data, parts, replace(training, steps=8))
+    dvae.fit(method, data, out=parts, **vars(replace(training, steps=8)))
     assert main(["resume", str(parts), "--steps", "12"]) == 0
     rates = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]
     assert max(row["step"] for row in rates) == 12
