@@ -1,9 +1,10 @@
 """Threads take turns: Pyro's stack of handlers and torch's random state are one for the whole process.
 
-Two programs that ran at once would land on each other's stack, and draw from each other's random numbers. So whatever
-runs one for a user is decorated with `alone`: of several threads one goes on, and the others wait until it is done, a
-whole fit if need be. Processes run side by side (`dvae.runs.sweep`). When a process forks while another
-thread holds the lock, the child starts with a free lock and without that thread's handlers.
+Two programs that ran at once would land on each other's stack, and draw from each other's random numbers. So `alone`
+is held while a model is built or a program runs: in `DynamicalVAE.running`, in the terms of a bound, in a step or a
+validation of `SVI`, and in `seeded`, which also sets and restores the random state. Threads wait for each other that
+long, not for a whole fit. Processes run side by side (`dvae.runs.sweep`). When a process forks while another thread
+holds the lock, the child starts with a free lock and without that thread's handlers.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import logging  # noqa: F401  its fork hook, registered first, takes its lock af
 import os
 import re
 import threading
-from contextlib import ContextDecorator
+from collections.abc import Iterator
+from contextlib import ContextDecorator, contextmanager
+from typing import Any
 
 SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
 """The table that Pyro appends to an error that passes a program."""
@@ -44,6 +47,24 @@ class _Alone(ContextDecorator):
 
 
 alone = _Alone()
+
+
+@contextmanager
+def seeded(seed: int | None, device: Any = None) -> Iterator[None]:
+    """Draw from a seed, or without one go on from the present state; restore torch's random state at the end.
+
+    Args:
+        seed: of torch's random numbers.
+        device: a `torch.device` whose random state is restored too, if it is a GPU.
+    """
+    import torch
+
+    with alone, torch.random.fork_rng([device] if device is not None and device.type == "cuda" else []):
+        if seed is not None:
+            torch.manual_seed(seed)
+        yield
+
+
 no_fork = threading.RLock()
 """A lock held during imports: a child that is forked during one would wait for the lock of the module for ever."""
 if hasattr(os, "register_at_fork"):  # not on Windows

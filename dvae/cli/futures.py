@@ -21,6 +21,7 @@ from ..motion.data.dataset import SIMULATED
 from ..motion.files.writing import format_of
 from ..options import nearest
 from ..runs import directory as runs
+from ..turns import seeded
 from . import tables
 from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, save_figure
 from .help import Expert
@@ -160,8 +161,7 @@ def _completed(
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
     given = _told(joint_names(paths.joints), truth, paths.paths, windows.skeleton)
     how: dict[str, Any] = {"exact": paths.exact, "temperature": paths.temperature, "progress": True}
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
+    with seeded(seed):
         done = loaded.model.complete(pose, given, None if given else len(truth), samples, **how)
     before_and_after = pose[None, None], truth[None, : done.positions.shape[1]]
     motions = motion.Forecasts(
@@ -270,8 +270,7 @@ def impute(
 def _fillings(model: Any, windows: motion.Windows, samples: int, seed: int, drawn: bool) -> motion.Imputed:
     """Motion with its missing joints filled in."""
     listed, parts = windows.all(), []
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
+    with seeded(seed):
         for some in torch.arange(len(windows)).split(64):
             made = model.impute(each(listed, itemgetter(some)), samples, draw=drawn)["x"]
             parts.append(windows.positions(made).numpy())
@@ -433,8 +432,7 @@ def draw_futures(
     keys = windows.keys
     some = each(windows.all(), itemgetter(list(chosen)))
     past, future = past_of(some, observed), gapped(some)[:, observed:][:, :horizon]
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
+    with seeded(seed):
         whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
         for given in Sequences(past).batches(64):

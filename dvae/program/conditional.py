@@ -34,6 +34,7 @@ from ..networks.base import (
     valid_steps,
 )
 from ..networks.rows import Rows, select
+from ..turns import seeded
 from .groups import Groups
 
 CONSTANT = "1"
@@ -145,7 +146,7 @@ class Conditional(nn.Module):
             ValueError: a distribution of another shape.
         """
         rows = (1, 1) if self.factor.local else (1,)
-        with torch.random.fork_rng(devices=[]):
+        with seeded(None):
             read = torch.randn(*rows, features, requires_grad=True)
             previous = torch.randn(*rows, self.size) if self.law.residual else None
             parameters = self.law(read, previous)

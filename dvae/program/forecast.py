@@ -86,8 +86,7 @@ def forecast(
 
     # Samples that are all the same are one: rows of one product may differ in their last bits.
     distinct = samples if model.latents or model.summed or redrawn or drawn else 1
-    with model._evaluating():
-        out = in_chunks(futures, size, distinct, _together(model, data, size, chunk))
+    out = in_chunks(futures, size, distinct, _together(model, data, size, chunk))
     return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
 
@@ -131,8 +130,7 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
         made = {name: mean.unflatten(0, (count, -1)) for name, mean in found.items()}
         return model.shown(made, rows(data, part))
 
-    with model._evaluating():
-        return in_chunks(means, whole.batch, samples, _together(model, data, whole.batch, chunk))
+    return in_chunks(means, whole.batch, samples, _together(model, data, whole.batch, chunk))
 
 
 def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
@@ -147,8 +145,7 @@ def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, T
         found = _given(model, some, model.guide(some)).summation.probabilities()
         return {name: value.unflatten(0, (count, -1)) for name, value in found.items()}
 
-    with model._evaluating():
-        return in_chunks(probabilities, whole.batch, samples, _together(model, data, whole.batch, chunk))
+    return in_chunks(probabilities, whole.batch, samples, _together(model, data, whole.batch, chunk))
 
 
 def _given(model: Any, batch: AnyBatch, latents: Mapping[str, Tensor]) -> Any:
@@ -206,10 +203,9 @@ def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int, particles: in
             made[WEIGHT] = ratio.unflatten(0, (count, -1))
         return made
 
-    with model._evaluating():
-        if particles == 1:
-            return in_chunks(draws, whole.batch, samples, _together(model, data, whole.batch, chunk))
-        return _resampled(draws, whole.batch, samples, particles, chunk, groups)
+    if particles == 1:
+        return in_chunks(draws, whole.batch, samples, _together(model, data, whole.batch, chunk))
+    return _resampled(draws, whole.batch, samples, particles, chunk, groups)
 
 
 def _resampled(

@@ -8,8 +8,8 @@ with different things known.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from itertools import accumulate
 from operator import mul
@@ -418,7 +418,6 @@ class DynamicalVAE(nn.Module):
 
     # What is done with it ------------------------------------------------------------------------------------------
 
-    @alone
     @torch.no_grad()
     def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
         """Free runs from the prior.
@@ -431,11 +430,10 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to draws (n, T, D), or (n, D) of a static latent.
         """
-        data = self.read(batch, size=n)
-        with self._evaluating():
+        with self.running():
+            data = self.read(batch, size=n)
             return self.shown(self.model(data, length=length, size=n), data)
 
-    @alone
     @torch.no_grad()
     def forecast(
         self,
@@ -468,9 +466,9 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: a ragged batch, a local context that ends before the horizon, or a fixed value that cannot be.
         """
-        return forecast(self, batch, horizon, samples, draw_emission, fix, chunk)
+        with self.running():
+            return forecast(self, batch, horizon, samples, draw_emission, fix, chunk)
 
-    @alone
     @torch.no_grad()
     def reconstruct(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """Means of the data given latents from the guide, teacher-forced; missing entries are filled in so.
@@ -483,9 +481,9 @@ class DynamicalVAE(nn.Module):
         Returns:
             Name to (S, B, T, D) for every data variable, and the whole where these are parts.
         """
-        return reconstruct(self, batch, samples, chunk)
+        with self.running():
+            return reconstruct(self, batch, samples, chunk)
 
-    @alone
     @torch.no_grad()
     def impute(
         self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, particles: int = 1, chunk: int = CHUNK
@@ -516,9 +514,9 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: a batch without a mask, or particles where there is nothing to choose or to choose by.
         """
-        return impute(self, batch, samples, chunk, draw, particles)
+        with self.running():
+            return impute(self, batch, samples, chunk, draw, particles)
 
-    @alone
     @torch.no_grad()
     def states(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """Probabilities of the states that are summed out, given the whole data and draws of the latents.
@@ -536,9 +534,9 @@ class DynamicalVAE(nn.Module):
         Raises:
             ValueError: a model that sums nothing out.
         """
-        return states(self, batch, samples, chunk)
+        with self.running():
+            return states(self, batch, samples, chunk)
 
-    @alone
     @torch.no_grad()
     def log_joint(self, batch: AnyBatch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
@@ -552,7 +550,7 @@ class DynamicalVAE(nn.Module):
             raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
         for name, value in latents.items():
             self.reader.check(name, value)
-        with self._evaluating():
+        with self.running():
             trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
             names = [name for name in (*self.generative.variables, LOG_DET) if name in trace]
             trace.compute_log_prob(site_filter=lambda name, site: name in names)
@@ -565,8 +563,11 @@ class DynamicalVAE(nn.Module):
 
     # What is read, and what is handed out --------------------------------------------------------------------------
 
-    def _evaluating(self) -> Any:
-        return evaluating(self) if self.training else nullcontext()
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Evaluation mode for a block that runs programs of the model, during which other threads wait."""
+        with alone, evaluating(self) if self.training else nullcontext():
+            yield
 
     def read(
         self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False

@@ -30,7 +30,7 @@ from ..factorization.notation import Factor, Factorization
 from ..networks.base import indicator, valid_steps
 from ..networks.linear import Linear, LinearNetwork
 from ..options import Count, kind_of, require
-from ..turns import alone
+from ..turns import seeded
 from .conditional import Conditional, like
 from .groups import GROUP
 from .model import DynamicalVAE
@@ -38,7 +38,6 @@ from .rollout import Rollout
 from .summed import Discrete
 
 
-@alone
 def twin(
     generative: str | Factorization,
     inference: str | Factorization | None,
@@ -72,8 +71,7 @@ def twin(
         for factor in equation.factors
         if factor.parents or factor.kind == "q"
     }
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with seeded(seed):
         return DynamicalVAE(generative, inference, sizes, Linear(steps, scale), laws, observed=observed).double()
 
 
@@ -371,7 +369,6 @@ class Oracle:
         return float(self.gap().detach())
 
 
-@alone
 def price(
     generative: str | Factorization,
     inference: str | Factorization | None,
@@ -416,7 +413,6 @@ def _drawing(model: Factorization, context: tuple[Factor, ...]) -> Factorization
     return replace(model, factors=(*context, *model.factors))
 
 
-@alone
 def model_price(
     generative: str | Factorization,
     reduced: str | Factorization,

@@ -27,7 +27,6 @@ from ..inference.training.schedules import from_config as option_from_config
 from ..inference.training.trackers import Tracker
 from ..models.registry import configured
 from ..options import flat
-from ..turns import alone
 from .kinds import DATA, SCHEMAS, Dataset, opened
 
 
@@ -144,7 +143,6 @@ def training_of(method: Trainable, data: Dataset, training: Training | Mapping[s
     return training if isinstance(training, Training) else replace(method.training(data.schema), **(training or {}))
 
 
-@alone
 def resume(
     path: str | os.PathLike[str],
     data: str | os.PathLike[str] | None = None,
@@ -175,7 +173,6 @@ def resume(
     return fit(run.model, recipe, resume=True, **told, **vars(training))
 
 
-@alone
 def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Loaded:
     """Reads a run back: method, and model with its best weights; its data when they are asked for.
 

@@ -31,7 +31,6 @@ from ...program.batch import AnyBatch, repeat
 from ...program.conditional import like
 from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..diagnostics.latents import joined, split
 from ..evaluation.held import reproducibly
 from ..evaluation.result import progress_bar
@@ -74,7 +73,6 @@ class AnnealedBound:
     temperatures: int
 
 
-@alone
 @torch.inference_mode(False)
 def annealed_bound(
     model: DynamicalVAE,

@@ -98,7 +98,6 @@ class SequenceELBO(ELBO):
     def __init__(self, num_particles: int = 1):
         super().__init__(num_particles=num_particles)
 
-    @alone
     def terms(
         self, model: Callable[..., Any], batch: AnyBatch, guide: Callable[..., Any] | None = None, **options: Any
     ) -> Terms:
@@ -117,7 +116,6 @@ class SequenceELBO(ELBO):
         draws = [self._terms(model, guide, (batch,), options) for _ in range(self.num_particles)]
         return draws[0] if len(draws) == 1 else _mean(draws)
 
-    @alone
     def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
         """Minus the bound plus the energies, summed over the batch."""
         draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
@@ -138,6 +136,7 @@ class SequenceELBO(ELBO):
         return _traces(model, guide, args, kwargs)
 
     @computing_once()
+    @alone
     def _terms(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
         model_sites, guide_sites = map(sites_of, self._get_trace(model, guide, args, kwargs))
         for name in guide_sites:
@@ -335,7 +334,6 @@ class ImportanceBound:
     particles: int
 
 
-@alone
 @torch.no_grad()
 def importance_bound(
     model: DynamicalVAE, batch: AnyBatch, particles: int = 100, *, chunk: int = 4096, **options: Any
@@ -364,9 +362,9 @@ def importance_bound(
     if particles < 1:
         raise ValueError(f"particles is at least 1, got {particles}")
     require_likelihood(model)
-    data = model.read(batch)
-    size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
-    with model._evaluating():
+    with model.running():
+        data = model.read(batch)
+        size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
         if not model.latents:
             evidence = _log_weights(model, data, options)
             return ImportanceBound(evidence, torch.zeros_like(evidence), particles)

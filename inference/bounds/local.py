@@ -36,7 +36,6 @@ from ...program.batch import AnyBatch, repeat
 from ...program.conditional import Conditional
 from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..evaluation.held import reproducibly
 from .elbo import joint_and_guide, require_data, require_latents, require_likelihood, sites_of
 
@@ -194,7 +193,6 @@ def _alone(parameters: Parameters) -> Parameters:
     return tuple(p[:, 0] for p in parameters)
 
 
-@alone
 @torch.inference_mode(False)
 def local_guide(
     model: DynamicalVAE,

@@ -31,7 +31,6 @@ from ...program.conditional import Conditional, like
 from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
 from ...program.rollout import Rollout
-from ...turns import alone
 from .elbo import require_data, require_likelihood
 
 
@@ -52,7 +51,6 @@ class ParticleBound:
     particles: int
 
 
-@alone
 @torch.no_grad()
 def particle_bound(
     model: DynamicalVAE, batch: AnyBatch, particles: int = 16, *, resample_below: float = 0.5, chunk: int = 4096
@@ -91,10 +89,10 @@ def particle_bound(
     if not 0 <= resample_below <= 1:
         raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
     require_likelihood(model)
-    data = model.read(batch)
-    size = require_data(model, data)
-    at_once = max(1, chunk // particles)
-    with model._evaluating():
+    with model.running():
+        data = model.read(batch)
+        size = require_data(model, data)
+        at_once = max(1, chunk // particles)
         if refused := obstacle(model, data):
             raise ValueError(refused)
         parts = []
@@ -102,8 +100,8 @@ def particle_bound(
             some = each(data, itemgetter(slice(first, first + at_once)))
             part = Filter(model, some, particles).run(resample_below)
             parts.append((part.bound, part.effective, part.resamplings))
-    bound, effective, resamplings = (torch.cat(found, dim=-1) for found in zip(*parts, strict=True))
-    return ParticleBound(bound + (volume(data) if LOG_DET in data else 0), effective, resamplings, particles)
+        bound, effective, resamplings = (torch.cat(found, dim=-1) for found in zip(*parts, strict=True))
+        return ParticleBound(bound + (volume(data) if LOG_DET in data else 0), effective, resamplings, particles)
 
 
 class Filter:

@@ -31,11 +31,9 @@ from ...data.views import LOG_DET
 from ...program.batch import AnyBatch, repeat
 from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from .elbo import ImportanceBound, importance_mean, log_densities, require_likelihood, sites_of, total
 
 
-@alone
 @torch.no_grad()
 def predictive_bound(
     model: DynamicalVAE, batch: AnyBatch, observed: int, particles: int = 100, *, chunk: int = 4096
@@ -61,41 +59,43 @@ def predictive_bound(
         raise ValueError(
             f"{type(model).__name__} forecasts in a way of its own, whose density is not known; leave the log score out"
         )
-    data = model.read(batch)
-    size, length = data[model.observed[0]].shape[:2]
-    observed -= model.view.past  # the others are context, and given anyhow
-    if model.grouped and GROUP in data:
-        raise ValueError(f"groups share {', '.join(model.grouped)}, and a log score is of one sequence; leave it out")
-    if "lengths" in data:
-        raise ValueError("a log score needs sequences of one length, but these have lengths")
-    first = 0 if model.view.past else 1
-    if particles < 1 or not first <= observed < length:
-        taken = model.view.past
-        raise ValueError(
-            f"expected at least 1 particle, and observed frames from {taken + first} to {taken + length - 1}; got "
-            f"{particles} and {taken + observed}"
-        )
-    log_det = data.get(LOG_DET, torch.zeros(size, length))
-    if log_det.dim() == 1:
-        raise ValueError(
-            "the view changes the volume of whole sequences, and what of that is due to the future is not known; leave "
-            "the log score out, or give the view a log_det by entry, (B, T, D)"
-        )
-    past = each(data, lambda value: value[:, :observed] if value.dim() == 3 else value)
+    with model.running():
+        data = model.read(batch)
+        size, length = data[model.observed[0]].shape[:2]
+        observed -= model.view.past  # the others are context, and given anyhow
+        if model.grouped and GROUP in data:
+            raise ValueError(
+                f"groups share {', '.join(model.grouped)}, and a log score is of one sequence; leave it out"
+            )
+        if "lengths" in data:
+            raise ValueError("a log score needs sequences of one length, but these have lengths")
+        first = 0 if model.view.past else 1
+        if particles < 1 or not first <= observed < length:
+            taken = model.view.past
+            raise ValueError(
+                f"expected at least 1 particle, and observed frames from {taken + first} to {taken + length - 1}; got "
+                f"{particles} and {taken + observed}"
+            )
+        log_det = data.get(LOG_DET, torch.zeros(size, length))
+        if log_det.dim() == 1:
+            raise ValueError(
+                "the view changes the volume of whole sequences, and what of that is due to the future is not known; "
+                "leave the log score out, or give the view a log_det by entry, (B, T, D)"
+            )
+        past = each(data, lambda value: value[:, :observed] if value.dim() == 3 else value)
 
-    def log_weights(count: int) -> Tensor:
-        whole = repeat(data, count)
-        proposed = poutine.trace(model.guide).get_trace(whole)
-        joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(whole)
-        if not observed:  # and latents are from the prior
-            return total(log_densities(joint)) - total(log_densities(proposed))
-        drawn = {n: s["value"] for n, s in sites_of(proposed).items()}
-        known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}
-        seen = poutine.trace(poutine.condition(model.guide, data=known)).get_trace(repeat(past, count))
-        local = [n for n in model.generative.variables if model.generative.local(n)]
-        future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
-        return total(future) + total(log_densities(seen)) - total(log_densities(proposed))
+        def log_weights(count: int) -> Tensor:
+            whole = repeat(data, count)
+            proposed = poutine.trace(model.guide).get_trace(whole)
+            joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(whole)
+            if not observed:  # and latents are from the prior
+                return total(log_densities(joint)) - total(log_densities(proposed))
+            drawn = {n: s["value"] for n, s in sites_of(proposed).items()}
+            known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}
+            seen = poutine.trace(poutine.condition(model.guide, data=known)).get_trace(repeat(past, count))
+            local = [n for n in model.generative.variables if model.generative.local(n)]
+            future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
+            return total(future) + total(log_densities(seen)) - total(log_densities(proposed))
 
-    with model._evaluating():
         found = importance_mean(log_weights, size, particles, chunk)
-    return replace(found, bound=found.bound + log_det[:, observed:].sum(1).to(found.bound))
+        return replace(found, bound=found.bound + log_det[:, observed:].sum(1).to(found.bound))

@@ -23,7 +23,6 @@ from torch.distributions import Distribution
 
 from ...program.batch import AnyBatch
 from ...program.conditional import like
-from ...turns import alone
 
 
 class Redrawn(nn.Module):
@@ -63,10 +62,9 @@ class Redrawn(nn.Module):
         """As the model decides."""
         return bool(self.model.is_drawn(means))
 
-    @alone
     def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> Mapping[str, Tensor]:
         """As the model's, with latents from the other laws."""
-        with _Redrawing(self.laws, like(self.model)):
+        with self.model.running(), _Redrawing(self.laws, like(self.model)):
             found: Mapping[str, Tensor] = self.model.forecast(batch, horizon, samples, **options)
             return found
 

@@ -35,7 +35,6 @@ from ...data.views import LOG_DET
 from ...program.batch import AnyBatch, repeat
 from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..bounds.annealing import annealed_bound
 from ..bounds.elbo import joint_and_guide, require_latents, require_likelihood
 from ..bounds.local import local_guide, missing_latents, require_local
@@ -257,7 +256,6 @@ def _reach(estimate: Estimate) -> float:
     return 0.0 if math.isnan(reach) else reach
 
 
-@alone
 @torch.inference_mode(False)
 def bracket(
     model: DynamicalVAE,

@@ -23,7 +23,6 @@ from typing_extensions import override
 
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..bounds.elbo import require_likelihood
 from ..evaluation.held import on_device_of, reproducibly
 from ..evaluation.result import Result, Table, canvas, progress_bar
@@ -244,7 +243,6 @@ class Calibration(Result):
         return np.stack([_likeliest_normal(counts, self.draws)[0] for counts in self.counts])
 
 
-@alone
 def calibrate(
     model: DynamicalVAE,
     length: int,

@@ -22,7 +22,6 @@ from torch import Tensor
 from ...data.sequences import HeldOutWindows, called, columns_of, gapped, mean_of_known, past_of, scales_of
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..bounds.elbo import require_likelihood
 from ..evaluation.held import hold, on_device_of, plain, reproducibly
 from ..evaluation.result import Result, Table, as_they_are, canvas, progress_bar
@@ -306,7 +305,6 @@ class PredictiveChecks(Result):
         return " · ".join(part for part in parts if part)
 
 
-@alone
 def predictive_checks(
     model: DynamicalVAE | Mapping[str, DynamicalVAE],
     windows: HeldOutWindows,

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from ...options import Count, Delay, Positive, Size, check
 from ...program.batch import repeat, rows
-from ...turns import alone
+from ...turns import alone, seeded
 from ..bounds.elbo import ImportanceBound, importance_mean
 from ..evaluation.result import progress_bar
 from .latents import Values, joined, split
@@ -125,7 +125,6 @@ class Posterior:
             values = split(flat, self.mode).items()
             return {name: pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1)) for name, value in values}
 
-    @alone
     @torch.no_grad()
     def evidence(
         self, program: _Program, batch: Any, particles: int = 200, *, seed: int = 0, chunk: int = 4096
@@ -156,7 +155,6 @@ class Posterior:
         return (self.factor @ noise.to(self.factor)[..., None]).squeeze(-1)
 
 
-@alone
 @torch.inference_mode(False)
 def posterior(
     program: _Program,
@@ -200,9 +198,7 @@ def posterior(
     descent = descent or Descent()
     size, at_once = len(_some(batch)), max(1, chunk // descent.starts)
     device = _some(batch).device
-    forked = torch.random.fork_rng([device] if device.type == "cuda" else [])
-    with forked, pyro.validation_enabled(False), progress_bar(progress) as bar:
-        torch.manual_seed(seed)
+    with seeded(seed, device), pyro.validation_enabled(False), progress_bar(progress) as bar:
         chunks = [rows(batch, slice(first, first + at_once)) for first in range(0, size, at_once)]
         task = bar.add_task("looking for modes", total=len(chunks) * (descent.steps + descent.newton + 1))
         parts = [_Search(program, chunk, guide, descent, renew, partial(bar.advance, task)).run() for chunk in chunks]
@@ -344,7 +340,8 @@ class _Search:
 
 def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str] | None = None) -> Tensor:
     """-log p (B,) of a program's sites, or of some of them, at these values of its latents."""
-    trace = poutine.trace(poutine.condition(program, data=dict(values))).get_trace(batch)
+    with alone:
+        trace = poutine.trace(poutine.condition(program, data=dict(values))).get_trace(batch)
     trace.compute_log_prob(site_filter=lambda name, _: sites is None or name in sites)
     logs = {name: site["log_prob"] for name, site in trace.nodes.items() if "log_prob" in site}
     size = len(next(iter(values.values())))

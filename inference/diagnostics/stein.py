@@ -27,7 +27,6 @@ from typing_extensions import override
 
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..evaluation.held import plain, reproducibly
 from ..evaluation.result import Result, Table, canvas, progress_bar
 from .latents import Inferred, some_of
@@ -131,7 +130,6 @@ class SteinDiscrepancy(Result):
             ) from error
 
 
-@alone
 @torch.inference_mode(False)
 def stein_discrepancy(
     model: DynamicalVAE,

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..evaluation.held import on_device_of, reproducibly
 from .checks import decode
 
@@ -42,7 +41,6 @@ class Traversal:
         return self.frames.var(1, correction=0).mean((1, 2, 3)).sqrt()
 
 
-@alone
 @torch.no_grad()
 def traverse(
     model: DynamicalVAE,

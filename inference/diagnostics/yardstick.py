@@ -28,7 +28,6 @@ from typing_extensions import override
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
 from ...program.oracle import Oracle
-from ...turns import alone
 from ..evaluation.held import plain, reproducibly
 from ..evaluation.result import Result, Table, canvas, progress_bar
 from .latents import Inferred, Shapes, quantities, some_of
@@ -384,7 +383,6 @@ def _read(kind: Any, said: Mapping[str, Any], shape: tuple[int, int]) -> Any:
     return kind(**found)
 
 
-@alone
 @torch.inference_mode(False)
 def reference_posterior(
     model: DynamicalVAE,

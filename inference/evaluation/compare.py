@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from ...data.sequences import Batch, HeldOutWindows, Listed, called, clusters, each, leaves, sequences, take_split
 from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from ..bounds.elbo import require_likelihood
 from ..bounds.particles import obstacle
 from ..bounds.teacher_forced import bounds, filtered, information, length_of, variances
@@ -32,7 +31,6 @@ from .scores import Measure, Scores, proper
 _PAIRS = 4096  # sequences times contrasts to hold at once
 
 
-@alone
 def compare(
     models: Mapping[str, DynamicalVAE | Sequence[DynamicalVAE]],
     data: HeldOutWindows | Listed | Tensor | np.ndarray | Batch,

@@ -33,7 +33,6 @@ from typing_extensions import override
 
 from ...data.sequences import HeldOutWindows, called, clusters, columns_of, mean_of_known, scales_of
 from ...options import nearest
-from ...turns import alone
 from .evaluate import evaluate, forecaster_of, forecasts_of
 from .evaluation import Evaluation
 from .held import Held, clip_places, hold, plain, reproducibly
@@ -239,7 +238,6 @@ class Tubes(Result):
         return torch.as_tensor(self.factors[region]).to(like)
 
 
-@alone
 def conformal(
     model: nn.Module | str,
     windows: HeldOutWindows,

@@ -25,7 +25,6 @@ from ...data.sequences import HeldOutWindows, called
 from ...options import Count, Delay, require
 from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting, Forecasting
-from ...turns import alone
 from ..bounds.elbo import SequenceELBO, importance_bound
 from ..bounds.predictive import predictive_bound
 from .evaluation import Evaluation, Row
@@ -35,7 +34,6 @@ from .result import progress_bar
 from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clip_means, proper
 
 
-@alone
 def evaluate(
     model: nn.Module | Mapping[str, nn.Module],
     windows: HeldOutWindows,

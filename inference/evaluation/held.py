@@ -15,6 +15,7 @@ from ...data.sequences import Batch, HeldOutWindows, called, clusters, each, gap
 from ...program.batch import rows
 from ...program.conditional import evaluating
 from ...program.model import DynamicalVAE
+from ...turns import seeded
 
 
 @dataclass(frozen=True)
@@ -133,9 +134,7 @@ def clip_places(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 @contextmanager
 def reproducibly(model: nn.Module, seed: int) -> Iterator[None]:
     """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
-    device = next(model.parameters()).device
-    with evaluating(model), torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
+    with seeded(seed, next(model.parameters()).device), evaluating(model), torch.no_grad():
         yield
 
 

@@ -24,7 +24,7 @@ from ...program.batch import check_scale
 from ...program.conditional import like
 from ...program.model import DynamicalVAE
 from ...program.rollout import SelfFeeding
-from ...turns import alone
+from ...turns import seeded
 from ..evaluation.result import as_they_are
 from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
@@ -165,7 +165,6 @@ class Interrupted(KeyboardInterrupt):
         self.signal = signal
 
 
-@alone
 @torch.inference_mode(False)  # which enables gradients too
 def fit(
     model: nn.Module | Trainable,
@@ -185,7 +184,7 @@ def fit(
 
     Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
     or without validation data the last ones. The caller's random state is left as it was. Threads take turns, as Pyro's
-    handlers and torch's random state are the process's: another fit or forecast waits until this one is done.
+    handlers and torch's random state are the process's: another fit or forecast waits for a step of this one.
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` takes; or a method, such as `dvae.method("srnn")`,
@@ -239,7 +238,7 @@ def fit(
     if not isinstance(model, Trainable):
         if validation is not None:
             raise ValueError("a recipe has its own validation data; leave out validation")
-        return _follow(data, model, **loop, **options)
+        return _fit(model, data.batches, data.validation, **_prepared(data, model, loop | options))
     if resume:
         raise ValueError(f"dvae.resume({os.fspath(out or 'RUN')!r}) continues the run of a method")
     if validation is None and is_divided(data):
@@ -254,13 +253,15 @@ def fit(
     if out is not None and config is None and hasattr(data, "recorded"):
         loop["config"] = run_config(method, schema, data.kind, data.recorded())
     recipe = method.train(train, take_split(validation, "validation"), training.steps)
-    with torch.random.fork_rng():
-        torch.manual_seed(training.seed)
-        return _follow(recipe, method.build(schema), **loop, **vars(training), **options)
+    options = vars(training) | options
+    with seeded(training.seed):
+        module = method.build(schema)
+        told = _prepared(recipe, module, loop | options)
+    return _fit(module, recipe.batches, recipe.validation, **told)
 
 
-def _follow(recipe: Recipe, model: nn.Module, **options: Any) -> Fit:
-    """Fit a model by a recipe, prepared first unless a run is resumed."""
+def _prepared(recipe: Recipe, model: nn.Module, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Prepare a model as a recipe says, unless a run is resumed, and return the options of its fit."""
     steps = sum(stage.steps for stage in recipe.stages)
     if options.get("steps", steps) != steps:
         raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
@@ -271,10 +272,10 @@ def _follow(recipe: Recipe, model: nn.Module, **options: Any) -> Fit:
         )
     if not options["resume"]:
         run_directory(options["out"], False, {})  # which is refused before what may take long
-        with torch.random.fork_rng():
+        with seeded(None):
             recipe.prepare(model)
-    options |= {"steps": steps, "self_feeding": recipe.feeding, "stages": recipe.stages}
-    return _fit(model, recipe.batches, recipe.validation, objective=None, **options)
+    own = {"steps": steps, "self_feeding": recipe.feeding, "stages": recipe.stages, "objective": None}
+    return {**options, **own}
 
 
 def _fit(

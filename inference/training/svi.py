@@ -8,7 +8,7 @@ changes nothing, nor the reverse.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from ...data.sequences import Batch, InBatches, each, in_batches, refuse_table, 
 from ...options import kind_of
 from ...program.model import DynamicalVAE
 from ...program.protocols import Program
-from ...turns import alone, no_fork
+from ...turns import alone, no_fork, seeded
 from ..bounds.elbo import SequenceELBO, Terms
 from ..evaluation.result import reason
 from . import processes
@@ -140,7 +140,6 @@ class SVI:
             self._begun = {first: described.begin(self.model) if isinstance(described, Adaptive) else described}
         return self._begun[first]
 
-    @alone
     @torch.inference_mode(False)
     def init(self) -> State:
         """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
@@ -148,7 +147,7 @@ class SVI:
         with no_fork:  # lightning-fabric, and by the first optimiser parts of torch
             self.fabric: Fabric = processes.launched(training)
             torch.optim.SGD([torch.zeros(1)])
-        with _forked(self.fabric.device):
+        with seeded(None, self.fabric.device):
             own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
                 self.parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True, **own
@@ -278,7 +277,7 @@ class SVI:
     @contextmanager
     def drawing(self) -> Iterator[None]:
         """Within it, torch draws the run's random numbers; the caller's random state is left as it was."""
-        with _forked(self.fabric.device):
+        with seeded(None, self.fabric.device):
             torch.set_rng_state(self.random["torch"])
             if "cuda" in self.random:
                 torch.cuda.set_rng_state(self.random["cuda"], self.fabric.device)
@@ -320,8 +319,7 @@ class SVI:
         first, end = (fabric.global_rank, None) if shares else (0, 1)
         own = islice(data.batches(size), first, end, fabric.world_size)
         self.module.eval()
-        with _forked(self.fabric.device), torch.no_grad():
-            torch.manual_seed(self._seed)
+        with seeded(self._seed, self.fabric.device), torch.no_grad():
             for batch in own:
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 found = _sums(terms)
@@ -376,11 +374,6 @@ class _Bound(nn.Module):
             with torch.autocast(terms.frames.device.type, enabled=False):
                 measure(terms)
         return dict(vars(terms))
-
-
-def _forked(device: torch.device) -> AbstractContextManager[None]:
-    """Puts the random state of torch back at the end."""
-    return torch.random.fork_rng([device] if device.type == "cuda" else [])
 
 
 def _sums(terms: Terms) -> dict[str, Tensor]:

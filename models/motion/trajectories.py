@@ -38,7 +38,6 @@ from ...motion.data.protocols import Poses
 from ...options import Amount, Share, Size
 from ...program.batch import CHUNK, AnyBatch, in_chunks, repeat, rows
 from ...program.model import DynamicalVAE
-from ...turns import alone
 from .poses import PoseMethod
 
 FIRST, GIVEN, REST = "s", "y", "r"
@@ -225,7 +224,6 @@ class TrajectoryModel(DynamicalVAE):
             data[GIVEN] = first.new_zeros(len(first), length, first.shape[-1])
         return super().model(data, curriculum=curriculum, **options)
 
-    @alone
     @torch.no_grad()
     @override
     def forecast(
@@ -294,7 +292,7 @@ class TrajectoryModel(DynamicalVAE):
             made[WHOLE] = made[WHOLE][:, :, :horizon]
             return self.shown(made, some)
 
-        with self._evaluating():
+        with self.running():
             out = in_chunks(futures, len(data[FIRST]), distinct, chunk)
         # Samples that are all the same are one: rows of one product may differ in their last bits.
         return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
@@ -321,7 +319,6 @@ class TrajectoryModel(DynamicalVAE):
         rest = given[:, -1:].expand(-1, max(made - given.shape[1], 0), -1)
         return {**data, GIVEN: torch.cat([given[:, :made], rest], 1)}
 
-    @alone
     def complete(
         self,
         initial_pose: Any,
@@ -454,7 +451,7 @@ class TrajectoryModel(DynamicalVAE):
             rollout.values[self.latents[0]] = z
             return rollout.draw(WHOLE)
 
-        with self._evaluating():
+        with self.running():
             with torch.no_grad():
                 scale = self.generator[self.latents[0]](data, 1, len(known))[1]
             x, corrections = bend(means, latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options)

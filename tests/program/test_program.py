@@ -16,6 +16,7 @@ from pyro.infer import SVI, Trace_ELBO
 import dvae
 from dvae import DynamicalVAE, SequenceELBO
 from dvae.inference.bounds.particles import Filter
+from dvae.inference.training.fit import Callback
 from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Recurrent
 from dvae.testing import FactorizationContract
@@ -106,6 +107,34 @@ class TestRowMaskOfAttention(RowMask):
 
 
 # ------------------------------------------------------------------------------------------------------------ threads
+
+
+class _Waiting(Callback):
+    """Holds a fit between two steps until another thread has forecast."""
+
+    def __init__(self) -> None:
+        self.began, self.forecast = threading.Event(), threading.Event()
+
+    def on_step(self, state: Any) -> None:
+        self.began.set()
+        assert self.forecast.wait(60), "the fit has kept the lock between its steps"
+
+
+def test_forecasts_are_made_while_a_fit_goes_on_and_change_nothing_of_it():
+    x = torch.randn(8, 6, 3).double()
+    torch.manual_seed(0)
+    alone_, beside, other = srnn(), srnn(), srnn()
+    beside.load_state_dict(alone_.state_dict())
+    dvae.fit(alone_, x, steps=2, batch_size=4, progress=False)
+    waiting, quiet = _Waiting(), {"steps": 2, "batch_size": 4, "progress": False}
+    fit = threading.Thread(target=lambda: dvae.fit(beside, x, callbacks=[waiting], **quiet))
+    fit.start()
+    assert waiting.began.wait(60)
+    assert other.forecast(x[:, :4], 2, 3)["x"].shape == (3, 8, 2, 3)
+    waiting.forecast.set()
+    fit.join()
+    for name, value in alone_.state_dict().items():
+        torch.testing.assert_close(beside.state_dict()[name], value, rtol=0, atol=0)
 
 
 def test_a_bound_and_the_building_of_a_model_wait_for_their_turn():

@@ -201,12 +201,11 @@ class Angled(nn.Module):
         """As the model decides."""
         return self.model.is_drawn(means) if isinstance(self.model, Emitting) else not means
 
-    @alone
     def forecast(self, batch: Batch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
         """{"x": (S, B, times, A)}, angles at all times, of which there are as many as the horizon."""
         frames, inverse = self.angles.protocol.frames, self.angles.protocol.inverse
         places, last, made = [frame - 1 for frame in frames], max(frames), _Made()
-        with made:  # at once, where it is seen
+        with alone, made:  # at once, where it is seen
             at_once = {} if inverse else {"chunk": 2**62}
             futures = self.model.forecast(batch[MOTION], last, samples, **options, **at_once)[WHOLE]
         if inverse:

@@ -37,7 +37,7 @@ from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe, Trainable
 from ...inference.training.trackers import Bar
 from ...options import Layers, Range
-from ...turns import alone
+from ...turns import seeded
 from ..data.protocols import Poses, Windows
 from ..geometry.skeleton import HUMAN36M, HUMANEVA, Skeleton, rotate_about_up
 from ..geometry.views import Heading
@@ -182,7 +182,6 @@ class PosePriorModel(nn.Module):
         return self.flow.prior().sample((count,))
 
 
-@alone
 def fit_pose_prior(
     windows: Windows, steps: int = 1000, seed: int = 0, progress: bool = True, **options: Any
 ) -> PosePriorModel:
@@ -199,8 +198,7 @@ def fit_pose_prior(
         The model, in evaluation mode, with its last weights.
     """
     method = PosePrior(**options)
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
+    with seeded(seed):
         model = method.build(windows)
         fit(
             model,

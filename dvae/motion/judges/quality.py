@@ -57,7 +57,7 @@ from ...inference.training.recipe import Recipe, Trainable
 from ...inference.training.trackers import Bar
 from ...networks.cells import GRU
 from ...options import Size, nearest
-from ...turns import alone
+from ...turns import seeded
 from ..data.protocols import Poses, Windows
 from ..geometry.skeleton import Skeleton
 from ..geometry.views import Heading
@@ -273,7 +273,6 @@ def _said(found: Estimate) -> str:
     )
 
 
-@alone
 def quality(
     models: Mapping[str, Any],
     train: Windows,
@@ -333,8 +332,7 @@ def quality(
             learned, judged = (_examples(name, futures, each, progress) for each in (known, held))
         found: dict[str, list[Sequence[float]]] = {score: [] for score in SCORES}
         for number in seeds:
-            with torch.random.fork_rng():
-                torch.manual_seed(number)
+            with seeded(number):
                 judge = method.build(train)
             bar = Bar(f"judge of {name}, seed {number}", steps, progress)
             options = {**TRAINING, "seed": number, "progress": False, "trackers": [bar], **training}

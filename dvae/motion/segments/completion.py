@@ -42,7 +42,6 @@ from ...inference.bounds.elbo import ImportanceBound
 from ...inference.diagnostics.posteriors import Descent, Posterior, posterior
 from ...options import Positive, check
 from ...program.conditional import evaluating, like
-from ...turns import alone
 from ..bodies import MARKERS, Body, vertex_error
 from .embodied import SHAPE
 from .frames import TimedFrames
@@ -277,7 +276,6 @@ class Completed:
         return self.model.decode(z, shape), shape
 
 
-@alone
 def complete(
     model: Any,
     seen: Batch,

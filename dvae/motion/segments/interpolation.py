@@ -20,7 +20,6 @@ from ...data.sequences import Batch
 from ...data.views import WHOLE
 from ...inference.evaluation.held import on_device_of, reproducibly
 from ...inference.evaluation.result import Table, as_they_are, canvas
-from ...turns import alone
 from ..bodies import Body
 from ..data.clips import MotionSet
 from .embodied import SHAPE, surfaces_of
@@ -120,7 +119,6 @@ class Interpolation:
         return angle.mean((-2, -1)).rad2deg()
 
 
-@alone
 @torch.no_grad()
 def interpolate(model: Any, first: Batch, second: Batch, steps: int = 9) -> Interpolation:
     """Segments on the straight line in z and beta from some to others, all pairs and steps at once.
@@ -149,7 +147,6 @@ def interpolate(model: Any, first: Batch, second: Batch, steps: int = 9) -> Inte
         return Interpolation(model.timed, model.body, shares, latent, shape, model.decode(latent, shape))
 
 
-@alone
 @torch.no_grad()
 def transferred(model: Any, batch: Batch, shape: Tensor) -> Tensor:
     """The motion of segments on other bodies: their z, with another beta.

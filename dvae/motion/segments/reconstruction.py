@@ -29,7 +29,6 @@ from ...inference.evaluation.result import Result, Table, as_they_are, canvas, p
 from ...inference.evaluation.scores import TEACHER_FORCED, Metric, clip_means
 from ...inference.evaluation.uncertainty import clustered_variance, linearised
 from ...options import nearest
-from ...turns import alone
 from ..bodies import vertex_error
 from .embodied import SHAPE, Segments, SegmentSchema, surfaces_of
 from .frames import TimedFrames
@@ -173,7 +172,6 @@ def _joined(batch: Batch) -> Tensor:
     return torch.cat([batch[WHOLE].flatten(1), batch[SHAPE]], -1)
 
 
-@alone
 def reconstruct_segments(
     models: Mapping[str, Any],
     segments: Segments,

@@ -21,7 +21,6 @@ from ...data.views import WHOLE
 from ...inference.diagnostics.posteriors import Descent
 from ...inference.evaluation.result import Table
 from ...options import nearest
-from ...turns import alone
 from ..bodies import vertex_error
 from ..data.clips import MotionSet
 from ..files.archive import archive
@@ -147,7 +146,6 @@ class Recovered:
         return replace(made, clips=[replace(clip, split=split, name=name) for clip, (split, name) in named])
 
 
-@alone
 def recover(
     model: Any,
     seen: Batch,
