@@ -225,7 +225,7 @@ def test_what_takes_long_to_import_is_imported_when_it_is_used(program, unused):
 
 WITHOUT = """
 import sys
-sys.modules |= dict.fromkeys(("roma", "plotly", "pooch", "tensorboard"))
+sys.modules |= dict.fromkeys(("roma", "pooch", "tensorboard"))
 import dvae, torch
 model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
 dvae.fit(model, torch.randn(8, 5, 3), steps=2, progress=False)

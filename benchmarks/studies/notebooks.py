@@ -1,36 +1,28 @@
 """Runs notebooks and stores them with what they show; `make notebooks` does so for all.
 
-What is stored depends on the run alone: no times, no versions, no progress. A figure of plotly is stored as a still, of
-an animation its last frame, as these are large and hosts that show notebooks do not play or turn them.
+What is stored depends on the run alone: no times, no versions, no progress. An animation is stored as
+its last frame, as it is large and hosts that show notebooks do not play it.
 """
 
 import base64
-import html
 import io
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 import nbformat
-import numpy as np
 import tyro
 from jupyter_client.manager import KernelManager
-from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from nbclient import NotebookClient
 from PIL import Image
 
 ROOT = Path(__file__).parents[2]
-PLOTLY = "application/vnd.plotly.v1+json"
 # sequences have fewer steps than training
 SHARED = re.compile(
     r"(\b(?:steps|particles|samples|fitting|warm_up)=|\b(?:Stage|draw)\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)"
 )
 CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.35  # a share of them, so that every split has some
 SEEDS = re.compile(r"(\bseeds=)(\d+)")
-LIGHT = np.array([-0.5, -0.6, 0.63])  # towards it, from the left, above and in front
 TEXTS = ("text/plain", "text/html", "text/latex")
 
 
@@ -96,9 +88,8 @@ def execute(path: Path, share: float = 1.0, on: KernelManager | None = None) -> 
             data = output.get("data", {})
             if "text/plain" in data:
                 data["text/plain"] = re.sub(r" at 0x[0-9a-f]+", "", data["text/plain"])
-            if PLOTLY in data:
-                still, what = _still(data[PLOTLY]), "play" if data[PLOTLY].get("frames") else "turn"
-                output["data"] = {"image/png": still, "text/plain": f"a still; run the cell to {what} it"}
+            if "<iframe" in data.get("text/html", "") and "image/png" in data:
+                del data["text/html"]
             if "image/png" in output.get("data", {}):
                 output["data"]["image/png"] = _small(output["data"]["image/png"])
     return notebook
@@ -125,62 +116,17 @@ def _small(picture: str) -> str:
 
 
 def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
-    """Outputs without progress and the script that plays animations; what was printed is one, however it came."""
+    """Outputs without progress; what was printed is one, however it came."""
     whole: list[nbformat.NotebookNode] = []
     for output in outputs:
         data = output.get("data", {})
-        script = "PlotlyConfig" in data.get("text/html", "") and PLOTLY not in data
-        if script or "application/vnd.jupyter.widget-view+json" in data:
+        if "application/vnd.jupyter.widget-view+json" in data:
             continue
         if whole and output.output_type == "stream" and output.name == whole[-1].get("name"):
             whole[-1].text += output.text
         else:
             whole.append(output)
     return whole
-
-
-def _still(figure: Any) -> str:
-    """Draw a figure from the front, of an animation the last frame, as a PNG in base64."""
-    scene = figure["layout"]["scene"]
-    width, height = (np.ptp(scene[axis]["range"]) for axis in ("xaxis", "zaxis"))
-    still = Figure(figsize=(9, min(9 * height / width, 6)), dpi=72, layout="constrained")
-    ax = still.subplots()
-    for trace in figure["frames"][-1]["data"] if figure.get("frames") else figure["data"]:
-        places = [_numbers(trace[axis]) for axis in "xyz"]
-        if trace["type"] == "mesh3d":
-            ax.add_collection(_shaded(trace, np.stack(places, -1)))
-        elif trace.get("name") != "floor":
-            ax.plot(places[0], places[2], color=trace["line"]["color"], linewidth=1.8)
-    for label in scene["annotations"]:
-        ax.text(label["x"], label["z"], html.unescape(label["text"]), ha="center", parse_math=False)
-    ax.autoscale_view()
-    ax.set_aspect("equal")
-    ax.axis("off")
-    file = io.BytesIO()
-    still.savefig(file, format="png")
-    return base64.encodebytes(file.getvalue()).decode()
-
-
-def _shaded(mesh: Any, places: np.ndarray) -> PolyCollection:
-    """The triangles of a mesh (V, 3) that face the viewer, the nearest last, by how the light falls on them."""
-    faces = np.stack([_numbers(mesh[corner]) for corner in "ijk"], -1).astype(int)
-    first, second, third = places[faces].swapaxes(0, 1)
-    normals = np.cross(second - first, third - first)
-    smooth = np.zeros_like(places)
-    np.add.at(smooth, faces, normals[:, None])
-    smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
-    seen = np.flatnonzero(normals[:, 1] < 0)  # y goes away from the viewer
-    seen = seen[np.argsort(-places[faces[seen], 1].mean(-1))]
-    bright = 0.6 + 0.4 * (smooth[faces[seen]].mean(1) @ LIGHT).clip(0)
-    colours = bright.round(2)[:, None] * to_rgb(mesh["color"])
-    return PolyCollection(places[faces[seen]][..., [0, 2]], facecolors=colours, edgecolors=colours, linewidths=0.4)
-
-
-def _numbers(values: Any) -> np.ndarray:
-    """An array as plotly writes it, in base64 or as a list."""
-    if "bdata" in values:
-        return np.frombuffer(base64.b64decode(values["bdata"]), values["dtype"])
-    return np.array(values, float)
 
 
 def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:

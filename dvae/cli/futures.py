@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
@@ -305,12 +304,11 @@ def animate(
 ) -> None:
     """Play forecasts beside what happened, or a clip, as moving skeletons.
 
-    A page (.html) is one file that any browser shows, without a network: to play, to scrub, to turn with the mouse. A
-    film (.gif or .mp4) is the same from the front, for slides and messages.
+    The page is one file that any browser shows, without a network: to play, to scrub, to turn with the mouse.
 
     Args:
         source: a run directory, a file that `dvae forecast` wrote, a motion file, or "simulated".
-        out: the file to write; the end of its name is its kind, html, gif or mp4.
+        out: the html file to write.
         clip: name of a clip, or split/name where the name is not unique. Without it, futures are those of any test
             window, and a motion file shows its first clip.
         window: which of the windows of futures, from 0; by default the one that moves most.
@@ -323,9 +321,7 @@ def animate(
     """
     at_least(1, samples=samples, every=every)
     at_least(0, window=window)
-    check_files(out, figure, ".html", ".gif", ".mp4", ".htm")
-    if out.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
-        raise UsageError("an mp4 needs imageio-ffmpeg: pip install 'pyro-dvae[video]'; or end the name in .gif")
+    check_files(out, figure, ".html", ".htm")
     if Path(source).is_dir():
         if not Run(source).exists:
             raise ValueError(
@@ -373,14 +369,9 @@ def _play_clip(source: str, name: str | None, missing: bool, every: int | None, 
 
 
 def _play(out: Path, *motions: Any, **options: Any) -> None:
-    if out.suffix.lower() in (".gif", ".mp4"):
-        from ..motion.drawing.film import save_film
+    from ..motion.drawing.player import animate
 
-        save_film(out, *motions, **options)
-    else:
-        from ..motion.drawing.plot import animate, save_html
-
-        save_html(animate(*motions, **options), out)
+    animate(*motions, **options).save(out)
 
 
 def joint_names(given: Sequence[str]) -> list[str]:

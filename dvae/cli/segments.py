@@ -40,13 +40,13 @@ APART, FARTHER = 3.0, 1.3
 
 def _save_page(out: Path, made: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None) -> None:
     """Clips that move side by side; who is done stays as it ends."""
-    from ..motion.drawing.plot import animate, save_html
+    from ..motion.drawing.player import animate
 
     clips = [*made, *(truth or ())]
     frames = max(clip.frames for clip in clips)
     still = np.stack([np.pad(c.positions, ((0, frames - c.frames), (0, 0), (0, 0)), mode="edge") for c in clips])
     samples, real = still[: len(made), 1:], None if truth is None else still[-1, 1:]
-    save_html(animate(made.skeleton, still[0, :1], samples, real, names=names), out)
+    animate(made.skeleton, still[0, :1], samples, real, names=names).save(out)
 
 
 def _alone(made: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:

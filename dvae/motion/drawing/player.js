@@ -77,11 +77,17 @@ const play = async box => {
         const [x, y, z] = [0, 1, 2].map(i => unit * ((1 - share) * values[a + 3 * j + i] + share * values[b + 3 * j + i]));
         return [x - middle[0], y - middle[1], z];
       };
-      pen.strokeStyle = before < observed ? scene.past : person.colour;
-      pen.lineWidth = Math.max(1.2, THICK * scale);
-      pen.beginPath();
-      for (const ends of bones.map(bone => bone.map(joint))) if (ends.every(Boolean)) line(...ends);
-      pen.stroke();
+      const past = before < observed, alike = new Set(person.fixed);
+      for (const dark of [false, true]) {  // bones that move alike in all samples are dark and thick
+        pen.strokeStyle = past ? scene.past : dark ? scene.dark : person.colour;
+        pen.lineWidth = Math.max(1.2, THICK * scale) * (dark ? 1.5 : 1);
+        pen.beginPath();
+        for (const bone of bones) {
+          const ends = alike.has(bone[1]) === dark ? bone.map(joint) : [null];
+          if (ends.every(Boolean)) line(...ends);
+        }
+        pen.stroke();
+      }
     });
     slider.value = frame;
     const seconds = (frame - observed + 1) * scene.milliseconds / 1000;

@@ -1,24 +1,32 @@
-"""Moving skeletons within a page of HTML, small and without a library: to play, to scrub, to turn.
+"""Moving skeletons on a page of HTML or in a notebook, small and without a library: to play, to scrub, to turn.
 
 A scene is stored as whole numbers of a millimetre: the observed frames, which all people share, then each one's future,
 as steps from frame to frame; a joint that lacks is at `MISSING`. Of these numbers of 16 bits first all low bytes and
-then all high ones are deflated and written in base64: 50 futures of a window take about 100 kB, a fifteenth of what
-plotly's frames take.
+then all high ones are deflated and written in base64: 50 futures of a window take about 100 kB.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import io
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from math import pi
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
-from .plot import PAST, Scene
+from ... import files
+from ..geometry.skeleton import Skeleton
+from .plot import FIXED, PAST, Scene, staged
 
 SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
 """What moves all players of a page."""
@@ -64,9 +72,10 @@ def _scene(stage: Scene) -> dict[str, Any]:
         "frames": len(stage.shown),
         "milliseconds": stage.milliseconds,
         "people": [
-            {"name": name, "colour": colour, "frames": len(ahead)}
-            for name, colour, ahead in zip(stage.names, stage.colours, futures, strict=True)
+            {"name": name, "colour": colour, "frames": len(ahead), "fixed": sorted(stage.shared(k))}
+            for k, (name, colour, ahead) in enumerate(zip(stage.names, stage.colours, futures, strict=True))
         ],
+        "dark": FIXED,
         "past": PAST,
         "unit": unit,
         "middle": middle[:2].tolist(),
@@ -81,3 +90,113 @@ def _packed(steps: np.ndarray) -> str:
     """Whole numbers modulo 2^16, in which sums of steps come out right."""
     planes = steps.astype(np.int64).astype("<u2").view(np.uint8).reshape(-1, 2).T
     return base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """Skeletons that move side by side. A notebook shows it; `save` writes a page that any browser plays offline.
+
+    Args:
+        scene: the people.
+        title: above them.
+    """
+
+    scene: Scene
+    title: str = ""
+
+    def to_html(self) -> str:
+        """Return the page, which loads nothing and runs no script but the player's."""
+        allowed = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
+        moving = player({self.title or "motion": self.scene})
+        return str(_PAGE.format(title=self.title, policy=allowed, player=moving, script=Markup(SCRIPT)))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the page to a file."""
+        with files.written(path) as file:
+            file.write(self.to_html().encode())
+
+    def still(self) -> Figure:
+        """Draw the last frame, seen from the front."""
+        scene = self.scene
+        motion = scene.motion[:, scene.shown[-1]] + scene.places[:, None]
+        size = np.ptp(motion[..., [0, 2]].reshape(-1, 2), axis=0)
+        figure = Figure(figsize=(9, float(np.clip(9 * size[1] / size[0], 1.5, 6))), dpi=72, layout="constrained")
+        ax = figure.subplots()
+        edges = np.array(scene.skeleton.edges)
+        for name, place, colour, person in zip(scene.names, scene.places, scene.colours, motion, strict=True):
+            ax.add_collection(LineCollection(list(person[edges][..., [0, 2]]), colors=colour, linewidths=1.8))
+            ax.text(place[0], place[2] + scene.high[2] + 0.1, name, ha="center", parse_math=False)
+        ax.autoscale_view()
+        ax.set_aspect("equal")
+        ax.set_axis_off()
+        return figure
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
+        """Return the player for notebooks, and the last frame where they cannot play it."""
+        png = io.BytesIO()
+        self.still().savefig(png, format="png")
+        page = Markup('<iframe srcdoc="{}" style="width:100%;height:30em;border:0"></iframe>').format(self.to_html())
+        return {
+            "text/html": str(page),
+            "image/png": base64.encodebytes(png.getvalue()).decode(),
+            "text/plain": "a still; run the cell to play it",
+        }
+
+
+_PAGE = Markup(
+    """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{policy}'">
+<title>{title}</title>
+<style>
+body {{font: 14px system-ui, sans-serif; margin: 1em}}
+.controls {{display: flex; gap: 1em}} .controls input {{flex: 1}} canvas {{width: 100%}}
+</style>
+</head>
+<body>
+{player}
+<script>{script}</script>
+</body>
+</html>
+"""
+)
+
+
+def animate(
+    skeleton: Skeleton,
+    observed: Any,
+    samples: Any = None,
+    truth: Any = None,
+    *,
+    names: Sequence[str] = (),
+    fixed: Collection[int] = (),
+    every: int | None = None,
+    view: float = pi / 5,
+    title: str = "",
+) -> Animation:
+    """Return skeletons that move side by side, to play, scrub and turn: the true motion, and sampled futures.
+
+    All repeat the observed motion in black and go on in the colours of `plot.futures`, seen from the same side. Time
+    zero is the last observed pose.
+
+    Args:
+        skeleton: the tree.
+        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
+        samples: (K, H, J, 3) in metres; without them the observed motion is played alone, from time zero.
+        truth: (F, J, 3) in metres, where it is known; F is at most H.
+        names: what to call the K samples; by default they are numbered.
+        fixed: joints that move alike in all samples; bones that end in them are drawn dark and thick.
+        every: frames from one that is shown to the next, the last observed always among them; by default so that
+            about 25 a second are shown. The speed is the motion's own.
+        view: radians between the last observed heading and the viewer, before the scene is turned.
+        title: above the figure.
+
+    Raises:
+        ValueError: the shapes do not fit each other or the skeleton, there is nothing to draw, a position is not
+            finite, or names, fixed or every do not fit the motion.
+    """
+    scene = staged(skeleton, observed, samples, truth, names=names, fixed=fixed, every=every, view=view)
+    return Animation(scene, title)

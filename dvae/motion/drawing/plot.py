@@ -1,69 +1,32 @@
-"""Figures of skeletons: a pose, observed motion with its possible futures, and both in motion."""
+"""Figures of skeletons and bodies: poses, observed motion with its possible futures, surfaces."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from math import ceil, pi
-from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import to_hex
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from ... import files
-from ...lazy import optional
 from ..geometry.skeleton import Skeleton, rotate_about_up
-
-if TYPE_CHECKING:
-    import plotly.graph_objects as go
-else:
-    go = optional("plotly.graph_objects", "motion")
 
 PAST, TRUTH, FIXED, GIVEN, SKIN = "black", "#1a7f37", "#4a4f57", "#cf222e", "#c3b2a1"
 
 SPACING = 1.15
 """Metres between the skeletons of a figure."""
 
-MARGIN = 0.15
-"""Metres around all skeletons of an animation."""
-
-ELEVATION = 0.2
-"""Radians by which the viewer of an animation looks down."""
-
-_PLAYER = """
-const figure = document.getElementById('{plot_id}'), scene = figure._fullLayout.scene._scene;
-const [place, update] = [scene.setViewport, scene.updateFx];
-const {w, h} = figure._fullLayout._size, {x, y, z} = scene.fullSceneLayout.aspectratio, {high} = figure.layout.meta;
-const height = Math.min(h, w * high / x), fit = 1.9 * Math.min(w / height / x, 1 / high);
-document.body.style.margin = 0;
-Plotly.relayout(figure, {
-  'height': figure._fullLayout.height - h + height,
-  'scene.aspectratio': {x: x * fit, y: y * fit, z: z * fit},
-});
-let turning = false, drag = scene.fullSceneLayout.dragmode, due = 0;
-figure.addEventListener('pointerdown', () => { turning = true; }, true);
-for (const end of ['pointerup', 'pointercancel']) window.addEventListener(end, () => { turning = false; }, true);
-scene.setViewport = layout => { if (!turning) place.call(scene, layout); };
-scene.updateFx = (mode, hover) => { if (mode !== drag) update.call(scene, drag = mode, hover); };
-figure.on('plotly_animating', () => { due = performance.now(); });
-figure.on('plotly_animatingframe', () => {
-  const spacing = figure.layout.meta.milliseconds, queue = figure._transitionData._frameQueue;
-  const late = Math.max(0, Math.floor((performance.now() - due) / spacing));
-  queue.splice(0, Math.min(late, queue.length - 1));
-  due += (late + 1) * spacing;
-});
-"""
-"""What plotly lacks: the scene fills the window, or is as high as the window's width lets it be; it can be turned while
-it plays, and keeps its speed on a slow machine by leaving frames out."""
+LIGHT = np.array([-0.5, -0.6, 0.63])
+"""Direction of the light on surfaces: from the left, the front and above."""
 
 
 def pose(
@@ -237,7 +200,7 @@ def staged(
     every: int | None = None,
     view: float = pi / 5,
 ) -> Scene:
-    """People for an animation; see `animate` for its arguments and what it refuses."""
+    """Return people for an animation; see `player.animate` for the arguments and the errors."""
     alone = samples is None
     if alone:
         motion = np.asarray(observed)
@@ -265,173 +228,6 @@ def staged(
     return Scene(skeleton, called, colours, motion, now, shown, alike, real is not None)
 
 
-def animate(
-    skeleton: Skeleton,
-    observed: Any,
-    samples: Any = None,
-    truth: Any = None,
-    *,
-    names: Sequence[str] = (),
-    fixed: Collection[int] = (),
-    every: int | None = None,
-    view: float = pi / 5,
-    title: str = "",
-) -> go.Figure:
-    """Skeletons that move side by side, to play, scrub and turn: what happened, and sampled futures.
-
-    (Longer than other functions by what is drawn, one thing after the other.)
-
-    Everybody repeats the observed motion in black and goes on in the colours of `futures`, seen from the same side.
-    Time zero is the last observed pose.
-
-    A notebook shows the figure; `save_html` writes it to a file.
-
-    Args:
-        skeleton: the tree.
-        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
-        samples: (K, H, J, 3) in metres; without them the observed motion is played alone, from time zero.
-        truth: (F, J, 3) in metres, where it is known; F is at most H.
-        names: what to call the K samples; by default they are numbered.
-        fixed: joints that move alike in all samples; bones that end in them are drawn dark and thick.
-        every: frames from one that is shown to the next, the last observed always among them; by default so that
-            about 25 a second are shown. The speed is the motion's own.
-        view: radians between the last observed heading and the viewer, before the scene is turned.
-        title: above the figure.
-
-    Returns:
-        A plotly figure in metres: x to the viewer's right, y away from the viewer, z up. A skeleton is a trace of
-        polylines with gaps between them; with fixed joints, one trace for the other bones and one for these.
-
-    Raises:
-        ValueError: the shapes do not fit each other or the skeleton, there is nothing to draw, a position is not
-            finite, or names, fixed or every do not fit the motion.
-    """
-    stage = staged(skeleton, observed, samples, truth, names=names, fixed=fixed, every=every, view=view)
-    low, high, places = stage.low, stage.high, stage.places
-    gap = np.full((*stage.motion.shape[:2], 1, 3), np.nan)
-    motion = np.concatenate([stage.motion + places[:, None, None], gap], axis=2).astype(np.float32)
-
-    drawn = []
-    for k, colour in enumerate(stage.colours):
-        drawn.append((k, colour, _polylines(skeleton, set(range(skeleton.joints)) - stage.shared(k)), 6))
-        if stage.shared(k):
-            drawn.append((k, FIXED, _polylines(skeleton, stage.shared(k)), 9))
-    now, shown = stage.now, stage.shown
-
-    def traces(frame: int) -> list[dict[str, Any]]:
-        """What changes from frame to frame."""
-        return [
-            {
-                "type": "scatter3d",
-                **dict(zip("xyz", motion[k, frame, path].T, strict=True)),
-                "line": {"color": PAST if frame <= now else colour},
-            }
-            for k, colour, path, _ in drawn
-        ]
-
-    first = traces(shown[0])
-    for trace, (k, _, _, width) in zip(first, drawn, strict=True):
-        trace |= {"mode": "lines", "name": _literal(stage.names[k]), "hoverinfo": "skip"}
-        trace["line"]["width"] = width
-    return _figure(
-        first,
-        (low, high),
-        places,
-        stage.names,
-        title,
-        margin=110,
-        milliseconds=stage.milliseconds,
-        frames=[go.Frame(name=str(f), data=traces(f), traces=list(range(len(drawn)))) for f in shown],
-        **_player({str(f): stage.seconds(f) for f in shown}, stage.milliseconds),
-    )
-
-
-def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = "y", title: str = "") -> go.Figure:
-    """Bodies that stand side by side, to turn.
-
-    Args:
-        faces: triangles, (F, 3).
-        vertices: of one pose (V, 3) or of P bodies or poses (P, V, 3), metres, numpy or torch without gradients.
-        names: what to call them; by default they are not named.
-        up: the vertical axis, "y" or "z".
-        title: above the figure.
-
-    Returns:
-        A plotly figure in metres as that of `animate`: a mesh for each, seen from the front of who faces heading zero.
-
-    Raises:
-        ValueError: the shapes do not fit each other, a place is not finite, or there are too few names.
-    """
-    corners, people = np.asarray(faces), np.asarray(vertices, np.float64)
-    people = people[None] if people.ndim == 2 else people
-    names = names or [""] * len(people)
-    if corners.shape[1:] != (3,) or people.ndim != 3 or people.shape[2] != 3 or not (people.size and corners.size):
-        raise ValueError(f"expected faces (F, 3) and vertices (P, V, 3), got {corners.shape} and {people.shape}")
-    if not (0 <= corners.min() <= corners.max() < people.shape[1]):
-        raise ValueError(f"a face has corner {corners.max()} of {people.shape[1]} vertices")
-    if not np.isfinite(people).all():
-        raise ValueError("vertices have NaN or infinite places, which cannot be drawn")
-    if len(names) != len(people):
-        raise ValueError(f"{len(names)} names for {len(people)} bodies; give each its own")
-    people = people if up == "z" else people[..., [0, 2, 1]] * [1, -1, 1]
-    middle = (people.min(1, keepdims=True) + people.max(1, keepdims=True)) / 2
-    people = people - middle * [1, 1, 0]
-    low, high = people.min((0, 1)), people.max((0, 1))
-    places = _places(len(people), high - low + 0.2)
-    people = people + places[:, None]
-    meshes = [
-        {
-            **{"type": "mesh3d", "name": _literal(name), "color": SKIN, "hoverinfo": "skip"},
-            **dict(zip("xyz", body.T.astype(np.float32), strict=True)),
-            **dict(zip("ijk", corners.T, strict=True)),
-            # normals of triangles of a square centimetre are else taken for rounding
-            "lighting": {"facenormalsepsilon": 0, "vertexnormalsepsilon": 0, "ambient": 0.4, "specular": 0.05},
-            "lightposition": {"x": -5e4, "y": 7e4, "z": -7e4},  # as the viewer has it: left, above, in front
-        }
-        for name, body in zip(names, people, strict=True)
-    ]
-    return _figure(meshes, (low, high), places, names, title)
-
-
-def save_html(figure: go.Figure, path: str | PathLike[str]) -> None:
-    """Write a figure of `animate` or `surfaces` as one HTML file, which needs no network; motion has its own speed."""
-    page = figure.to_html(auto_play=False, post_script=_PLAYER, config={"displaylogo": False})
-    with files.written(path) as file:
-        file.write(page.encode())
-
-
-def _figure(
-    drawn: list[Any],
-    box: tuple[np.ndarray, np.ndarray],
-    places: np.ndarray,
-    names: Sequence[str],
-    title: str,
-    *,
-    margin: int = 0,
-    milliseconds: float = 0,
-    frames: Sequence[go.Frame] = (),
-    **layout: Any,
-) -> go.Figure:
-    """Traces on a floor, each in a box (two corners) about its place (P, 3), with names above."""
-    low, high = box
-    floors, labels = np.unique(places[:, 2]) + low[2], _labels(names, places, high[2])
-    low, high = low + places.min(0) - MARGIN, high + places.max(0) + MARGIN
-    scene, fill = _scene(low, high)
-    return go.Figure(
-        data=[*drawn, *(_floor(low[:2], high[:2], height) for height in floors)],
-        frames=frames,
-        layout={
-            "title": {"text": _literal(title), "x": 0.5, "font": {"size": 16}},
-            "template": "none",
-            "showlegend": False,
-            "margin": {"l": 0, "r": 0, "t": 40 if title else 0, "b": margin},
-            "scene": {**scene, "annotations": labels},
-            **layout,
-            "meta": {"milliseconds": milliseconds, "high": fill},
-        },
-    )
-
-
 def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
     """What the colours of `futures` mean, below the times."""
     sampled = tuple(Line2D([], [], color=colour) for colour in _colours(min(samples, 5)))
@@ -454,33 +250,14 @@ def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
     )
 
 
-def _player(seconds: dict[str, float], spacing: float) -> dict[str, Any]:
-    """The part of a layout that plays frames, which are given by name and time, some milliseconds apart."""
-
-    def go_to(frames: list[str | None] | None, milliseconds: float = 0) -> dict[str, Any]:
-        speed = {"duration": milliseconds, "redraw": True}
-        options = {"frame": speed, "transition": {"duration": 0}, "mode": "immediate", "fromcurrent": frames is None}
-        return {"method": "animate", "args": [frames, options]}
-
-    # half a refresh of a display less: a frame that waited its whole time would often miss the refresh
-    play = {"label": "Play", **go_to(None, max(spacing - 8, 0))}
-    corner = {"y": 0, "yanchor": "top", "xanchor": "left"}
-    buttons = [play, {"label": "Pause", **go_to([None])}]
-    steps = [{"label": f"{time:.2f}", **go_to([name])} for name, time in seconds.items()]
-    return {
-        "updatemenus": [{"type": "buttons", "showactive": False, "buttons": buttons, "x": 0.01, **corner}],
-        "sliders": [{"steps": steps, "currentvalue": {"suffix": " s"}, "x": 0.12, "len": 0.86, **corner}],
-    }
-
-
 def _seen(skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], horizon: int, view: float) -> np.ndarray:
     """Motions (P, O + H, J, 3) as the viewer of an animation sees them, with z up."""
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
-    for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which plotly does not draw
+    for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which is not drawn
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
     turn = torch.tensor(view - facing(skeleton, torch.from_numpy(past)), dtype=torch.float64)
     motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
-    return motion if skeleton.up == "z" else motion[..., [0, 2, 1]] * [1, -1, 1]  # plotly turns a scene about z
+    return motion if skeleton.up == "z" else motion[..., [0, 2, 1]] * [1, -1, 1]
 
 
 def _places(people: int, step: np.ndarray) -> np.ndarray:
@@ -491,55 +268,6 @@ def _places(people: int, step: np.ndarray) -> np.ndarray:
     return np.stack([column * step[0], 0.0 * row, -row * step[2]], axis=-1)  # rows one above the other
 
 
-def _scene(low: np.ndarray, high: np.ndarray) -> tuple[dict[str, Any], float]:
-    """The part of a layout that shows what lies between two corners (3,), and how much of its height is filled."""
-    size = high - low
-    height = size[2] * np.cos(ELEVATION) + size[1] * np.sin(ELEVATION)
-    # an orthographic scene is 2 high, and as wide as the window makes it, here taken for 2:1; what lies behind the eye
-    # is not seen, from wherever it looks
-    fit = max(height, size[0] / 2)
-    ratio = 1.9 * size / fit
-    far = float(np.linalg.norm(ratio))
-    eye = {"x": 0.0, "y": -far * np.cos(ELEVATION), "z": far * np.sin(ELEVATION)}
-    scene = {
-        # what lies on the limits of a range would be cut away in part
-        f"{axis}axis": {"visible": False, "range": [low[i] - 0.01, high[i] + 0.01]}
-        for i, axis in enumerate("xyz")
-    } | {
-        "aspectmode": "manual",
-        "aspectratio": dict(zip("xyz", ratio, strict=True)),
-        "dragmode": "turntable",
-        "camera": {"eye": eye, "projection": {"type": "orthographic"}},
-    }
-    return scene, 1.9 * height / fit
-
-
-def _labels(names: Sequence[str], places: np.ndarray, top: float) -> list[dict[str, Any]]:
-    """Names over the heads of those who stand at places (P, 3)."""
-    return [
-        {"text": _literal(name), "font": {"size": 14}, "showarrow": False, "x": x, "y": y, "z": z + top + MARGIN}
-        for name, (x, y, z) in zip(names, places, strict=True)
-    ]
-
-
-def _literal(text: str) -> str:
-    """A text for plotly, which takes tags for markup, links among them, and dollar signs for formulas."""
-    return escape(text, quote=False).replace("$", "&#36;")
-
-
-def _floor(low: np.ndarray, high: np.ndarray, height: float) -> dict[str, Any]:
-    """A trace: a grid of half metres between two corners (2,)."""
-    x, y = (np.unique([a, *np.arange(ceil(2 * a) / 2, b, 0.5), b]) for a, b in zip(low, high, strict=True))
-    rows = [[(x[0], b, height), (x[-1], b, height)] for b in y]
-    columns = [[(a, y[0], height), (a, y[-1], height)] for a in x]
-    lines = np.array([[*ends, (np.nan,) * 3] for ends in rows + columns]).reshape(-1, 3)
-    line = {"color": "#d5d8dd", "width": 1}
-    return {
-        **{"type": "scatter3d", "name": "floor", "mode": "lines", "line": line, "hoverinfo": "skip"},
-        **dict(zip("xyz", lines.T, strict=True)),
-    }
-
-
 def _colours(samples: int) -> np.ndarray:
     """(K, 4): a colour for each sample."""
     return plt.get_cmap("turbo")(np.linspace(0.05, 0.95, samples))
@@ -548,15 +276,6 @@ def _colours(samples: int) -> np.ndarray:
 def facing(skeleton: Skeleton, positions: Tensor) -> float:
     """Where the person of motion (F, J, 3) faces in the end; zero where the skeleton does not tell left from right."""
     return float(skeleton.heading_near(positions, len(positions) - 1)) if skeleton.left and skeleton.right else 0.0
-
-
-def _polylines(skeleton: Skeleton, joints: Collection[int]) -> list[int]:
-    """The bones that end in the given joints as polylines: indices of joints, J between two polylines."""
-    path: list[int] = []
-    for parent, joint in skeleton.edges:
-        if joint in joints:
-            path += [joint] if path and path[-1] == parent else [skeleton.joints, parent, joint]
-    return path[1:]
 
 
 def _given(paths: Mapping[str, Any], skeleton: Skeleton, horizon: int) -> np.ndarray:
@@ -584,3 +303,62 @@ def _checked(
             f"got {past.shape}, {future.shape} and {None if real is None else real.shape}"
         )
     return past, future, real
+
+
+def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = "y", title: str = "") -> Figure:
+    """Draw bodies that stand side by side, seen from the front of a person with heading zero.
+
+    Args:
+        faces: triangles, (F, 3).
+        vertices: of one pose (V, 3) or of P bodies or poses (P, V, 3), metres, numpy or torch without gradients.
+        names: what to call them; by default they are not named.
+        up: the vertical axis, "y" or "z".
+        title: above the figure.
+
+    Returns:
+        A figure in metres.
+
+    Raises:
+        ValueError: the shapes do not fit each other, a place is not finite, or there are too few names.
+    """
+    corners, people = np.asarray(faces), np.asarray(vertices, np.float64)
+    people = people[None] if people.ndim == 2 else people
+    names = names or [""] * len(people)
+    if corners.shape[1:] != (3,) or people.ndim != 3 or people.shape[2] != 3 or not (people.size and corners.size):
+        raise ValueError(f"expected faces (F, 3) and vertices (P, V, 3), got {corners.shape} and {people.shape}")
+    if not (0 <= corners.min() <= corners.max() < people.shape[1]):
+        raise ValueError(f"a face has corner {corners.max()} of {people.shape[1]} vertices")
+    if not np.isfinite(people).all():
+        raise ValueError("vertices have NaN or infinite places, which cannot be drawn")
+    if len(names) != len(people):
+        raise ValueError(f"{len(names)} names for {len(people)} bodies; give each its own")
+    people = people if up == "z" else people[..., [0, 2, 1]] * [1, -1, 1]
+    people = people - (people.min(1, keepdims=True) + people.max(1, keepdims=True)) / 2 * [1, 1, 0]
+    size = np.ptp(people, axis=(0, 1)) + 0.2
+    places = _places(len(people), size)
+    columns, rows = len({*places[:, 0]}), len({*places[:, 2]})
+    width = min(9.0, 4.5 * columns)
+    figure = Figure(figsize=(width, min(9.0, width * rows * size[2] / (columns * size[0]))), layout="constrained")
+    ax = figure.subplots()
+    for name, body, place in zip(names, people, places, strict=True):
+        ax.add_collection(_shaded(corners, body + place))
+        ax.text(place[0], place[2] + people[..., 2].max() + 0.05, name, ha="center", parse_math=False)
+    ax.autoscale_view()
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    figure.suptitle(title, parse_math=False)
+    return figure
+
+
+def _shaded(faces: np.ndarray, places: np.ndarray) -> PolyCollection:
+    """The triangles of a mesh (V, 3) that face the viewer, the nearest last, by how the light falls on them."""
+    first, second, third = places[faces].swapaxes(0, 1)
+    normals = np.cross(second - first, third - first)
+    smooth = np.zeros_like(places)
+    np.add.at(smooth, faces, normals[:, None])
+    smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True).clip(1e-12)
+    seen = np.flatnonzero(normals[:, 1] < 0)  # y goes away from the viewer
+    seen = seen[np.argsort(-places[faces[seen], 1].mean(-1))]
+    bright = 0.6 + 0.4 * (smooth[faces[seen]].mean(1) @ LIGHT).clip(0)
+    colours = bright.round(2)[:, None] * to_rgb(SKIN)
+    return PolyCollection(places[faces[seen]][..., [0, 2]], facecolors=colours, edgecolors=colours, linewidths=0.4)
