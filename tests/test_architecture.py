@@ -32,10 +32,10 @@ LAYERS = {
 }
 # Motion is an application: beside itself, the methods and commands for it import it, and nothing else does.
 MOTION = re.compile(
-    r"dvae\.(motion|models\.motion|models\.baselines)\b|dvae\.cli\.(data|fitting|futures|judging|report|segments)$"
+    r"dvae\.(motion|models\.motion|models\.baselines)\b|dvae\.cli\.(checks|data|fitting|futures|judging|opening|report|segments)$"
 )
 # Tables likewise, but that any method is fitted to them.
-TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(data|fitting|futures|judging|report|tables)$")
+TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(checks|data|fitting|futures|judging|opening|report|tables)$")
 
 
 @cache

@@ -204,7 +204,7 @@ def use(call: str, fitted: str, run: Path, data: Path) -> None:
     elif call == "forecast" and fitted == "latent":
         segments.interpolate(run, "person_0001", "person_0002", run / "steps.npz", steps=2, data=str(data))
     elif call == "forecast":
-        futures.forecast(run, run / "futures.npz", samples=1, horizon=2, data=str(data))
+        futures.forecast(run, run / "futures.npz", futures.Paths(), samples=1, horizon=2, data=str(data))
     else:
         few = {} if fitted == "latent" else {"samples": 1}
         judging.evaluate((run,), judging.Control(), data=str(data), **few)

@@ -33,7 +33,7 @@ def command(people, out, *more):
     equations = ["--generative", PAIR[0], "--inference", PAIR[1], "--residual", ".5", "--latent", "2", "--width", "4"]
     runs = ["--data", str(people), "--out", str(out), "--seeds", "0", "1", "--steps", "2", "--batch-size", "4"]
     twins = ["--twins", "1", "--twin-steps", "2", "--bound-particles", "4", "--jobs", "1"]
-    return ["ablate", *equations, *runs, *twins, "--warm-up", "1", *more]
+    return ["check", "edges", *equations, *runs, *twins, "--warm-up", "1", *more]
 
 
 @pytest.fixture(scope="module")

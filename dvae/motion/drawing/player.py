@@ -119,13 +119,17 @@ class Animation:
         """Draw the last frame, seen from the front."""
         scene = self.scene
         motion = scene.motion[:, scene.shown[-1]] + scene.places[:, None]
-        size = np.ptp(motion[..., [0, 2]].reshape(-1, 2), axis=0)
-        figure = Figure(figsize=(9, float(np.clip(9 * size[1] / size[0], 1.5, 6))), dpi=72, layout="constrained")
+        low, high = (find(motion[..., [0, 2]], axis=(0, 1)) for find in (np.nanmin, np.nanmax))
+        figure = Figure(
+            figsize=(9, float(np.clip(9 * (high - low)[1] / (high - low)[0], 1.5, 6))), dpi=72, layout="constrained"
+        )
         ax = figure.subplots()
         edges = np.array(scene.skeleton.edges)
-        for name, place, colour, person in zip(scene.names, scene.places, scene.colours, motion, strict=True):
+        for name, colour, person in zip(scene.names, scene.colours, motion, strict=True):
             ax.add_collection(LineCollection(list(person[edges][..., [0, 2]]), colors=colour, linewidths=1.8))
-            ax.text(place[0], place[2] + scene.high[2] + 0.1, name, ha="center", parse_math=False)
+            if np.isfinite(person).any():  # a truth may end early
+                place = np.nanmean(person[:, 0]), np.nanmax(person[:, 2]) + 0.1
+                ax.text(*place, name, ha="center", parse_math=False)
         ax.autoscale_view()
         ax.set_aspect("equal")
         ax.set_axis_off()

@@ -32,7 +32,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from pyro.poutine.messenger import Messenger
@@ -126,6 +126,8 @@ class Angles:
     def fingerprint(self) -> str:
         """Of the windows and the protocol."""
         return hashlib.sha256(f"{self.windows.fingerprint} {self.protocol}".encode()).hexdigest()
+
+    references: ClassVar = Windows.references
 
     @property
     def description(self) -> dict[str, Any]:

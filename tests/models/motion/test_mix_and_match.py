@@ -182,7 +182,7 @@ def test_it_is_written_into_the_log_as_a_model_learns_and_changes_nothing(window
 
     def fitted(**more):
         torch.manual_seed(0)
-        return recipe.fit(method.build(windows["train"]), **options, **more)
+        return dvae.fit(method.build(windows["train"]), recipe, **options, **more)
 
     watch = CodeDiversity(past(windows), every=2, samples=5)
     plain, watched = fitted(), fitted(out=tmp_path / "run", callbacks=[watch])

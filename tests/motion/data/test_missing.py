@@ -730,14 +730,10 @@ def test_past_that_is_shown_has_its_gaps():
 
 def test_every_command_that_reads_motion_takes_gaps_the_same_way():
     for name in COMMANDS:
-        hints = get_type_hints(command([name]), include_extras=True)
+        hints = get_type_hints(command(name.split()), include_extras=True)
         if "source" in hints and is_dataclass(hints["source"]):
             hints |= get_type_hints(hints["source"], include_extras=True)
-        reads = {"data", "files"} & hints.keys() and name not in (
-            "resume",
-            "interpolate",
-            "recover",
-        )  # what the run has, and whole bodies
+        reads = {"data", "files"} & hints.keys() and name != "resume"
         assert (hints.get("missing") in (Missing, Expert[Missing])) == bool(reads), name
 
 

@@ -179,10 +179,10 @@ def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsy
     assert any("validation/log_likelihood/c" in row for row in rows)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "compare", "criticise", "forecast"])
+@pytest.mark.parametrize("command", ["evaluate", "compare", "check calibration", "forecast"])
 def test_it_forecasts_nothing(command, run, tmp_path, capsys):
     out = ["--out", str(tmp_path / "futures.npz")] if command == "forecast" else []
-    assert main([command, str(run), *out]) == 1
+    assert main([*command.split(), str(run), *out]) == 1
     assert "is a fitted action-classifier, which forecasts nothing" in " ".join(capsys.readouterr().err.split())
 
 

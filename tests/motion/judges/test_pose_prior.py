@@ -159,10 +159,10 @@ def test_it_says_what_it_is(run, capsys, tmp_path):
     assert "dvae evaluate RUN --pose-prior" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", ["evaluate", "compare", "criticise", "forecast"])
+@pytest.mark.parametrize("command", ["evaluate", "compare", "check calibration", "forecast"])
 def test_it_forecasts_nothing(command, run, tmp_path, capsys):
     out = ["--out", str(tmp_path / "futures.npz")] if command == "forecast" else []
-    assert main([command, str(run), *out]) == 1
+    assert main([*command.split(), str(run), *out]) == 1
     assert "is a fitted pose-prior, which forecasts nothing" in " ".join(capsys.readouterr().err.split())
 
 
