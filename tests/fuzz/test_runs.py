@@ -202,7 +202,10 @@ def use(call: str, fitted: str, run: Path, data: Path) -> None:
     elif call == "resume":
         runs.resume(run, data, steps=6, progress=False)
     elif call == "forecast" and fitted == "latent":
-        segments.interpolate(run, "person_0001", "person_0002", run / "steps.npz", steps=2, data=str(data))
+        quick = dvae.Descent(steps=1, starts=1, candidates=1, newton=0)
+        glimpse = segments.Glimpse(seen="markers", seconds=0.2)
+        recovery = segments.Recovery(glimpse, descent=quick, source=("person_0001",))
+        recovery.run(run, run / "found.npz", 0, 0, str(data), False)
     elif call == "forecast":
         futures.forecast(run, run / "futures.npz", futures.Paths(), samples=1, horizon=2, data=str(data))
     else:
