@@ -51,7 +51,7 @@ autodoc_class_signature = "mixed"
 python_maximum_signature_line_length = 100
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
-suppress_warnings = ["ref.python", "mystnb.unknown_mime_type"]  # names of two classes; what plotly shows is in HTML too
+suppress_warnings = ["ref.python"]  # names of two classes
 
 # Docstrings are text, not reStructuredText: `code`, *emphasis*, examples, and indented blocks as they stand.
 _MARKS = re.compile(

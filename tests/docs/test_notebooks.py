@@ -1,21 +1,15 @@
 """The notebooks are stored with what they show, and a run from top to bottom shows the same."""
 
-import base64
 import copy
-import io
-import json
 import re
 from pathlib import Path
 
 import nbformat
-import numpy as np
 import pytest
-from PIL import Image
 from rich import console
 
 from benchmarks.studies import notebooks
 from dvae.inference.evaluation import result
-from dvae.motion.drawing.plot import surfaces
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -104,25 +98,6 @@ def test_words_of_a_table_are_held_in_any_order_of_its_rows():
     assert stable(table) == stable("<pre>┃ name ┃ bound ┃\n│ second │ 2 % │\n│ first │ 11.5 ± 0.1 │</pre>")
     assert stable(table) != stable(table.replace("second", "third"))
     assert stable("<pre>data 1ab457e0c8bf</pre>") == stable("<pre>data 04cdf7e0c8ff</pre>")  # of bits of motion
-
-
-def test_a_still_of_bodies_has_what_faces_the_viewer_the_nearest_in_front():
-    square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])  # faces +z, where the viewer is
-    roof = [[-0.5, 0.5, 1], [0.5, 0.5, 1], [0.5, 1, 0.2], [-0.5, 1, 0.2]]  # in front, turned to the light
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-
-    def middle(faces, vertices):
-        """The colour a little below the middle."""
-        figure = json.loads(surfaces(faces, vertices).to_json())
-        with Image.open(io.BytesIO(base64.b64decode(notebooks._still(figure)))) as image:
-            return image.convert("RGB").getpixel((image.width // 2, round(0.65 * image.height)))
-
-    behind, before = middle(faces, square), middle(faces, roof)
-    both = np.concatenate([square, roof])
-    assert (255, 255, 255) != behind != before != (255, 255, 255)
-    assert middle(faces[:, ::-1], square) == (255, 255, 255)
-    for order in ([faces, faces + 4], [faces + 4, faces]):
-        assert middle(np.concatenate(order), both) == before
 
 
 @pytest.mark.parametrize("widgets", [None, "installed"])

@@ -1,8 +1,11 @@
 """Pictures of bodies: they are the bodies themselves, side by side, upright and towards the viewer."""
 
+import io
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from dvae.motion.bodies import human
 from dvae.motion.drawing.plot import surfaces
@@ -26,6 +29,26 @@ def test_bodies_stand_apart_upright_and_face_the_viewer(up):
             assert ((box.min(0) > other.max(0)) | (box.max(0) < other.min(0))).any()
     assert [text.get_text() for text in ax.texts] == list("abcde")
     assert not any(text.get_parse_math() for text in ax.texts)
+
+
+def test_what_faces_the_viewer_is_drawn_the_nearest_in_front():
+    square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])  # faces +z, where the viewer is
+    roof = [[-0.5, 0.5, 1], [0.5, 0.5, 1], [0.5, 1, 0.2], [-0.5, 1, 0.2]]  # in front, turned to the light
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+
+    def middle(faces, vertices):
+        """The colour a little below the middle."""
+        file = io.BytesIO()
+        surfaces(faces, vertices).savefig(file, format="png")
+        with Image.open(file) as image:
+            return image.convert("RGB").getpixel((image.width // 2, round(0.65 * image.height)))
+
+    behind, before = middle(faces, square), middle(faces, roof)
+    both = np.concatenate([square, roof])
+    assert (255, 255, 255) != behind != before != (255, 255, 255)
+    assert middle(faces[:, ::-1], square) == (255, 255, 255)
+    for order in ([faces, faces + 4], [faces + 4, faces]):
+        assert middle(np.concatenate(order), both) == before
 
 
 @pytest.mark.parametrize(
