@@ -149,7 +149,10 @@ def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
 
 def _stable(text: str) -> str:
     if "<pre" in text or "━" in text:
-        return " ".join(sorted(re.findall(r"\b[^\W\d_]{2,}\b", re.sub("<[^>]*>", "", text))))
+        # notes below a table depend on its numbers, and so does whether a part of a gap is a lower bound
+        plain = re.sub("<[^>]*>", "", text).replace(", at least", "")
+        rows = [line for line in plain.splitlines() if re.search("[│┃]", line)]
+        return " ".join(sorted(re.findall(r"\b[^\W\d_]{2,}\b", " ".join(rows))))
     return " ".join(re.sub(r"[-+]?(\d*\.\d+|\d+(?=e[-+]\d|%))(e[-+]?\d+)?", "#", text).split())
 
 

@@ -39,6 +39,7 @@ from benchmarks.studies import (
 from dvae import Descent, Training, alternatives, method, motion
 from dvae.cli import main as command
 from dvae.inference.training.checkpoints import Run
+from dvae.inference.training.fit import fit
 from dvae.motion.segments import dataset
 from dvae.runs.directory import load
 from dvae.tables import Column, Columns, Panel, Series
@@ -309,9 +310,7 @@ def test_motion_latent(tmp_path, page, monkeypatch):
 def test_completion(tmp_path, page, short, monkeypatch):
     """Measured once, whatever is asked again; what is seen is not predicted, and nothing is nearer than the floor."""
     small = method("motion-latent", latent=3, widths=(8,), finish=0.0)
-    dvae.fit(
-        small, dataset.SegmentData.open(), out=tmp_path / "a", **vars(Training(steps=2, batch_size=4, progress=False))
-    )
+    fit(small, dataset.SegmentData.open(), out=tmp_path / "a", **vars(Training(steps=2, batch_size=4, progress=False)))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     for name in ("BEGIN", "END"):
         page.write_text(
