@@ -34,7 +34,7 @@ import dvae
 from dvae import motion
 from dvae.data.views import WHOLE
 from dvae.inference.evaluation.estimates import Crossed, Estimate
-from dvae.inference.evaluation.held import plain
+from dvae.inference.evaluation.record import plain
 from dvae.inference.evaluation.result import canvas
 from dvae.inference.training.checkpoints import LAST, load_weights
 from dvae.motion import bodies

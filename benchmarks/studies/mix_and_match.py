@@ -27,6 +27,7 @@ from dvae.data.sequences import past_of
 from dvae.inference.bounds.probe import Redrawn
 from dvae.inference.evaluation.estimates import Crossed, Estimate
 from dvae.inference.evaluation.held import reproducibly
+from dvae.inference.evaluation.record import plain
 from dvae.inference.evaluation.result import canvas
 from dvae.inference.evaluation.scores import Measure
 from dvae.inference.training.checkpoints import LAST, load_weights
@@ -258,13 +259,13 @@ def measured(case: str, model: Any, windows: Mapping[str, motion.Windows], seed:
     futures = {
         name: {
             **{score: row[score][0].tolist() for score in row},
-            **{score: list(scored.rows[name].clip_means[score]) for score in SCORES},
+            **{score: scored.rows[name].clip_means[score].tolist() for score in SCORES},
         }
         for name, row in judged.rows.items()
     }
     return {
         "futures": {**futures, "clips": scored.clips},
-        "angles": {**{name: angles.rows[name].clip_means for name in futures}, "clips": angles.clips}
+        "angles": {**{name: plain(angles.rows[name].clip_means) for name in futures}, "clips": angles.clips}
         if angles
         else None,
         "jerk": next(note for note in scored.notes if note.startswith("jerk")),

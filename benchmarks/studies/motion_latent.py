@@ -23,7 +23,8 @@ import dvae
 from dvae import motion
 from dvae.data.sequences import each
 from dvae.inference.evaluation.estimates import Crossed, Estimate
-from dvae.inference.evaluation.held import clip_places, plain
+from dvae.inference.evaluation.held import clip_places
+from dvae.inference.evaluation.record import plain
 from dvae.inference.evaluation.result import canvas
 from dvae.inference.evaluation.scores import clip_means
 from dvae.inference.training.checkpoints import Run

@@ -16,14 +16,12 @@ SRNN's three factors share the state of x_{<t}, and none of them could do withou
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import networkx as nx
 import numpy as np
@@ -36,7 +34,7 @@ from ..factorization.notation import Factorization, Parent, check_pair
 from ..inference.evaluation.compare import compare
 from ..inference.evaluation.comparison import Comparison
 from ..inference.evaluation.estimates import Estimate, number
-from ..inference.evaluation.held import plain
+from ..inference.evaluation.record import Dims
 from ..inference.evaluation.result import Result, Table, canvas, progress_bar
 from ..inference.training.checkpoints import ENDED
 from ..inference.training.many import holm
@@ -100,8 +98,7 @@ class Ablation(Result):
     """What every arrow of a model and its guide is worth.
 
     Attributes:
-        generative: the model.
-        inference: its guide.
+        equations: "generative" and "inference".
         sizes: of the variables of the twins.
         steps: T of the twins.
         prices: by `Arrow.run`, the price in each of the twins, in nats a sequence.
@@ -114,13 +111,26 @@ class Ablation(Result):
         ['x_{<t} to z_t']
     """
 
-    generative: Factorization
-    inference: Factorization
+    equations: dict[str, str]
     sizes: dict[str, int]
     steps: int
-    prices: dict[str, tuple[float, ...]]
+    prices: Annotated[dict[str, np.ndarray], Dims("twin", name="{}")]
     notes: dict[str, str]
     comparison: Comparison | None = None
+
+    @cached_property
+    def _pair(self) -> tuple[Factorization, Factorization]:
+        return Equations(generative=self.equations["generative"], inference=self.equations["inference"]).equations()
+
+    @property
+    def generative(self) -> Factorization:
+        """The model."""
+        return self._pair[0]
+
+    @property
+    def inference(self) -> Factorization:
+        """Its guide."""
+        return self._pair[1]
 
     @property
     def arrows(self) -> tuple[Arrow, ...]:
@@ -202,47 +212,25 @@ class Ablation(Result):
         """What the model draws and the guide does not."""
         return tuple(name for name in self.generative.variables if name not in self.inference.variables)
 
-    def to_json(self) -> str:
-        """Everything, with the differences and p-values written out. What is not finite becomes null."""
-        document = {
-            **vars(self),
-            "generative": self.generative.text,
-            "inference": self.inference.text,
-            "comparison": None if self.comparison is None else json.loads(self.comparison.to_json()),
-            "differences": {run: vars(estimate) for run, estimate in self.differences.items()},
-            "p_values": self.p_values,
-        }
-        return json.dumps(plain(document), allow_nan=False)
-
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        try:
-            document = json.loads(text)
-            said = Equations(generative=document["generative"], inference=document["inference"])
-            prices = {run: tuple(map(float, costs)) for run, costs in document["prices"].items()}
-            comparison = document["comparison"]
-            found = cls(
-                *said.equations(),
-                {str(name): int(size) for name, size in document["sizes"].items()},
-                int(document["steps"]),
-                prices,
-                {run: str(note) for run, note in document["notes"].items()},
-                None if comparison is None else Comparison.from_json(json.dumps(comparison)),
-            )
-            runs = {arrow.run for arrow in arrows_of(found.generative, found.inference)}
-            fitted = set() if found.comparison is None else found.comparison.rows.keys() - {WHOLE}
-            if prices.keys() != runs or not runs >= found.notes.keys() | fitted:
-                raise ValueError("its prices, notes and fits are not those of its arrows")
-            counts = {len(costs) for costs in prices.values()}
-            if len(counts) > 1 or max(counts, default=1) > MOST or not all(counts):
-                raise ValueError(f"every arrow has a price in each of the same 1 to {MOST} random models")
-            if not all(map(math.isfinite, (cost for costs in prices.values() for cost in costs))):
-                raise ValueError("a price is finite")
-            found.table()  # of a comparison that has the whole and all that its table needs
-            return found
-        except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ValueError(f"this is not an ablation written by Ablation.to_json: {error!r}") from error
+    def summary(self) -> dict[str, Any]:
+        differences = {run: vars(estimate) for run, estimate in self.differences.items()}
+        return {"differences": differences, "p_values": self.p_values}
+
+    @override
+    def check(self) -> None:
+        runs = {arrow.run for arrow in arrows_of(self.generative, self.inference)}
+        fitted = set() if self.comparison is None else self.comparison.rows.keys() - {WHOLE}
+        if self.prices.keys() != runs or not runs >= self.notes.keys() | fitted:
+            raise ValueError("its prices, notes and fits are not those of its arrows")
+        counts = {len(costs) for costs in self.prices.values()}
+        if len(counts) > 1 or not all(0 < count <= MOST for count in counts):
+            raise ValueError(f"every arrow has a price in each of the same 1 to {MOST} random models")
+        if not all(np.isfinite(costs).all() for costs in self.prices.values()):
+            raise ValueError("a price is finite")
+        if self.comparison is not None:
+            self.comparison.check()
+        self.table()  # of a comparison that has the whole and all that its table needs
 
 
 def arrows_of(generative: Factorization, inference: Factorization) -> tuple[Arrow, ...]:
@@ -353,7 +341,7 @@ def ablate(
     less = {arrow: parts[arrow.kind].without(arrow.child, arrow.parent) for arrow in arrows}
 
     of_twins = known, steps, twins, observed
-    prices: dict[str, tuple[float, ...]] = {}
+    prices: dict[str, np.ndarray] = {}
     with progress_bar(progress) as bar:
         gaps = price(model, read, *of_twins)
         for arrow in bar.track(arrows, description="prices on twins"):
@@ -361,14 +349,14 @@ def ablate(
                 costs = model_price(model, less[arrow], *of_twins)
             else:
                 costs = price(model, less[arrow], *of_twins) - gaps
-            prices[arrow.run] = tuple(costs.tolist())
+            prices[arrow.run] = costs.numpy()
 
     notes = {
         arrow.run: f"no data depend on {', '.join(sorted(idle))} then"
         for arrow in arrows
         if arrow.kind == "p" and (idle := _idle(less[arrow], observed) - _idle(model, observed))
     }
-    found = Ablation(model, read, known, steps, prices, notes)
+    found = Ablation({"generative": model.text, "inference": read.text}, known, steps, prices, notes)
     if data is None or out is None:
         return found
     named: dict[str, Method] = {WHOLE: whole}

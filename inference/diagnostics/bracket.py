@@ -17,12 +17,11 @@ and from above by the same run backward, for sequences simulated from the model 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -41,7 +40,8 @@ from ..bounds.local import local_guide, missing_latents, require_local
 from ..bounds.particles import obstacle, particle_bound
 from ..bounds.teacher_forced import length_of
 from ..evaluation.estimates import Crossed, Estimate, number
-from ..evaluation.held import clip_places, on_device_of, plain, refuse_non_finite, reproducibly
+from ..evaluation.held import clip_places, on_device_of, refuse_non_finite, reproducibly
+from ..evaluation.record import Dims
 from ..evaluation.result import Result, Table, canvas, progress_bar
 from ..evaluation.uncertainty import decimals
 
@@ -92,9 +92,9 @@ class Bracket(Result):
         True
     """
 
-    bounds: dict[str, dict[str, np.ndarray]]
+    bounds: Annotated[dict[str, dict[str, np.ndarray]], Dims("sequence", name="{1} {0}")]
     keys: list[tuple[str, str, int]]
-    frames: np.ndarray
+    frames: Annotated[np.ndarray, Dims("sequence")]
     equations: dict[str, str]
     added: dict[str, list[str]]
     data: dict[str, Any]
@@ -201,48 +201,29 @@ class Bracket(Result):
         figure.suptitle(f"{self.equations['generative']}\n{self.equations['inference']}", fontsize=9, parse_math=False)
         return figure
 
-    def to_json(self) -> str:
-        """Everything, with the parts of the gap written out."""
-        parts = {data: {name: vars(each) for name, each in self.gap(data).items()} for data in DATA}
-        return json.dumps(plain({"gap": parts, **vars(self)}), allow_nan=False)
-
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        try:
-            document = json.loads(text)
-            del document["gap"]
-            keys = [(str(split), str(clip), int(start)) for split, clip, start in document.pop("keys")]
-            frames = _numbers(document.pop("frames"), len(keys))
-            given = document.pop("bounds")
-            bounds = {
-                data: {n: _numbers(given[data][n], len(keys)) for n in BOUNDS if n in given[data]} for data in DATA
-            }
-            if (
-                not {"ELBO", "AIS"} <= bounds["real"].keys() & bounds["simulated"].keys()
-                or "upper" not in bounds["simulated"]
-            ):
-                raise ValueError("bounds are missing")
-            for name in ("particles", "temperatures", "chains", "fitting", "seed"):
-                if not isinstance(document[name], int):
-                    raise ValueError(f"{name} is no whole number")
-            clip, frame = called(document["data"])
-            said = [*document["equations"].values(), *document["notes"], clip, frame]
-            said += [term for terms in document["added"].values() for term in terms]
-            if not isinstance(document["notes"], list) or not all(isinstance(each, str) for each in said):
-                raise ValueError("what is said is no text")
-            if document["equations"].keys() != {"generative", "inference"}:
-                raise ValueError("equations are those of a model and its guide")
-            return cls(bounds=bounds, keys=keys, frames=frames, **document)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"this is not a bracket written by Bracket.to_json: {error!r}") from error
+    def summary(self) -> dict[str, Any]:
+        return {"gap": {data: {name: vars(each) for name, each in self.gap(data).items()} for data in DATA}}
 
+    @override
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"sequence": [f"{split}/{clip} {start}" for split, clip, start in self.keys]}
 
-def _numbers(values: Any, count: int) -> np.ndarray:
-    found = np.array(values, dtype=float)
-    if not count or found.shape != (count,) or not np.isfinite(found).all():
-        raise ValueError(f"expected {count} finite numbers, got an array {found.shape}")
-    return found
+    @override
+    def check(self) -> None:
+        real, simulated = (self.bounds[data] for data in DATA)
+        if not {"ELBO", "AIS"} <= real.keys() & simulated.keys() or "upper" not in simulated:
+            raise ValueError("bounds are missing")
+        if unknown := (real.keys() | simulated.keys()) - {*BOUNDS}:
+            raise ValueError(f"unknown bounds {', '.join(sorted(unknown))}")
+        if self.extents != {"sequence": {len(self.keys)}} or not self.keys:
+            raise ValueError(f"expected {len(self.keys)} numbers of every bound")
+        if not all(np.isfinite(values).all() for values in (self.frames, *real.values(), *simulated.values())):
+            raise ValueError("bounds and numbers of frames are finite")
+        if self.equations.keys() != {"generative", "inference"}:
+            raise ValueError("equations are those of a model and its guide")
+        if not all(isinstance(word, str) for word in called(self.data)):
+            raise ValueError("what sequences and frames are called is no text")
 
 
 def told(estimate: Estimate) -> str:

@@ -6,13 +6,12 @@ together that depend on the data: the log joint (Modrák et al., 2023, arXiv 221
 
 from __future__ import annotations
 
-import json
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 import scipy
@@ -25,6 +24,7 @@ from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..evaluation.held import on_device_of, reproducibly
+from ..evaluation.record import Dims
 from ..evaluation.result import Result, Table, canvas, progress_bar
 from .latents import quantities
 
@@ -54,7 +54,7 @@ class Calibration(Result):
         equations: of model and guide; no guide's where it was a program of one's own.
     """
 
-    ranks: np.ndarray
+    ranks: Annotated[np.ndarray, Dims("simulation", "quantity", kind=int)]
     names: tuple[str, ...]
     draws: int
     length: int
@@ -181,57 +181,24 @@ class Calibration(Result):
         figure.supxlabel(f"rank among {self.draws} draws, scaled to [0, 1]", fontsize=8)
         return figure
 
-    def document(self) -> dict[str, Any]:
-        """Everything but the single ranks, of which the counts tell all that the tests use, in JSON's types."""
-        columns = (self.p_values, self.adjusted, self.bias, self.spread, self.readings, self.counts.tolist())
-        return {
-            "equations": self.equations,
-            "simulations": len(self.ranks),
-            "draws": self.draws,
-            "length": self.length,
-            "seed": self.seed,
-            "p_value": self.p_value,
-            "verdict": self.verdict,
-            "quantities": {
-                name: {
-                    "p": float(p),
-                    "p_adjusted": float(adjusted),
-                    "bias": float(bias),
-                    "spread": float(spread),
-                    "reading": reading,
-                    "rank_counts": counts,
-                }
-                for name, p, adjusted, bias, spread, reading, counts in zip(self.names, *columns, strict=True)
-            },
-        }
-
-    def to_json(self) -> str:
-        """`document` as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
-
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        """What `to_json` wrote, with the ranks of each quantity in their order, since they alone are kept.
+    def summary(self) -> dict[str, Any]:
+        columns = {"p": self.p_values, "p_adjusted": self.adjusted, "bias": self.bias, "spread": self.spread}
+        columns["reading"] = np.array(self.readings)
+        quantities = {name: {key: each[q] for key, each in columns.items()} for q, name in enumerate(self.names)}
+        return {"p_value": self.p_value, "verdict": self.verdict, "quantities": quantities}
 
-        Raises:
-            ValueError: text that is not such a document, or one of more ranks than memory should be asked for.
-        """
-        try:
-            document = json.loads(text)
-            quantities, draws, simulations = (document[name] for name in ("quantities", "draws", "simulations"))
-            counts = np.array([each["rank_counts"] for each in quantities.values()], dtype=np.int64)
-            if counts.ndim != 2 or counts.shape[1] != draws + 1 or (counts < 0).any():
-                raise ValueError(f"expected counts of the ranks 0 to {draws} for every quantity")
-            if (counts.astype(float).sum(1) != simulations).any() or simulations * max(draws, len(counts)) > _MOST:
-                raise ValueError(
-                    f"the counts of a quantity do not add up to {simulations} simulations, or are too many"
-                )
-            ranks = np.stack([np.repeat(np.arange(draws + 1), row) for row in counts], 1)
-            said = {name: document[name] for name in ("length", "seed", "equations")}
-            return cls(ranks, tuple(quantities), draws, **said)
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ValueError(f"this is not a calibration written by Calibration.to_json: {error!r}") from error
+    @override
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"quantity": self.names}
+
+    @override
+    def check(self) -> None:
+        count, quantities = self.ranks.shape
+        if len(self.names) != quantities or not count or not 1 <= self.draws <= _MOST / max(count, quantities):
+            raise ValueError(f"expected ranks of {len(self.names)} quantities, and few draws, not {self.draws}")
+        if (self.ranks < 0).any() or (self.ranks > self.draws).any():
+            raise ValueError(f"ranks are between 0 and {self.draws}")
 
     @property
     def _title(self) -> str:

@@ -7,23 +7,25 @@ unit of the data.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import scipy
 import torch
 from rich.text import Text
 from torch import Tensor
+from typing_extensions import override
 
 from ...data.sequences import HeldOutWindows, called, columns_of, gapped, mean_of_known, past_of, scales_of
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
-from ..evaluation.held import hold, on_device_of, plain, reproducibly
+from ..evaluation.held import hold, on_device_of, reproducibly
+from ..evaluation.record import MODELS, Dims, plain
 from ..evaluation.result import Result, Table, as_they_are, canvas, progress_bar
 
 if TYPE_CHECKING:
@@ -139,8 +141,8 @@ class Check:
         unit: of both.
     """
 
-    real: np.ndarray
-    replicated: np.ndarray
+    real: Annotated[np.ndarray, Dims("sequence", name="{0} {2} {1}")]
+    replicated: Annotated[np.ndarray, Dims("replicate", "sequence", name="{0} {2} {1}")]
     unit: str
 
     @property
@@ -165,21 +167,6 @@ class Check:
         """Distance between the distributions of real and replicated values, in their unit."""
         return float(scipy.stats.wasserstein_distance(self.real, self.replicated.ravel()))
 
-    def document(self) -> dict[str, Any]:
-        """What the table shows and the tail area of every window, in JSON's types."""
-        levels = (0.05, 0.25, 0.5, 0.75, 0.95)
-        return {
-            "unit": self.unit,
-            "quantiles": list(levels),
-            "real": np.quantile(self.real, levels).tolist(),
-            "replicated": np.quantile(self.replicated, levels).tolist(),
-            "wasserstein": self.wasserstein,
-            "tail_area": float(self.tail_areas.mean()),
-            "outside": self.outside,
-            "expected_outside": self.expected_outside,
-            "tail_areas": self.tail_areas.tolist(),
-        }
-
 
 _SEAM = 2  # observed frames that are joined to a forecast, so that a jump counts
 PROGRAMS = {
@@ -193,7 +180,7 @@ class PredictiveChecks(Result):
     """Statistics of replicated windows beside those of the real ones.
 
     Attributes:
-        checks: (model, program, statistic) to `Check`; programs are "forecast" and, of a model with latents,
+        models: by model, program and statistic, `Check`; programs are "forecast" and, of a model with latents,
             "posterior".
         data: fingerprint, windows, frames, coordinates, and what the windows say of themselves.
         protocol: the fields of the windows' protocol.
@@ -203,13 +190,23 @@ class PredictiveChecks(Result):
         notes: lines below the table on how statistics are to be read.
     """
 
-    checks: dict[tuple[str, str, str], Check]
+    models: Annotated[dict[str, dict[str, dict[str, Check]]], MODELS]
     data: dict[str, Any]
     protocol: dict[str, Any]
     samples: int
     emission: str
     seed: int
     notes: list[str] = field(default_factory=list)
+
+    @cached_property
+    def checks(self) -> dict[tuple[str, str, str], Check]:
+        """By (model, program, statistic)."""
+        return {
+            (model, program, name): check
+            for model, programs in self.models.items()
+            for program, checks in programs.items()
+            for name, check in checks.items()
+        }
 
     def __getitem__(self, key: tuple[str, str, str]) -> Check:
         if key not in self.checks:
@@ -279,17 +276,26 @@ class PredictiveChecks(Result):
         figure.suptitle(self._title, fontsize=9, parse_math=False)
         return figure
 
-    def document(self) -> dict[str, Any]:
-        """Summaries of every check and what they rest on, in JSON's types."""
-        nested: dict[str, Any] = {}
+    @override
+    def summary(self) -> dict[str, Any]:
+        """By model, program and statistic."""
+        found: dict[str, Any] = {}
         for (model, program, name), check in self.checks.items():
-            nested.setdefault(model, {}).setdefault(program, {})[name] = check.document()
-        rest = {name: value for name, value in vars(self).items() if name != "checks"}
-        return {**rest, "programs": {program: PROGRAMS[program] for program in self._keys[1]}, "checks": nested}
+            found.setdefault(model, {}).setdefault(program, {})[name] = {
+                "wasserstein": check.wasserstein,
+                "tail_area": float(check.tail_areas.mean()),
+                "outside": check.outside,
+                "expected_outside": check.expected_outside,
+            }
+        return found
 
-    def to_json(self) -> str:
-        """`document` as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
+    @override
+    def check(self) -> None:
+        if not self.checks or {*self._keys[1]} - {*PROGRAMS}:
+            raise ValueError(f"expected checks by the programs {', '.join(PROGRAMS)}")
+        for each in self.checks.values():
+            if each.replicated.shape != (self.samples, len(each.real)) or not each.real.size:
+                raise ValueError(f"expected {self.samples} replicates of every window")
 
     @property
     def _keys(self) -> tuple[dict[str, list[str]], list[str], list[str]]:
@@ -361,7 +367,7 @@ def predictive_checks(
     truth = gapped(held.batch)
     _, frame = called(windows.description)
     firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
-    checks = {}
+    checks: dict[str, dict[str, dict[str, Check]]] = {label: {} for label in models}
     with progress_bar(progress) as bar:
         for program, first in firsts.items():
             real = _measure(statistics, truth[:, first:], "real windows")
@@ -383,9 +389,11 @@ def predictive_checks(
                     values, replicated = real[name], torch.cat([part[name] for part in parts], 1)
                     kept = told[name]
                     unit = statistic.unit.replace("frame", frame)
-                    checks[label, program, name] = Check(values[kept].numpy(), replicated[:, kept].numpy(), unit)
+                    checks[label].setdefault(program, {})[name] = Check(
+                        values[kept].numpy(), replicated[:, kept].numpy(), unit
+                    )
     return PredictiveChecks(
-        checks={(m, p, s): checks[m, p, s] for m in models for p in firsts for s in statistics if (m, p, s) in checks},
+        models=checks,
         data=held.description(),
         protocol=plain(asdict(windows.protocol)),
         samples=samples,

@@ -15,10 +15,9 @@ of draws from the posterior. Sums over sequences have that of sums, and tell mor
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -27,7 +26,8 @@ from typing_extensions import override
 
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
-from ..evaluation.held import plain, reproducibly
+from ..evaluation.held import reproducibly
+from ..evaluation.record import Dims
 from ..evaluation.result import Result, Table, canvas, progress_bar
 from .latents import Inferred, some_of
 
@@ -55,11 +55,11 @@ class SteinDiscrepancy(Result):
         equations: of model and guide; no guide's where it was a program of one's own.
     """
 
-    squared: np.ndarray
-    critical: np.ndarray
-    p_values: np.ndarray
+    squared: Annotated[np.ndarray, Dims("sequence")]
+    critical: Annotated[np.ndarray, Dims("sequence")]
+    p_values: Annotated[np.ndarray, Dims("sequence")]
     p_value: float
-    numbers: np.ndarray
+    numbers: Annotated[np.ndarray, Dims("sequence", kind=int)]
     sequences: tuple[int, ...]
     draws: int
     bootstrap: int
@@ -97,37 +97,18 @@ class SteinDiscrepancy(Result):
         figure.suptitle(self.equations.get("inference", "a guide of one’s own"), fontsize=9, parse_math=False)
         return figure
 
-    def document(self) -> dict[str, Any]:
-        """Everything, in JSON's types."""
-        return {**plain(asdict(self)), "verdict": self.verdict}
-
-    def to_json(self) -> str:
-        """`document` as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
-
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        """What `to_json` wrote.
+    def summary(self) -> dict[str, Any]:
+        return {"verdict": self.verdict}
 
-        Raises:
-            ValueError: text that is not such a document.
-        """
-        try:
-            said = json.loads(text)
-            said.pop("verdict")
-            sequences = tuple(map(int, said.pop("sequences")))
-            kinds = {"squared": float, "critical": float, "p_values": float, "numbers": int}
-            arrays: dict[str, Any] = {name: np.array(said.pop(name), dtype=kind) for name, kind in kinds.items()}
-            if not sequences or any(each.shape != (len(sequences),) for each in arrays.values()):
-                raise ValueError(f"expected a number for each of {len(sequences)} sequences")
-            numbers = {"p_value": float, "draws": int, "bootstrap": int, "seed": int, "equations": dict}
-            told: dict[str, Any] = {name: kind(said.pop(name)) for name, kind in numbers.items()}
-            return cls(**arrays, sequences=sequences, **told, **said)
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"this is not a Stein discrepancy written by SteinDiscrepancy.to_json: {error!r}"
-            ) from error
+    @override
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"sequence": [*map(str, self.sequences)]}
+
+    @override
+    def check(self) -> None:
+        if self.extents != {"sequence": {len(self.sequences)}} or not self.sequences:
+            raise ValueError(f"expected a number for each of {len(self.sequences)} sequences")
 
 
 @torch.inference_mode(False)

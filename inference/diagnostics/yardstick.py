@@ -11,12 +11,11 @@ the prior, so that R-hat tells a mode that the guide does not know.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -28,7 +27,8 @@ from typing_extensions import override
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
 from ...program.oracle import Oracle
-from ..evaluation.held import plain, reproducibly
+from ..evaluation.held import reproducibly
+from ..evaluation.record import Dims
 from ..evaluation.result import Result, Table, canvas, progress_bar
 from .latents import Inferred, Shapes, quantities, some_of
 
@@ -52,11 +52,11 @@ class LatentMoments:
         mean_error, deviation_error: (S, Q) Monte Carlo standard errors; 0 of what is exact.
     """
 
-    mean: np.ndarray
-    deviation: np.ndarray
-    correlation: np.ndarray
-    mean_error: np.ndarray
-    deviation_error: np.ndarray
+    mean: Annotated[np.ndarray, Dims("sequence", "quantity")]
+    deviation: Annotated[np.ndarray, Dims("sequence", "quantity")]
+    correlation: Annotated[np.ndarray, Dims("sequence", "quantity", "other quantity")]
+    mean_error: Annotated[np.ndarray, Dims("sequence", "quantity")]
+    deviation_error: Annotated[np.ndarray, Dims("sequence", "quantity")]
 
     @property
     def correlation_error(self) -> np.ndarray:
@@ -77,10 +77,10 @@ class Sampling:
         chains, draws, warmup: of each sequence; of each chain.
     """
 
-    rhat: np.ndarray
-    effective: np.ndarray
-    divergences: np.ndarray
-    evaluations: np.ndarray
+    rhat: Annotated[np.ndarray, Dims("sequence", "quantity")]
+    effective: Annotated[np.ndarray, Dims("sequence", "quantity")]
+    divergences: Annotated[np.ndarray, Dims("sequence", kind=int)]
+    evaluations: Annotated[np.ndarray, Dims("sequence", kind=int)]
     chains: int
     draws: int
     warmup: int
@@ -304,45 +304,22 @@ class ReferencePosterior(Result):
         figure.suptitle(f"{title}\n{self.verdict}", fontsize=9, parse_math=False)
         return figure
 
-    def document(self) -> dict[str, Any]:
-        """Everything, in JSON's types."""
-        said: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        for name in ("guide", "reference"):
-            said[name] = asdict(said[name])
-        said["sampling"] = None if self.sampling is None else asdict(self.sampling)
-        return {**plain(said), "verdict": self.verdict}
-
-    def to_json(self) -> str:
-        """`document` as text."""
-        return json.dumps(self.document(), allow_nan=False)
-
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        """What `to_json` wrote.
+    def summary(self) -> dict[str, Any]:
+        return {"verdict": self.verdict}
 
-        Raises:
-            ValueError: text that is not such a document.
-        """
-        try:
-            said = json.loads(text)
-            said.pop("verdict")
-            shapes = {name: (int(steps), int(size)) for name, (steps, size) in said.pop("shapes").items()}
-            names, sequences = tuple(map(str, said.pop("names"))), tuple(map(int, said.pop("sequences")))
-            count = sum(max(steps, 1) * size for steps, size in shapes.values())
-            if count != len(names) or min(count, len(sequences)) < 1 or any(min(each) < 0 for each in shapes.values()):
-                raise ValueError(f"{len(names)} names of {count} numbers of {len(sequences)} sequences")
-            read = partial(_read, shape=(len(sequences), count))
-            moments = {name: read(LatentMoments, said.pop(name)) for name in ("guide", "reference")}
-            sampling = said.pop("sampling")
-            sampling = None if sampling is None else read(Sampling, sampling)
-            kinds = {"guide_draws": int, "seed": int, "equations": dict}
-            told = {name: kind(said.pop(name)) for name, kind in kinds.items()}
-            return cls(**moments, shapes=shapes, names=names, sequences=sequences, sampling=sampling, **told, **said)
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"this is not a reference posterior written by ReferencePosterior.to_json: {error!r}"
-            ) from error
+    @override
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"sequence": [*map(str, self.sequences)], "quantity": self.names}
+
+    @override
+    def check(self) -> None:
+        count = sum(max(steps, 1) * size for steps, size in self.shapes.values())
+        if count != len(self.names) or min(count, len(self.sequences)) < 1 or min(map(min, self.shapes.values())) < 0:
+            raise ValueError(f"{len(self.names)} names of {count} numbers of {len(self.sequences)} sequences")
+        expected = {"sequence": {len(self.sequences)}, "quantity": {count}, "other quantity": {count}}
+        if self.extents != expected:
+            raise ValueError(f"expected arrays of {expected}, not of {self.extents}")
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -363,24 +340,6 @@ class ReferencePosterior(Result):
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
-
-
-def _read(kind: Any, said: Mapping[str, Any], shape: tuple[int, int]) -> Any:
-    """Arrays of some shapes, or whole numbers.
-
-    Raises:
-        ValueError: others.
-    """
-    shapes = {"correlation": (*shape, shape[1]), "divergences": shape[:1], "evaluations": shape[:1]}
-    found: dict[str, Any] = {}
-    for field in fields(kind):
-        if field.type == "int":
-            found[field.name] = int(said[field.name])
-            continue
-        found[field.name] = np.array(said[field.name], dtype=int if len(shapes.get(field.name, shape)) == 1 else float)
-        if found[field.name].shape != shapes.get(field.name, shape):
-            raise ValueError(f"{field.name} has shape {found[field.name].shape}")
-    return kind(**found)
 
 
 @torch.inference_mode(False)

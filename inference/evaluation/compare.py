@@ -24,7 +24,8 @@ from ..bounds.particles import obstacle
 from ..bounds.teacher_forced import bounds, filtered, information, length_of, variances
 from .comparison import Comparison, Contender
 from .evaluate import evaluate
-from .held import on_device_of, plain, reproducibly
+from .held import on_device_of, reproducibly
+from .record import plain
 from .result import progress_bar
 from .scores import Measure, Scores, proper
 

@@ -6,9 +6,9 @@ import dataclasses
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from rich.console import Group
@@ -20,7 +20,8 @@ from ..bounds.elbo import KHAT_PARTICLES
 from ..training.many import ConfidenceSet, Pairs, Requirement, confidence_set, pairs, required
 from .estimates import Crossed, Estimate, number
 from .evaluation import ARROWS
-from .held import clip_places, plain
+from .held import clip_places
+from .record import MODELS, Dims
 from .result import Result, Table, as_they_are, canvas
 
 if TYPE_CHECKING:
@@ -58,12 +59,12 @@ class Contender:
 
     equations: dict[str, str]
     config: dict[str, Any]
-    bounds: dict[str, np.ndarray]
-    kl_steps: dict[str, np.ndarray]
-    variances: dict[str, np.ndarray]
-    information: dict[str, np.ndarray]
-    estimates: np.ndarray
-    free_running: dict[str, np.ndarray]
+    bounds: Annotated[dict[str, np.ndarray], Dims("seed", "sequence", name="{}")]
+    kl_steps: Annotated[dict[str, np.ndarray], Dims("seed", "step", name="KL {} by step")]
+    variances: Annotated[dict[str, np.ndarray], Dims("seed", "column", name="variance of mean {}")]
+    information: Annotated[dict[str, np.ndarray], Dims("seed", "step", name="information of {}")]
+    estimates: Annotated[np.ndarray, Dims("estimate", "sequence", name="estimates")]
+    free_running: Annotated[dict[str, np.ndarray], Dims("seed", "clip", name="{}")]
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -121,9 +122,9 @@ class Comparison(Result):
         (..., [...])
     """
 
-    rows: dict[str, Contender]
+    rows: Annotated[dict[str, Contender], MODELS]
     keys: list[tuple[str, str, int]]
-    frames: np.ndarray
+    frames: Annotated[np.ndarray, Dims("sequence")]
     data: dict[str, Any]
     protocol: dict[str, Any]
     particles: int
@@ -335,15 +336,12 @@ class Comparison(Result):
             )
         return trees
 
-    def to_json(self) -> str:
-        """Everything, with the estimates, ranking and differences written out.
-
-        What is not finite becomes null; null as k-hat is infinity, and not estimated with fewer than 25 particles.
-        """
+    @override
+    def summary(self) -> dict[str, Any]:
+        """The ranking, and of every model its estimates, its difference to the best and its active units."""
         ranking = self.ranking
-        rows = {
+        models = {
             name: {
-                **vars(row),
                 "scores": {metric: _scored(estimate) for metric, estimate in self[name].items()},
                 "difference_to_best": _scored(self.difference(name, ranking[0])),
                 "khat_above_0.7": row.unreliable,
@@ -351,21 +349,22 @@ class Comparison(Result):
             }
             for name, row in self.rows.items()
         }
-        return json.dumps({"ranking": ranking, **plain({**vars(self), "rows": rows})}, allow_nan=False)
+        return {"ranking": ranking, "models": models}
 
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        try:
-            document = json.loads(text)
-            del document["ranking"]
-            rows = {name: _contender(row, document["particles"]) for name, row in document.pop("rows").items()}
-            keys = [(split, clip, start) for split, clip, start in document.pop("keys")]
-            if not isinstance(document.get("filter_particles", 0), int):
-                raise ValueError("filter_particles is no whole number")
-            return cls(rows=rows, keys=keys, frames=np.array(document.pop("frames"), dtype=float), **document)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"this is not a comparison written by Comparison.to_json: {error!r}") from error
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"sequence": [f"{clip} {start}" for clip, (_, _, start) in zip(self._clips, self.keys, strict=True)]}
+
+    @override
+    def check(self) -> None:
+        if self.extents["sequence"] != {len(self.keys)}:
+            raise ValueError(f"expected numbers of {len(self.keys)} sequences")
+        for name, row in self.rows.items():
+            if not {"ELBO", "importance bound", "k-hat"} <= row.bounds.keys():
+                raise ValueError(f"{name} has no bounds")
+            parts = (row.bounds, row.kl_steps, row.variances, row.information, row.free_running)
+            if {row.seeds} != {len(each) for part in parts for each in part.values()}:
+                raise ValueError(f"{name} has scores of different numbers of seeds")
 
     # Estimates
 
@@ -502,20 +501,3 @@ def _interval(estimate: Estimate) -> str:
 
 def _scored(estimate: Estimate) -> dict[str, Any]:
     return {**dataclasses.asdict(estimate), "interval": estimate.interval(), "p_value": estimate.p_value()}
-
-
-def _contender(document: dict[str, Any], particles: int) -> Contender:
-    def arrays(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: arrays(item) for key, item in value.items()}
-        return np.array(value, dtype=float)
-
-    said = {"equations", "config", "notes"}
-    document = {"notes": [], **document}  # of which older files have none
-    if not isinstance(document["notes"], list) or not all(isinstance(note, str) for note in document["notes"]):
-        raise ValueError("notes are no list of texts")
-    names = [field.name for field in dataclasses.fields(Contender)]
-    row = Contender(**{name: document[name] if name in said else arrays(document[name]) for name in names})
-    if particles >= KHAT_PARTICLES and "k-hat" in row.bounds:
-        row.bounds["k-hat"][np.isnan(row.bounds["k-hat"])] = math.inf
-    return row

@@ -18,13 +18,12 @@ drawn from a new clip is held with probability `level` at least. Of clips of one
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -35,7 +34,8 @@ from ...data.sequences import HeldOutWindows, called, clusters, columns_of, mean
 from ...options import nearest
 from .evaluate import evaluate, forecaster_of, forecasts_of
 from .evaluation import Evaluation
-from .held import Held, clip_places, hold, plain, reproducibly
+from .held import Held, clip_places, hold, reproducibly
+from .record import Dims
 from .references import References
 from .result import Result, Table, canvas, progress_bar
 from .scores import Measure, clip_means
@@ -72,8 +72,8 @@ class Tubes(Result):
     """
 
     level: float
-    factors: Mapping[str, np.ndarray]
-    spread: np.ndarray | None
+    factors: Annotated[Mapping[str, np.ndarray], Dims("step", "column", name="factor of a {}")]
+    spread: Annotated[np.ndarray, Dims("step", "column")] | None
     samples: int
     seed: int
     options: Mapping[str, Any]
@@ -208,27 +208,15 @@ class Tubes(Result):
         axes.legend(fontsize=8)
         return figure
 
-    def to_json(self) -> str:
-        """Everything."""
-        return json.dumps(plain({**vars(self), "factors": dict(self.factors)}), indent=1, allow_nan=False)
-
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        try:
-            document = json.loads(text)
-            factors = {region: np.array(document["factors"][region], dtype=float) for region in REGIONS}
-            spread = None if document["spread"] is None else np.array(document["spread"], dtype=float)
-            shape = factors["number"].shape
-            told = [*factors.values(), *([] if spread is None else [spread])]
-            if len(shape) != 2 or [each.shape for each in told] != [shape, (shape[0], 1), (1, 1), shape][: len(told)]:
-                raise ValueError("expected factors (H, D), (H, 1) and (1, 1), and a spread (H, D)")
-            if not all(np.isfinite(each).all() and (each >= 0).all() for each in told):
-                raise ValueError("factors and spreads are numbers from 0 on")
-            document |= {"factors": factors, "spread": spread, "level": _checked(document["level"])}
-            return cls(**document)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"these are not tubes written by Tubes.to_json: {error!r}") from error
+    def check(self) -> None:
+        _checked(self.level)
+        shape = self.factors["number"].shape
+        given = [self.factors[region] for region in REGIONS] + ([] if self.spread is None else [self.spread])
+        if [each.shape for each in given] != [shape, (shape[0], 1), (1, 1), shape][: len(given)]:
+            raise ValueError("expected factors (H, D), (H, 1) and (1, 1), and a spread (H, D)")
+        if not all(np.isfinite(each).all() and (each >= 0).all() for each in given):
+            raise ValueError("factors and spreads are numbers from 0 on")
 
     def _spread(self, forecasts: Tensor) -> Tensor:
         """Of forecasts (B, K, H, D): (B, H, D), or the one (H, D) of all."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from reprlib import repr as brief
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -28,7 +29,8 @@ from ...program.protocols import Emitting, Forecasting
 from ..bounds.elbo import SequenceELBO, importance_bound
 from ..bounds.predictive import predictive_bound
 from .evaluation import Evaluation, Row
-from .held import Held, hold, on_device_of, plain, refuse_non_finite, reproducibly
+from .held import Held, hold, on_device_of, refuse_non_finite, reproducibly
+from .record import plain
 from .references import Forecaster, References
 from .result import progress_bar
 from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clip_means, proper
@@ -222,7 +224,7 @@ class _Judge:
     @torch.no_grad()
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
-    ) -> tuple[dict[str, tuple[float, ...]], dict[str, tuple[tuple[float, ...], ...]]]:
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Scores and histograms of free-running forecasts, those that so many samples have."""
         measures = [measure for measure in self.measures if measure.least <= samples]
         held, found = self.held, []
@@ -232,11 +234,11 @@ class _Judge:
             scored = forecasts, held.futures[part], held.past(part), index[part]
             found.append({measure.name: measure.function(*scored) for measure in measures})
         values = _concatenate(found)
-        pooled = {measure.name: measure.pool(values[measure.name], held.places) for measure in measures}
-        scores = {measure.name: tuple(pooled[measure.name]) for measure in measures if not measure.bins}
-        return scores, {m.name: tuple(map(tuple, pooled[m.name])) for m in measures if m.bins}
+        pooled = {measure.name: np.array(measure.pool(values[measure.name], held.places)) for measure in measures}
+        scores, histograms = ({m.name: pooled[m.name] for m in measures if bool(m.bins) == of} for of in (False, True))
+        return scores, histograms
 
-    def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, tuple[float, ...]]:
+    def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
         """Bounds and KL terms in nats per frame."""
         found = []
         for part in parts:
@@ -251,7 +253,7 @@ class _Judge:
             found.append({metric: values.cpu() for metric, values in scores.items()})
         return self._means(_concatenate(found))
 
-    def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, tuple[float, ...]]:
+    def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
         """The log score in nats per predicted frame, where it is asked for."""
         if not self.log_score_particles:
             return {}
@@ -275,8 +277,8 @@ class _Judge:
         }
         return {name: metric for name, metric in order.items() if name in found}
 
-    def _means(self, scores: dict[str, Tensor]) -> dict[str, tuple[float, ...]]:
-        return {name: tuple(clip_means(values, self.held.places)) for name, values in scores.items()}
+    def _means(self, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        return {name: np.array(clip_means(values, self.held.places)) for name, values in scores.items()}
 
 
 def _references(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from rich.text import Text
@@ -17,7 +15,7 @@ from typing_extensions import override
 from ...data.sequences import called
 from ...options import nearest
 from ..diagnostics.calibration import envelope
-from .held import plain
+from .record import MODELS, Dims
 from .result import Result, Table, canvas
 from .scores import Metric
 from .uncertainty import clustered_variance, decimals, effective_number, linearised, student_interval
@@ -57,7 +55,7 @@ class Score:
         return f"{self.mean:.{places}f}{error}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Row:
     """One method: its number of samples, what it is, and each score's value for each clip (see `Measure.pool`).
 
@@ -65,13 +63,15 @@ class Row:
     """
 
     samples: int
-    clip_means: dict[str, tuple[float, ...]]
+    clip_means: Annotated[dict[str, np.ndarray], Dims("clip", name="{}")]
     equations: dict[str, str] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
-    histograms: dict[str, tuple[tuple[float, ...], ...]] = field(default_factory=dict)
+    histograms: Annotated[dict[str, np.ndarray], Dims("clip", "bin", name="histogram of {}")] = field(
+        default_factory=dict
+    )
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(Result):
     """Scores of several methods on the same windows, with all that is needed to say what was measured.
 
@@ -101,7 +101,7 @@ class Evaluation(Result):
         (['last value', 'model'], True)
     """
 
-    rows: dict[str, Row]
+    rows: Annotated[dict[str, Row], MODELS]
     metrics: dict[str, Metric]
     clips: dict[str, int]
     data: dict[str, Any]
@@ -116,7 +116,7 @@ class Evaluation(Result):
     options: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, method: str) -> dict[str, Score]:
-        return {name: self._score(name, np.array(means)) for name, means in self._row(method).clip_means.items()}
+        return {name: self._score(name, means) for name, means in self._row(method).clip_means.items()}
 
     def difference(self, first: str, second: str, metric: str) -> Score:
         """Paired difference of two methods in a metric, first minus second, with its standard error.
@@ -148,7 +148,7 @@ class Evaluation(Result):
             if metric not in row.clip_means:
                 meant = nearest(metric, row.clip_means)
                 raise KeyError(f"{method!r} has no score {metric!r}{meant}; it has {', '.join(row.clip_means)}")
-            means.append(np.array(row.clip_means[metric]))
+            means.append(row.clip_means[metric])
         return means
 
     def table(self) -> Table:
@@ -209,7 +209,7 @@ class Evaluation(Result):
         Raises:
             KeyError: a method or a histogram that there is not.
         """
-        shares = np.array(self._histogram(method, histogram)).cumsum(1)[:, :-1].T
+        shares = self._histogram(method, histogram).cumsum(1)[:, :-1].T
         points = np.arange(1, len(shares) + 1) / (len(shares) + 1)
         below, deviations = linearised(shares, np.array(list(self.clips.values())))
         if len(self.clips) == 1:
@@ -298,7 +298,7 @@ class Evaluation(Result):
 
     def _draw(self, panel: Axes, method: str, histogram: str) -> None:
         """A histogram over uniform, with two standard errors of each bin."""
-        clip_shares = np.array(self.rows[method].histograms[histogram]).T
+        clip_shares = self.rows[method].histograms[histogram].T
         bins = len(clip_shares)
         shares, deviations = linearised(clip_shares, np.array(list(self.clips.values())))
         errors = np.array([math.sqrt(clustered_variance(each)) for each in deviations])
@@ -308,24 +308,23 @@ class Evaluation(Result):
         panel.stairs(bins * shares, edges, color="C0")
         panel.axhline(1, color="0.4", linewidth=0.8)
 
-    def to_json(self) -> str:
-        """Everything, with means and standard errors written out; numbers that are not finite become null."""
-        metrics = {name: dataclasses.asdict(metric) for name, metric in self.metrics.items()}
-        rows = {method: self._document(method) for method in self.rows}
-        return json.dumps({**vars(self), "rows": rows, "metrics": metrics}, indent=1, allow_nan=False)
-
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        try:
-            document = json.loads(text)
-            metrics = {name: Metric(**metric) for name, metric in document.pop("metrics").items()}
-            rows = {method: _row(row) for method, row in document.pop("rows").items()}
-            return cls(rows=rows, metrics=metrics, **document)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"this is not an evaluation written by Evaluation.to_json: {error!r}") from error
+    def summary(self) -> dict[str, Any]:
+        """Means and standard errors by method and score."""
+        return {method: {name: vars(score) for name, score in self[method].items()} for method in self.rows}
 
-    def _histogram(self, method: str, name: str) -> tuple[tuple[float, ...], ...]:
+    @override
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"clip": [*self.clips]}
+
+    @override
+    def check(self) -> None:
+        if self.extents.get("clip", {len(self.clips)}) != {len(self.clips)}:
+            raise ValueError(f"expected numbers of {len(self.clips)} clips")
+        if unknown := {name for row in self.rows.values() for name in row.clip_means} - self.metrics.keys():
+            raise ValueError(f"nothing says how {', '.join(sorted(unknown))} are to be read")
+
+    def _histogram(self, method: str, name: str) -> np.ndarray:
         found = self._row(method).histograms
         if name not in found:
             has = ", ".join(found) or "none"
@@ -344,19 +343,6 @@ class Evaluation(Result):
         mean, deviations = linearised(clip_means[known], np.array(list(self.clips.values()))[known])
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
-    def _document(self, method: str) -> dict[str, Any]:
-        row = dataclasses.asdict(self.rows[method])
-        clip_means, histograms = row.pop("clip_means"), row.pop("histograms")
-        row["scores"] = {
-            name: {
-                **dataclasses.asdict(self.metrics[name]),
-                **dataclasses.asdict(score),
-                "clip_means": clip_means[name],
-            }
-            for name, score in self[method].items()
-        }
-        return plain(row | ({"histograms": histograms} if histograms else {}))
-
     def _caption(self) -> str:
         freedom = f"{len(self.clips) - 1} degrees of freedom"
         clip, _ = called(self.data)
@@ -369,12 +355,3 @@ class Evaluation(Result):
         parts += [f"{name} {value}" for name, value in self.options.items()]
         parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
         return " · ".join(part for part in parts if part)
-
-
-def _row(document: dict[str, Any]) -> Row:
-    scores = document.pop("scores")
-    means = {
-        name: tuple(math.nan if mean is None else mean for mean in score["clip_means"])
-        for name, score in scores.items()
-    }
-    return Row(clip_means=means, **document)

@@ -1,13 +1,11 @@
 """Models on held-out windows: windows prepared once for all models, and each model run under the same conditions."""
 
-import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -157,14 +155,3 @@ def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple
             f"the {what} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
             "it cannot be left out, since all methods are scored on the same ones"
         )
-
-
-def plain(value: Any) -> Any:
-    """The value as JSON holds it: tuples and arrays become lists, and numbers that are not finite None."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

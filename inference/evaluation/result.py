@@ -1,13 +1,16 @@
 """What every result is: a table on a terminal, in print and in a notebook, and a file. And the bar while one waits."""
 
 import io
+import json
 import os
-from collections.abc import Iterable
+import reprlib
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+import numpy as np
 import rich.table
 from rich.console import Console, RenderableType
 from rich.progress import Progress, TextColumn
@@ -16,9 +19,11 @@ from typing_extensions import override
 
 from ... import files
 from ...turns import SHAPES
+from .record import MODELS, Flat, Variable, flatten, plain, unflatten
 
 if TYPE_CHECKING:
     import matplotlib.text
+    import xarray as xr
     from matplotlib.figure import Figure
 
 LARGEST = 2**28
@@ -121,29 +126,106 @@ class Shown:
 
 
 class Result(Shown):
-    """A result with a `table` and a `to_json`; it shows itself as the one and is kept as the other."""
+    """Numbers with named dimensions, and how they were measured.
+
+    Subclasses are dataclasses; `record.Dims` says which fields are arrays. `dataset`, JSON and netCDF follow from that.
+    """
+
+    def summary(self) -> dict[str, Any]:
+        """What the table says, in JSON's types, for those who read the file by other means."""
+        return {}
+
+    def labels(self) -> dict[str, Sequence[str]]:
+        """Coordinates of dimensions, by name."""
+        return {}
+
+    def check(self) -> None:
+        """Refuse fields that contradict each other, as in a file that was altered.
+
+        Raises:
+            ValueError: saying what is wrong.
+        """
+
+    @property
+    def extents(self) -> Mapping[str, set[int]]:
+        """Sizes of the arrays by dimension; more than one where arrays differ in it."""
+        return flatten(self).sizes
+
+    @property
+    def dataset(self) -> "xr.Dataset":
+        """All arrays by name, with the dimensions "model", "seed", "sequence", "step", "column" and others.
+
+        Models that have fewer seeds, steps or columns are padded with NaN. Everything else is in `attrs`.
+        """
+        import xarray as xr
+
+        found = flatten(self)
+        stacked = {MODELS: found.models} if found.models else {}
+        return xr.Dataset(
+            {name: (each.dims, each.data) for name, each in found.variables.items()},
+            {name: (name, np.array(values, dtype=str)) for name, values in {**stacked, **self.labels()}.items()},
+            found.attributes,
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Everything, in JSON's types: a summary, variables with their dimensions, and all attributes."""
+        found = flatten(self)
+        return {
+            "kind": type(self).__name__,
+            "summary": plain(self.summary()),
+            "models": found.models,
+            "variables": {
+                name: {"dims": each.dims, "path": each.path, "data": plain(each.data)}
+                for name, each in found.variables.items()
+            },
+            "attributes": found.attributes,
+        }
+
+    @classmethod
+    def of(cls, document: Any) -> Self:
+        """The result of which `document` is.
+
+        Raises:
+            ValueError: something else.
+        """
+        try:
+            if document["kind"] != cls.__name__:
+                raise ValueError(f"it is of the kind {reprlib.repr(document['kind'])}")
+            variables = {
+                str(name): Variable(tuple(each["dims"]), np.array(each["data"], float), tuple(each["path"]))
+                for name, each in document["variables"].items()
+            }
+            found: Self = unflatten(cls, Flat(variables, document["models"], document["attributes"]))
+            found.check()
+        except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
+            raise ValueError(f"this was not written by {cls.__name__}.to_json: {error!r}") from error
+        return found
 
     def to_json(self) -> str:
-        """Everything, as text."""
-        raise NotImplementedError
+        """`document` as text."""
+        return json.dumps(self.document(), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """The result that `to_json` wrote.
+
+        Raises:
+            ValueError: text that is not such a document.
+        """
+        try:
+            document = json.loads(text)
+        except (RecursionError, ValueError) as error:
+            raise ValueError(f"this was not written by {cls.__name__}.to_json: {error!r}") from error
+        return cls.of(document)
 
     def save(self, path: str | Path) -> None:
-        """Write `to_json()` to a file, which takes the place of an older one once it is whole.
+        """Write `to_json()` to a file, which replaces an older one once it is whole.
 
         Raises:
             OSError, ValueError: it cannot be written.
         """
         with files.written(path) as file:
             file.write((self.to_json() + "\n").encode())
-
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """The result that `to_json` wrote, of a kind that can be read again.
-
-        Raises:
-            ValueError: text that is not such a document.
-        """
-        raise NotImplementedError
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -153,6 +235,17 @@ class Result(Shown):
             OSError, ValueError: there is no such file, or it is no plain one, or no result of this kind.
         """
         return cls.from_json(files.read(path, LARGEST, links=True).decode())
+
+    def to_netcdf(self, path: str | Path) -> None:
+        """Write `dataset` for other tools, with its attributes as JSON.
+
+        Raises:
+            OSError, ValueError: it cannot be written.
+        """
+        found = self.dataset
+        found.attrs = {name: json.dumps(value) for name, value in found.attrs.items()}
+        with files.written(path) as file:
+            file.write(found.to_netcdf())
 
 
 def progress_bar(shown: bool) -> Progress:

@@ -323,7 +323,7 @@ def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, track
     assert "no calibration" in capsys.readouterr().err
     document = json.loads(out.read_text())
     assert list(document) == ["predictive"]
-    assert document["predictive"]["emission"] == "mean"
+    assert document["predictive"]["attributes"]["emission"] == "mean"
 
 
 def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
@@ -587,11 +587,11 @@ def test_a_guide_is_put_beside_its_posterior(capsys, run, tmp_path):
     few = ["--windows", "2", "--frames", "2", "--draws", "4", "--chains", "2", "--warmup", "1", "--stein-draws", "9"]
     assert main(["check", "posterior", str(run), *few, "--figure", str(tmp_path / "a.png")]) == 0
     document = json.loads((run / "posterior.json").read_text())
-    reference = ReferencePosterior.from_json(json.dumps(document["posterior"]))
+    reference = ReferencePosterior.of(document["posterior"])
     assert reference.shapes == {"z": (2, 3)}
     assert reference.sequences == (0, 1)
     assert len(document["windows"]) == 2
-    assert SteinDiscrepancy.from_json(json.dumps(document["stein"])).numbers.tolist() == [6, 6]
+    assert SteinDiscrepancy.of(document["stein"]).numbers.tolist() == [6, 6]
     assert "did not converge" in capsys.readouterr().out
     assert {path.name for path in tmp_path.glob("*.png")} == {"a-stein.png", "a-posterior.png"}
 

@@ -173,7 +173,7 @@ def test_records_beside_a_run_are_shown(scored):
     assert "lowest" in facts or "best bound" in facts
     for row in evaluation.rows:
         assert str(evaluation[row]["ADE"]) in scores
-    assert json.loads((scored / "calibration.json").read_text())["calibration"]["verdict"] in criticism
+    assert json.loads((scored / "calibration.json").read_text())["calibration"]["summary"]["verdict"] in criticism
     assert "bone stretch (%)" in criticism
     assert "changed" not in scores
 
@@ -184,7 +184,7 @@ def test_what_the_bench_left_beside_a_run_is_shown(scored, tmp_path):
     bracket, beside, tubes = (Tags(document("a", [make(run)])) for make in made)
     assert "AIS, L = 2, K = 2" in bracket.text
     assert "amortisation" in bracket.text
-    assert json.loads((scored / "posterior.json").read_text())["stein"]["verdict"] in beside.text
+    assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in beside.text
     assert "beside the posterior of 1 sequences" in beside.text
     assert "held 40 %" in tubes.text
     pair = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})")
@@ -242,7 +242,7 @@ def test_a_run_without_its_data_or_its_log_is_shown_as_far_as_it_goes(run, tmp_p
     (run / "calibration.json").symlink_to(run / "config.json")
     report(run, "--out", tmp_path / "a.html")
     text = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
-    for said in ("say where they are with --data", "no log.jsonl", "not an evaluation", "is a link"):
+    for said in ("say where they are with --data", "no log.jsonl", "not written by Evaluation", "is a link"):
         assert said in text
 
 
@@ -254,10 +254,12 @@ def test_text_of_a_hostile_run_is_text(scored, tmp_path, tab):
         text = text.replace(json.dumps(name), json.dumps(f"{name}{EVIL}"))
     (run / "evaluation.json").write_text(text)
     criticism = json.loads((run / "calibration.json").read_text())
-    criticism["calibration"]["quantities"][EVIL] = criticism["calibration"]["quantities"].pop("log joint")
-    criticism["calibration"]["equations"] = {"inference": EVIL}
-    criticism["predictive"]["programs"][EVIL] = EVIL
-    criticism["predictive"]["checks"] = {EVIL: criticism["predictive"]["checks"]["vae"]}
+    ranks, checks = criticism["calibration"]["attributes"], criticism["predictive"]
+    ranks["names"][-1] = EVIL
+    ranks["equations"] = {"inference": EVIL}
+    checks["attributes"]["models"] = {EVIL: checks["attributes"]["models"]["vae"]}
+    checks["attributes"]["notes"] = [EVIL]
+    checks["models"] = [EVIL]
     (run / "calibration.json").write_text(json.dumps(criticism))
     rows = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     (run / "log.jsonl").write_text("".join(json.dumps({**row, f"kl/{EVIL}": 1.0}) + "\n" for row in rows))

@@ -172,7 +172,7 @@ def test_five_commands_on_a_file_that_nobody_prepared(table, capsys, tmp_path):
     assert "CRPS, riders" in printed
     assert "(nats/step)" in printed
     assert not OF_MOTION.findall(printed)
-    assert "rows" in json.loads((run / "evaluation.json").read_text())
+    assert dvae.Evaluation.load(run / "evaluation.json").rows
     out, fans = tmp_path / "futures.csv", tmp_path / "fans.png"
     assert main(["forecast", str(run), "--out", str(out), "--figure", str(fans)]) == 0
     assert fans.read_bytes().startswith(b"\x89PNG")
@@ -266,7 +266,7 @@ def test_runs_of_whole_sequences_are_reported_without_futures(table, tmp_path, c
         assert "free-running" not in said
         found.append(json.loads((tmp_path / "a.json").read_text()))
     assert found[0] == found[1]
-    assert found[0]["samples"] == 0
+    assert found[0]["attributes"]["samples"] == 0
     refused = failure(capsys, "evaluate", run, code=2)
     assert "fit with --observed and --horizon to forecast, or compare their bounds by `dvae compare`" in refused
     assert "--stride is between windows" in failure(capsys, *compared, "--stride", "2", code=2)
@@ -318,7 +318,7 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
     both = [str(tabled / name) for name in ("vae", "autoregressive")]
     few = ["--particles", "2", "--samples", "2", "--contrasts", "0", "--stride", "4"]
     assert main(["compare", *both, *few, "--out", str(tmp_path / "a.json")]) == 0
-    assert {*json.loads((tmp_path / "a.json").read_text())["rows"]} == {"vae", "autoregressive"}
+    assert {*dvae.Comparison.load(tmp_path / "a.json").rows} == {"vae", "autoregressive"}
     assert main(["check", "calibration", both[1], "--samples", "19"]) == 0
     said = capsys.readouterr()
     assert "no calibration" in said.err

@@ -141,7 +141,7 @@ def test_bracket(folder, page, tmp_path, monkeypatch):
     assert not {"–", ""} & {*line}
     (kept,) = (tmp_path / "kept").iterdir()
     kept.write_text(kept.read_text().replace('"seed"', '"other"'))
-    with pytest.raises(ValueError, match="not a bracket"):
+    with pytest.raises(ValueError, match="not written by Bracket"):
         bracket.main((run,), tmp_path / "kept", page, count=2, fitting=1, steps=2)
 
 

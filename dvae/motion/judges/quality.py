@@ -29,12 +29,11 @@ in a batch, 25,000 windows of each kind. Ours:
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import pyro
@@ -47,7 +46,8 @@ from ...data.schema import Schema
 from ...data.sequences import Batch
 from ...data.units import Units
 from ...inference.evaluation.estimates import Crossed, Estimate
-from ...inference.evaluation.held import Held, clip_places, hold, on_device_of, plain, refuse_non_finite, reproducibly
+from ...inference.evaluation.held import Held, clip_places, hold, on_device_of, refuse_non_finite, reproducibly
+from ...inference.evaluation.record import MODELS, Dims, plain
 from ...inference.evaluation.references import last_value
 from ...inference.evaluation.result import Result, Table, progress_bar
 from ...inference.evaluation.scores import clip_means
@@ -218,7 +218,7 @@ class Qualities(Result):
         record: what they rest on.
     """
 
-    rows: dict[str, dict[str, np.ndarray]]
+    rows: Annotated[dict[str, Annotated[dict[str, np.ndarray], Dims("seed", "clip", name="{}")]], MODELS]
     clips: dict[str, int]
     record: dict[str, Any]
 
@@ -252,19 +252,14 @@ class Qualities(Result):
         return table
 
     @override
-    def to_json(self) -> str:
-        document = {"rows": self.rows, "clips": self.clips, "record": self.record}
-        return json.dumps(plain(document), indent=1, allow_nan=False)
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"clip": [*self.clips]}
 
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        try:
-            document = json.loads(text)
-            rows = {n: {s: np.array(row[s], float) for s in SCORES} for n, row in document.pop("rows").items()}
-            return cls(rows=rows, **document)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"these are not qualities written by Qualities.to_json: {error!r}") from error
+    def check(self) -> None:
+        if self.extents.get("clip") != {len(self.clips)} or any(row.keys() != {*SCORES} for row in self.rows.values()):
+            raise ValueError(f"expected {', '.join(SCORES)} of {len(self.clips)} clips")
+        self.table()
 
 
 def _said(found: Estimate) -> str:

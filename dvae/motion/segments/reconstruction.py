@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 import torch
@@ -24,7 +24,8 @@ from ...data.sequences import Batch, each
 from ...data.views import WHOLE
 from ...inference.bounds.elbo import SequenceELBO, importance_bound
 from ...inference.evaluation.evaluation import ARROWS, Score
-from ...inference.evaluation.held import clip_places, on_device_of, plain, reproducibly
+from ...inference.evaluation.held import clip_places, on_device_of, reproducibly
+from ...inference.evaluation.record import MODELS, Dims
 from ...inference.evaluation.result import Result, Table, as_they_are, canvas, progress_bar
 from ...inference.evaluation.scores import TEACHER_FORCED, Metric, clip_means
 from ...inference.evaluation.uncertainty import clustered_variance, linearised
@@ -54,7 +55,7 @@ class Reconstruction(Result):
         configs: row to what was run.
     """
 
-    rows: Mapping[str, Mapping[str, np.ndarray]]
+    rows: Annotated[Mapping[str, Annotated[Mapping[str, np.ndarray], Dims("sequence", name="{}")]], MODELS]
     segments: list[tuple[str, str, str]]
     fingerprint: str
     notes: list[str] = field(default_factory=list)
@@ -101,30 +102,19 @@ class Reconstruction(Result):
         return figure
 
     @override
-    def to_json(self) -> str:
-        """Everything, with means and standard errors; numbers that are not finite become null."""
-        rows = {
-            row: {
-                name: {"mean": score.mean, "standard_error": score.standard_error, "values": self.rows[row][name]}
-                for name, score in self[row].items()
-            }
-            for row in self.rows
-        }
-        return json.dumps(plain({**vars(self), "rows": rows}), indent=1, allow_nan=False)
+    def summary(self) -> dict[str, Any]:
+        """Means and standard errors by row and score."""
+        return {row: {name: vars(score) for name, score in self[row].items()} for row in self.rows}
 
-    @classmethod
     @override
-    def from_json(cls, text: str) -> Self:
-        try:
-            document = json.loads(text)
-            rows = {
-                row: {name: np.array(score["values"], dtype=np.float64) for name, score in scores.items()}
-                for row, scores in document.pop("rows").items()
-            }
-            segments = [tuple(key) for key in document.pop("segments")]
-            return cls(rows=rows, segments=segments, **document)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"this is no reconstruction written by Reconstruction.to_json: {error!r}") from error
+    def labels(self) -> dict[str, Sequence[str]]:
+        return {"sequence": ["/".join(segment) for segment in self.segments]}
+
+    @override
+    def check(self) -> None:
+        if self.extents.get("sequence") != {len(self.segments)}:
+            raise ValueError(f"expected numbers of {len(self.segments)} segments")
+        self.table()
 
     def _row(self, row: str) -> Mapping[str, np.ndarray]:
         if row not in self.rows:

@@ -18,7 +18,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from markupsafe import Markup
-from rich.text import Text
 from torch import Tensor
 
 from ... import files
@@ -26,13 +25,15 @@ from ...data.sequences import Batch, HeldOutWindows, each
 from ...factorization.graph import audit
 from ...inference.diagnostics.bracket import Bracket
 from ...inference.diagnostics.calibration import Calibration
+from ...inference.diagnostics.checks import PredictiveChecks
 from ...inference.diagnostics.stein import SteinDiscrepancy
 from ...inference.diagnostics.yardstick import ReferencePosterior
 from ...inference.evaluation.compare import compare
 from ...inference.evaluation.comparison import KHAT, Comparison
 from ...inference.evaluation.conformal import Tubes
 from ...inference.evaluation.evaluation import ARROWS, Evaluation
-from ...inference.evaluation.held import on_device_of, plain, reproducibly
+from ...inference.evaluation.held import on_device_of, reproducibly
+from ...inference.evaluation.record import plain
 from ...inference.evaluation.result import Table, as_they_are, canvas, progress_bar, reason
 from ...inference.training.checkpoints import CheckpointError, Run
 from ...inference.training.fit import Fit
@@ -208,12 +209,13 @@ def calibration(runs: Runs) -> Section:
             return _missing(run, "calibration.json", "calibration and no predictive checks", "check calibration")
         document, parts = json.loads(text), []
         if "calibration" in document:
-            found = Calibration.from_json(json.dumps(document["calibration"]))
+            found = Calibration.of(document["calibration"])
             parts += [picture(found.plot(), found.verdict), tabulated(found.table())]
         else:
             parts += [paragraph("The guide was not calibrated, as the model starts from given data.")]
         if "predictive" in document:
-            parts += [tabulated(_checks(document["predictive"]))]
+            checks = PredictiveChecks.of(document["predictive"])
+            parts += [picture(checks.plot(), "statistics of real and of replicated windows"), tabulated(checks.table())]
         return Markup().join(parts)
 
     about = "Is the guide the model's posterior on the model's own data, and do replicated windows look like real ones?"
@@ -245,7 +247,7 @@ def yardsticks(runs: Runs) -> Section:
         kinds: dict[str, type[SteinDiscrepancy | ReferencePosterior]]
         kinds = {"stein": SteinDiscrepancy, "posterior": ReferencePosterior}
         for name in [name for name in kinds if name in document]:
-            found = kinds[name].from_json(json.dumps(document[name]))
+            found = kinds[name].of(document[name])
             parts += picture(found.plot(), found.verdict) + tabulated(found.table())
         return parts
 
@@ -453,24 +455,6 @@ def _scores(run: Loaded) -> dict[str, str]:
     except Exception:  # the section of scores says what is wrong with it
         return {}
     return {"forecasts scored, K": str(found.rows[name].samples), **values}
-
-
-def _checks(document: Mapping[str, Any]) -> Table:
-    """Predictive checks as they were written."""
-    caption = [*(f"{n}: {m}" for n, m in document["programs"].items()), *document.get("notes", ())]
-    shown = Table(title="predictive checks", caption="\n".join(caption))
-    for column in ("", "", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
-        shown.add_column(column, justify="right" if column else "left")
-    for model, programs in document["checks"].items():
-        for program, checks in programs.items():
-            shown.add_row(Text(program, "bold"))
-            for name, check in checks.items():
-                unit = f" ({check['unit']})" if check["unit"] else ""
-                shown.add_row(f"{name}{unit}", "real", *(f"{check['real'][n]:.3g}" for n in (0, 2, 4)))
-                replicated = (f"{check['replicated'][n]:.3g}" for n in (0, 2, 4))
-                outcome = (f"{check['wasserstein']:.3g}", f"{check['tail_area']:.2f}", f"{check['outside']:.0%}")
-                shown.add_row("", model, *replicated, *outcome)
-    return shown
 
 
 def _drawn(axes: Any, title: str) -> Markup:

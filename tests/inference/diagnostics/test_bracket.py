@@ -1,6 +1,5 @@
 """The bracket of the evidence and the parts of its gap, where all of them are known."""
 
-import json
 import math
 
 import numpy as np
@@ -81,17 +80,17 @@ def test_it_is_shown_and_kept(known):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda d: d.pop("gap"),
+        lambda d: d.pop("chains"),
         lambda d: d["bounds"]["real"].pop("AIS"),
-        lambda d: d["bounds"]["real"].update(ELBO=[0.0]),
+        lambda d: d["bounds"]["real"].update(ELBO=[1]),
         lambda d: d.update(notes="text"),
     ],
 )
 def test_files_that_are_none_are_refused(known, change):
-    document = json.loads(known[-1].to_json())
-    change(document)
-    with pytest.raises(ValueError, match="not a bracket"):
-        Bracket.from_json(json.dumps(document))
+    document = known[-1].document()
+    change(document["attributes"])
+    with pytest.raises(ValueError, match="not written by Bracket"):
+        Bracket.of(document)
 
 
 def test_a_guide_that_goes_backward_has_no_fivo_and_a_law_that_is_no_normal_no_parts():

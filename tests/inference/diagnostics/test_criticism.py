@@ -130,9 +130,8 @@ def test_calibration_prints_draws_and_writes():
     assert "is too narrow" in text
     assert text.index("z_2[0]") < text.index("z_1[0]")  # worst first
     assert "and 5 more" in " ".join(map(str, result.table(worst=1).columns[0].cells))
-    document = json.loads(result.to_json())
-    assert document["quantities"]["z_2[0]"]["p"] == result.p_values[1]
-    assert [sum(q["rank_counts"]) for q in document["quantities"].values()] == [300] * 6
+    assert json.loads(result.to_json())["summary"]["quantities"]["z_2[0]"]["p"] == result.p_values[1]
+    assert dict(result.dataset.sizes) == {"simulation": 300, "quantity": 6}
     figure = result.plot(worst=3)
     assert [axes.get_title().split(",")[0] for axes in figure.axes if axes.get_title()] == [
         result.names[q] for q in np.argsort(result.p_values, kind="stable")[:3]
@@ -158,14 +157,10 @@ def test_a_calibration_is_read_back_with_all_that_it_says():
     read = Calibration.from_json(result.to_json())
     assert read.to_json() == result.to_json()
     assert str(read) == str(result)
-    document = json.loads(result.to_json())
-    for damage in (
-        {"simulations": 41},
-        {"draws": 8},
-        {"quantities": {"z": {"rank_counts": [10**400] + [0] * 9}}, "simulations": 10**400},
-    ):
-        with pytest.raises(ValueError, match="not a calibration"):
-            Calibration.from_json(json.dumps({**document, **damage}))
+    document = result.document()
+    for damage in ({"names": ["z"]}, {"draws": 7}, {"draws": 10**9}, {"ranks": [41, 3]}):
+        with pytest.raises(ValueError, match="not written by Calibration"):
+            Calibration.of({**document, "attributes": document["attributes"] | damage})
 
 
 def test_statistics_of_any_sequences_have_their_known_values():
@@ -296,9 +291,13 @@ def test_checks_and_traversals_of_motion_print_draw_and_write(people):
     text = str(checks)
     for part in ("acceleration (m/s²)", "foot height (m)", "two", "Wasserstein", "drawn emission"):
         assert part in text
-    document = json.loads(checks.to_json())
-    assert document["data"]["fingerprint"] == windows.fingerprint
-    assert set(document["checks"]["two"]["posterior"]) == set(statistics)
+    again = type(checks).from_json(checks.to_json())
+    assert str(again) == str(checks)
+    assert again.data["fingerprint"] == windows.fingerprint
+    assert set(again.models["two"]["posterior"]) == set(statistics)
+    for damage in ({"samples": 20}, {"models": {}}):
+        with pytest.raises(ValueError, match="not written by PredictiveChecks"):
+            type(checks).of({**checks.document(), "attributes": checks.document()["attributes"] | damage})
     figure = checks.plot()
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["real", "one", "two"]
     figure.canvas.draw()

@@ -44,7 +44,7 @@ def run(models, data, **options):
 
 def scores(result, name):
     """The estimates of a model, with None for what is unknown."""
-    return json.loads(result.to_json())["rows"][name]["scores"]
+    return json.loads(result.to_json())["summary"]["models"][name]["scores"]
 
 
 @pytest.fixture(scope="module")
@@ -241,21 +241,40 @@ def test_a_comparison_comes_back_from_json_with_all_that_it_says(fitted, tmp_pat
     assert again.to_json() == result.to_json()
     assert str(again) == str(result)
     assert again.difference("dkf", "mean field") == result.difference("dkf", "mean field")
-    document = json.loads(result.to_json())
-    assert document["ranking"] == result.ranking
-    assert document["data"]["fingerprint"] == windows.fingerprint
-    assert document["protocol"]["observed"] == 3
-    row = document["rows"]["dkf"]
-    assert row["config"] == {"latent": 1}
-    assert row["equations"]["generative"] == models["dkf"][0].generative.text
+    summary = json.loads(result.to_json())["summary"]
+    assert summary["ranking"] == result.ranking
+    assert again.data["fingerprint"] == windows.fingerprint
+    assert again.protocol["observed"] == 3
+    assert again.rows["dkf"].config == {"latent": 1}
+    assert again.rows["dkf"].equations["generative"] == models["dkf"][0].generative.text
+    row = summary["models"]["dkf"]
     assert row["khat_above_0.7"] is None  # four particles have no tail
     assert row["scores"]["importance bound"]["seeds"] == pytest.approx(result["dkf"]["importance bound"].seeds)
 
 
-@pytest.mark.parametrize("text", ["[]", '{"ranking": [], "rows": {"a": {}}}'])
-def test_other_documents_are_not_comparisons(text):
-    with pytest.raises(ValueError, match="not a comparison"):
-        Comparison.from_json(text)
+def test_a_comparison_is_a_dataset(fitted):
+    models, x = fitted
+    result = run({**models, "one seed": models["dkf"][0]}, x)
+    found = result.dataset
+    assert found["ELBO"].dims == ("model", "seed", "sequence")
+    for name, row in result.rows.items():
+        own = found.sel(model=name)
+        np.testing.assert_array_equal(own["ELBO"].dropna("seed", how="all"), row.bounds["ELBO"])
+        steps = own["KL z by step"].dropna("seed", how="all").dropna("step", how="all")
+        np.testing.assert_array_equal(steps, row.kl_steps["z"])
+
+
+@pytest.mark.parametrize("damage", ["sequences", "seeds", "bounds"])
+def test_other_documents_are_not_comparisons(fitted, damage):
+    document = run(*fitted).document()
+    if damage == "sequences":
+        document["attributes"]["keys"].pop()
+    elif damage == "seeds":
+        document["attributes"]["rows"]["dkf"]["bounds"]["ELBO"][0] = 1
+    else:
+        del document["attributes"]["rows"]["dkf"]["bounds"]["k-hat"]
+    with pytest.raises(ValueError, match="not written by Comparison"):
+        Comparison.of(document)
 
 
 def test_joined_rows_are_those_of_one_comparison(fitted):

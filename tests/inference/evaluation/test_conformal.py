@@ -1,6 +1,5 @@
 """Tubes hold as many futures as they say, of dependent windows and few clips; TARP; calibration at each horizon."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -128,10 +127,11 @@ def test_tubes_are_kept_and_put_around_forecasts(fitted, tmp_path):
         tubes.tube(forecasts, "futures")
     with pytest.raises(ValueError, match=r"\(20, B, 4, 2\), not \(19, 500, 4, 2\)"):
         tubes.tube(forecasts[:19])
-    document = json.loads(tubes.to_json())
-    for change in ({"level": 2}, {"factors": {**document["factors"], "frame": [[1.0]]}}):
+    document = tubes.document()
+    shapes = document["attributes"]
+    for change in ({"level": 2}, {"factors": {**shapes["factors"], "frame": [1, 1]}}):
         with pytest.raises(ValueError, match="written"):
-            Tubes.from_json(json.dumps(document | change))
+            Tubes.of({**document, "attributes": shapes | change})
 
 
 # ----------------------------------------------------------------------------------------------------------------- TARP

@@ -6,6 +6,7 @@ from functools import partial
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -183,32 +184,35 @@ def test_the_record_says_what_was_measured_and_comes_back_from_json(model, tmp_p
     windows = array_windows()
     result = run({"dkf": model}, windows, configs={"dkf": {"width": 8}}, bound_particles=3, seed=5)
     result.save(tmp_path / "evaluation.json")
-    assert Evaluation.load(tmp_path / "evaluation.json").to_json() == result.to_json()
-    document = json.loads(result.to_json())
-    assert document["data"] == {
+    again = Evaluation.load(tmp_path / "evaluation.json")
+    assert again.data == {
         "fingerprint": windows.fingerprint,
         "windows": 12,
         "frames": FRAMES,
         "coordinates": SIZE,
     }
-    assert (document["samples"], document["seed"], document["bound_particles"]) == (5, 5, 3)
-    assert document["protocol"] == {"observed": OBSERVED}
+    assert again.to_json() == result.to_json()
+    assert (again.samples, again.seed, again.bound_particles) == (5, 5, 3)
+    assert again.protocol == {"observed": OBSERVED}
     alone = sum(len(found) == 1 for found in multimodal_truths(windows))
-    assert document["basis"] == {"multimodal": {"threshold": 0.5, "itself": True, "alone": alone}}
+    assert again.basis == {"multimodal": {"threshold": 0.5, "itself": True, "alone": alone}}
     assert f"{alone} of 12 have no other" in str(result)
-    row = document["rows"]["dkf"]
-    assert row["config"] == {"width": 8}
-    assert row["equations"]["generative"] == model.generative.text
-    assert row["scores"]["ADE"]["program"] == "free-running"
-    assert row["scores"]["ELBO"]["program"] == "teacher-forced"
-    assert row["scores"]["ELBO"]["unit"] == "nats/frame"
-    assert row["scores"]["k-hat"]["mean"] is None  # three particles have no tail
+    assert again.rows["dkf"].config == {"width": 8}
+    assert again.rows["dkf"].equations["generative"] == model.generative.text
+    assert again.metrics["ADE"].program == "free-running"
+    assert (again.metrics["ELBO"].program, again.metrics["ELBO"].unit) == ("teacher-forced", "nats/frame")
+    scores = json.loads(result.to_json())["summary"]["dkf"]
+    assert scores["ELBO"]["mean"] == result["dkf"]["ELBO"].mean
+    assert scores["k-hat"]["mean"] is None  # three particles have no tail
+    np.testing.assert_array_equal(again.dataset["ADE"].sel(model="dkf"), again.rows["dkf"].clip_means["ADE"])
 
 
-@pytest.mark.parametrize("text", ["[]", '{"rows": {"a": {}}}'])
-def test_other_documents_are_not_evaluations(text):
-    with pytest.raises(ValueError, match="not an evaluation"):
-        Evaluation.from_json(text)
+@pytest.mark.parametrize("damage", [{"clips": {}}, {"metrics": {}}, {"rows": {"a": {}}}, {"seed": "1"}])
+def test_other_documents_are_not_evaluations(model, damage):
+    document = run({"dkf": model}, array_windows()).document()
+    document["attributes"] |= damage
+    with pytest.raises(ValueError, match="not written by Evaluation"):
+        Evaluation.of(document)
 
 
 def test_table_and_plot_show_every_method_and_metric(model):

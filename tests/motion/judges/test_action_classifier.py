@@ -333,12 +333,10 @@ def test_the_record_says_which_classifier(fitted):
     assert fitted.training
     fitted.eval()
     assert list(result.metrics)[-7:] == ["limb-angle error", "CMD", "jerk", "ACC a", "ACC b", "FID a", "FID b"]
-    document = json.loads(result.to_json())
-    used = {name: document["basis"][f"classifier {name}"] for name in "ab"}
+    used = {name: result.basis[f"classifier {name}"] for name in "ab"}
     assert used["b"].keys() == {"label", "classes", "weights", "unknown"}
     assert used["a"]["weights"] != used["b"]["weights"]
-    score = document["rows"]["zero velocity"]["scores"]["FID b"]
-    assert (score["program"], score["better"]) == ("free-running", "lower")
+    assert (result.metrics["FID b"].program, result.metrics["FID b"].better) == ("free-running", "lower")
     assert f"ACC, FID b: classifier {used['b']['weights'][:12]}" in str(result)
     assert "FID a ↓" in [axes.get_title() for axes in result.plot().axes]
 

@@ -89,7 +89,7 @@ def test_a_reconstruction_is_a_table_boxes_and_a_file(held, model, tmp_path):
     assert [label.get_text() for label in axes.get_xticklabels()] == ["m", "PCA of 11"]
     with pytest.raises(KeyError, match="no row 'n'"):
         found["n"]
-    with pytest.raises(ValueError, match="no reconstruction written by"):
+    with pytest.raises(ValueError, match="not written by Reconstruction"):
         Reconstruction.from_json("{}")
     with pytest.raises(ValueError, match="at least one model"):
         reconstruct_segments({}, test)

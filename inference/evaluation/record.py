@@ -1,0 +1,239 @@
+"""Results as xarray datasets and as JSON.
+
+A result is a dataclass. The annotations of its fields say which are arrays, and of what dimensions:
+
+    frames: Annotated[np.ndarray, Dims("sequence")]
+    bounds: Annotated[dict[str, np.ndarray], Dims("seed", "sequence", name="{}")]      a variable for each key
+    rows: Annotated[dict[str, Row], MODELS]                                            the dimension "model"
+
+Arrays become variables. Those of several models are stacked, and the smaller ones padded with NaN. Everything else
+becomes attributes of the dataset. Nothing is lost: `unflatten` returns the same dataclass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from ...options import problem
+
+MODELS = "model"
+"""Marks a mapping by name of the model."""
+
+_Path = tuple[str, ...]
+
+
+@dataclass(frozen=True, init=False)
+class Dims:
+    """Marks an array, or a mapping to arrays.
+
+    Args:
+        names: of the dimensions. Arrays that share one need not have the same size.
+        name: of the variable, "{0}" being the last key, "{1}" that before it. By default all fields and keys.
+        kind: type of the numbers.
+    """
+
+    names: tuple[str, ...]
+    name: str
+    kind: type
+
+    def __init__(self, *names: str, name: str = "", kind: type = float) -> None:
+        for own, value in (("names", names), ("name", name), ("kind", kind)):
+            object.__setattr__(self, own, value)
+
+
+@dataclass(frozen=True, eq=False)
+class Variable:
+    """An array of the result, or those of all models stacked.
+
+    Args:
+        dims: names of its dimensions.
+        data: the numbers.
+        path: fields and keys that lead to it, without that of the model.
+    """
+
+    dims: tuple[str, ...]
+    data: np.ndarray
+    path: _Path
+
+
+@dataclass(frozen=True)
+class Flat:
+    """A result taken apart.
+
+    Args:
+        variables: by name.
+        models: names, in the order of the dimension "model".
+        attributes: everything else, in JSON's types; the shape of an array stands in its place.
+        sizes: of the arrays, by dimension.
+    """
+
+    variables: dict[str, Variable]
+    models: list[str]
+    attributes: dict[str, Any]
+    sizes: Mapping[str, set[int]] = field(default_factory=dict)
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON holds it: tuples and arrays become lists, NaN None, and infinity a text."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value
+
+
+def flatten(result: Any) -> Flat:
+    """Take a dataclass apart.
+
+    Raises:
+        TypeError: an array that has not the dimensions its field declares.
+    """
+    found: dict[_Path, dict[str | None, np.ndarray]] = {}
+    marks: dict[_Path, Dims] = {}
+    models: dict[str, None] = {}
+
+    def of(value: Any, hint: Any, path: _Path, model: str | None) -> Any:
+        mark, hint = _marked(hint)
+        if value is None:
+            return None
+        if isinstance(value, Mapping):
+            within = Annotated[np.ndarray, mark] if isinstance(mark, Dims) else (*get_args(hint), Any, Any)[1]
+            if mark == MODELS:
+                models.update(dict.fromkeys(value))
+                return {key: of(item, within, path, key) for key, item in value.items()}
+            return {str(key): of(item, within, (*path, str(key)), model) for key, item in value.items()}
+        if isinstance(mark, Dims):
+            array: np.ndarray = np.asarray(value, mark.kind)
+            if array.ndim != len(mark.names):
+                raise TypeError(f"{'.'.join(path)} has the shape {array.shape}; its dimensions are {mark.names}")
+            found.setdefault(path, {})[model] = array
+            marks[path] = mark
+            return list(array.shape)
+        if is_dataclass(value) and not isinstance(value, type):
+            hints = _hints(type(value))
+            return {name: of(getattr(value, name), hint, (*path, name), model) for name, hint in hints.items()}
+        return plain(value)
+
+    attributes = of(result, type(result), (), None)
+    sizes: dict[str, set[int]] = {}
+    for path, arrays in found.items():
+        for array in arrays.values():
+            for name, size in zip(marks[path].names, array.shape, strict=True):
+                sizes.setdefault(name, set()).add(size)
+    variables: dict[str, Variable] = {}
+    for path, arrays in found.items():
+        mark = marks[path]
+        name = mark.name.format(*reversed(path)) if mark.name else " ".join(path)
+        name = " ".join(path) if name in variables else name
+        shape = tuple(max(sizes[each]) for each in mark.names)
+        padded = {model: _padded(array, shape) for model, array in arrays.items()}
+        if None in padded:
+            variables[name] = Variable(mark.names, padded[None], path)
+        else:
+            absent = np.full(shape, math.nan)
+            data = np.stack([padded.get(model, absent) for model in models])
+            variables[name] = Variable((MODELS, *mark.names), data, path)
+    return Flat(variables, list(models), attributes, sizes)
+
+
+def unflatten(kind: Any, record: Flat) -> Any:
+    """Put a dataclass together again.
+
+    Raises:
+        TypeError, ValueError: what is missing, of another type or of another shape.
+    """
+    variables = {each.path: each for each in record.variables.values()}
+
+    def of(value: Any, hint: Any, path: _Path, model: str | None) -> Any:
+        mark, hint = _marked(hint, value)
+        said = ".".join(path) or "the result"
+        if value is None and hint is NoneType:
+            return None
+        if isinstance(mark, Dims) and not isinstance(value, Mapping):
+            return _array(value, mark, variables.get(path), record.models.index(model) if model else None, said)
+        arguments = get_args(hint)
+        if isinstance(mark, Dims) or get_origin(hint) in (dict, Mapping):
+            if not isinstance(value, Mapping):
+                raise TypeError(f"{said} is no object")
+            within = Annotated[np.ndarray, mark] if isinstance(mark, Dims) else arguments[1]
+            of_models = mark == MODELS
+            return {
+                key: of(item, within, path if of_models else (*path, key), key if of_models else model)
+                for key, item in value.items()
+            }
+        if is_dataclass(hint):
+            hints = _hints(hint)  # type: ignore[arg-type]
+            if not isinstance(value, Mapping) or value.keys() != hints.keys():
+                raise TypeError(f"{said} has not the fields {', '.join(hints)}")
+            return hint(**{name: of(value[name], within, (*path, name), model) for name, within in hints.items()})  # type: ignore[operator]
+        if get_origin(hint) in (list, tuple):
+            if not isinstance(value, list):
+                raise TypeError(f"{said} is no list")
+            each = arguments if arguments[1:] and arguments[1] is not Ellipsis else arguments[:1] * len(value)
+            if len(each) != len(value):
+                raise ValueError(f"{said} has {len(value)} entries; it must have {len(each)}")
+            entries = [of(item, within, path, model) for item, within in zip(value, each, strict=True)]
+            return tuple(entries) if get_origin(hint) is tuple else entries
+        if hint is float and (value is None or value in ("inf", "-inf")):
+            return float(value or "nan")
+        if (error := problem(said, value, hint)) is not None:
+            raise error
+        return value
+
+    return of(record.attributes, kind, (), None)
+
+
+def _array(shape: Any, mark: Dims, variable: Variable | None, place: int | None, said: str) -> np.ndarray:
+    if variable is None or variable.dims != ((MODELS, *mark.names) if place is not None else mark.names):
+        raise ValueError(f"{said} has no numbers of dimensions {mark.names}")
+    if not isinstance(shape, list) or len(shape) != len(mark.names) or not all(type(size) is int for size in shape):
+        raise ValueError(f"{said} has no shape")
+    if 0 in shape and min(shape) == 0:  # lists in JSON do not tell the other sizes
+        return np.zeros(shape, mark.kind)
+    data = variable.data if place is None else variable.data[place]
+    if data.ndim != len(shape) or not all(0 < size <= most for size, most in zip(shape, data.shape, strict=True)):
+        raise ValueError(f"{said} is not of the shape {shape}")
+    data = data[tuple(map(slice, shape))]
+    found: np.ndarray = data.astype(mark.kind)
+    if mark.kind is not float and (found != data).any():
+        raise ValueError(f"{said} has numbers that are not whole")
+    return found
+
+
+def _padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if array.shape == shape:
+        return array
+    whole = np.full(shape, math.nan)
+    whole[tuple(map(slice, array.shape))] = array
+    return whole
+
+
+def _marked(hint: Any, value: Any = True) -> tuple[Any, Any]:
+    """The mark of a type, and the type without it and without None, but of None itself."""
+    mark = None
+    while True:
+        if get_origin(hint) in (Union, UnionType) and NoneType in get_args(hint):
+            if value is None:
+                return None, NoneType
+            hint = next(each for each in get_args(hint) if each is not NoneType)
+        elif get_origin(hint) is Annotated and isinstance(hint.__metadata__[0], Dims | str):
+            mark, hint = hint.__metadata__[0], hint.__origin__
+        else:
+            return mark, hint
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {each.name: hints[each.name] for each in fields(kind) if each.init}
