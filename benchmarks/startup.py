@@ -20,7 +20,7 @@ COMMANDS = {
 TARGETS = {
     "dvae --help": ("at most", 1.3),
     "an unknown command": ("at most", 1.3),
-    "dvae list": ("at most", 2.5),
+    "dvae list": ("at most", 1.3),
     "dvae fit vae --help": ("at most", 2.5),
     "import dvae": ("at most", 0.3),
 }

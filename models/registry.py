@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 from collections import UserDict
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec, resolve_name
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from typing_extensions import override
@@ -77,9 +80,63 @@ class Registry(UserDict[str, Any]):
     def __getitem__(self, name: str) -> type[Any]:
         return self.data[name].load()  # type: ignore[no-any-return]
 
+    def texts(self, name: str, *attributes: str) -> list[str | None]:
+        """Attributes of a class, read from its file where they are literals, as importing torch takes seconds.
+
+        Args:
+            name: of a method or judge.
+            attributes: of the class or of its bases, such as "source".
+
+        Returns:
+            Their texts; None for an option of the method, which is a field of the dataclass.
+        """
+        found = _literals(*self.data[name].value.split(":"))
+        if not found.keys() >= {*attributes}:
+            kind = self[name]
+            options = {field.name for field in fields(kind)}
+            found = {each: None if each in options else getattr(kind, each) for each in attributes}
+        return [found[each] for each in attributes]
+
 
 @cache
-def methods() -> Mapping[str, type[Method]]:
+def _literals(module: str, name: str) -> dict[str, str | None]:
+    """Texts that the body of a class assigns, and None for its fields; those of its bases where it has none."""
+    package, *parts = module.split(".")
+    spec = find_spec(package)  # of the package alone, as that of a module would import what lies above it
+    file = Path(spec.origin or "").parent.joinpath(*parts).with_suffix(".py") if spec is not None else Path()
+    if not file.is_file():
+        return {}
+    tree = ast.parse(file.read_bytes())
+    classes = {each.name: each for each in tree.body if isinstance(each, ast.ClassDef)}
+    imported = {
+        alias.asname or alias.name: (
+            resolve_name("." * each.level + (each.module or ""), module.rpartition(".")[0]),
+            alias.name,
+        )
+        for each in tree.body
+        if isinstance(each, ast.ImportFrom)
+        for alias in each.names
+    }
+    if name not in classes:
+        return _literals(*imported[name]) if name in imported else {}
+    found: dict[str, str | None] = {}
+    for base in reversed(classes[name].bases):
+        if isinstance(base, ast.Name):
+            found |= _literals(module, base.id)
+    for line in classes[name].body:
+        if isinstance(line, ast.Assign | ast.AnnAssign):
+            target = line.target if isinstance(line, ast.AnnAssign) else line.targets[0]
+            assigned = ast.unparse(target)
+            found.pop(assigned, None)
+            if isinstance(line, ast.AnnAssign) and "ClassVar" not in ast.unparse(line.annotation):
+                found[assigned] = None
+            elif isinstance(line.value, ast.Constant) and isinstance(line.value.value, str):
+                found[assigned] = line.value.value
+    return found
+
+
+@cache
+def methods() -> Registry:
     """Every known method by name: those of this package and of installed packages (entry points "dvae.methods").
 
     Example:
@@ -90,7 +147,7 @@ def methods() -> Mapping[str, type[Method]]:
 
 
 @cache
-def judges() -> Mapping[str, type[Trainable]]:
+def judges() -> Registry:
     """Every known judge by name (and by entry points "dvae.judges")."""
     return Registry(JUDGES, "dvae.judges")
 

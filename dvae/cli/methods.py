@@ -26,11 +26,12 @@ def list_methods() -> None:
     table = Table(show_lines=True)
     for column in ("method", "equations", "source"):
         table.add_column(column)
-    for name, kind in methods().items():
-        pair = f"{kind.generative}\n{kind.inference}"
-        table.add_row(name, "--generative and --inference" if _asks_for_equations(kind) else pair, kind.source)
-    for name, judge in judges().items():
-        table.add_row(name, "a judge of what methods make", judge.source)
+    for name in methods():
+        generative, inference, source = methods().texts(name, "generative", "inference", "source")
+        pair = "--generative and --inference" if generative is None else f"{generative}\n{inference}"
+        table.add_row(name, pair, source)
+    for name in judges():
+        table.add_row(name, "a judge of what methods make", *judges().texts(name, "source"))
     OUT.print(table, highlight=False)
 
 

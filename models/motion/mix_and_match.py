@@ -53,12 +53,11 @@ from .poses import PoseMethod
 
 INDICES = MixAndMatch.indices_name
 EQUATIONS = {
-    "mix": ("p(z) p(x_t | x_{<t}, h, z, i)", "q(z | x_{1:T}, h, i)"),
     "concatenate": ("p(z) p(x_t | x_{<t}, h, z)", "q(z | x_{1:T}, h)"),
     "add": ("p(z) p(x_t | x_{<t}, h, z)", "q(z)"),
     "step": ("p(z_t) p(x_t | x_{<t}, h, z_t)", "q(z_t | x_{<=t}, h)"),
 }
-"""How the noise enters, and the factorization that it has so."""
+"""Other ways for the noise to enter than to be mixed in, and the factorization that each has."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,8 @@ class MixAndMatchMotion(PoseMethod):
 
     name = "mix-and-match"
     source = "Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733"
-    generative, inference = EQUATIONS["mix"]  # of the default; `equations` has those of each way
+    generative = "p(z) p(x_t | x_{<t}, h, z, i)"
+    inference = "q(z | x_{1:T}, h, i)"
     representation: ClassVar[str] = "quaternion"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 128}}
     trainings: ClassVar[Mapping[str, Training]] = {
@@ -115,7 +115,7 @@ class MixAndMatchMotion(PoseMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        generative, inference = map(Factorization.parse, EQUATIONS[self.noise])
+        generative, inference = map(Factorization.parse, EQUATIONS.get(self.noise, (self.generative, self.inference)))
         return generative, inference
 
     def entering(self) -> Noise | None:

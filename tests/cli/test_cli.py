@@ -43,6 +43,13 @@ def test_every_method_is_listed_with_its_equations(capsys):
     for name, kind in dvae.methods().items():
         assert name in printed
         assert kind.source.split(",")[0] in printed
+        texts = [*dvae.methods().texts(name, "generative", "inference"), kind.source]
+        assert texts == [*((None, None) if name == "equations" else (kind.generative, kind.inference)), kind.source]
+
+
+def test_methods_are_listed_without_importing_them():
+    program = "import sys; from dvae.cli import main; main(['list']); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode == 0
 
 
 def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
