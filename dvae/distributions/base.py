@@ -15,6 +15,8 @@ from typing import Any, ClassVar, Protocol
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
+from torch.distributions import constraints, transform_to
+from torch.nn import functional
 
 Parameters = tuple[Tensor, ...]
 
@@ -43,8 +45,8 @@ class Shape:
 class Law(nn.Module):
     """Features to the distribution of one variable.
 
-    A law of one's own gives `forward` and `distribution`, and says what else it is: a point mass, a location and a
-    scale, quicker to draw than its distribution.
+    A law of one's own gives `forward` and `distribution`, and declares what the program decides by: `support`,
+    `event_dim`, `discrete` and `reparameterised`, where they differ from those of independent normals.
 
     Args:
         residual: share of the variable's own previous value that its location keeps, so that features give the rest:
@@ -55,6 +57,14 @@ class Law(nn.Module):
         ValueError: a share that is not between 0 and 1.
     """
 
+    support: Any = constraints.real
+    """Where values of a step are, a constraint of torch; None where it depends on the parameters."""
+    event_dim: int = 0
+    """1 where all coordinates of a step are one event, 0 where each has a density of its own."""
+    discrete: bool = False
+    """Whether values are discrete."""
+    reparameterised: bool = True
+    """Whether draws have a gradient."""
     deterministic: ClassVar[bool] = False
     """Whether the variable is a function of its parents, without a density."""
     error_weight: bool = False
@@ -74,6 +84,20 @@ class Law(nn.Module):
         if not 0 <= residual <= 1:
             raise ValueError(f"residual is {residual}; it is a share of the previous value, from 0 to 1")
         self.residual = float(residual)
+
+    @property
+    def called(self) -> str:
+        """Name of the distribution, in messages."""
+        return type(self).__name__.removesuffix("Law")
+
+    def inside(self, size: int) -> Tensor | None:
+        """A value (D,) that has a density, to stand where nothing was observed; None where any has."""
+        if self.support is None or is_real(self.support):
+            return None
+        if not self.support.is_discrete:
+            return torch.as_tensor(transform_to(self.support)(torch.zeros(size)))
+        zero = torch.zeros(size)
+        return None if self.support.check(zero).all() else functional.one_hot(torch.tensor(0), size).to(zero)
 
     def projection(self, features: int, out: int, locations: int) -> Any:
         """Features to `out` parameters, of which the first so many are locations; without features, learned ones."""
@@ -133,6 +157,13 @@ class Law(nn.Module):
         """Values (..., D), reparameterised where they can be; of the noise, unless the distribution makes its own."""
         law = self.distribution(parameters)
         return law.rsample() if law.has_rsample else law.sample()
+
+
+def is_real(support: Any) -> bool:
+    """Whether a constraint allows all real numbers."""
+    while hasattr(support, "base_constraint"):
+        support = support.base_constraint
+    return support is constraints.real
 
 
 class LawSpec(Protocol):

@@ -57,6 +57,7 @@ class ConditionalFlow:
 class ConditionalFlowLaw(Law):
     """What `ConditionalFlow` describes; its parameters are m, s and h: (..., D), (..., D) and (..., H)."""
 
+    event_dim = 1
     location_scale = True
     centred = True
 

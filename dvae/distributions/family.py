@@ -115,6 +115,9 @@ class Inside(constraints.Constraint):
         return f"Inside({self.closed})"
 
 
+transform_to.register(Inside, lambda constraint: transform_to(constraint.closed))
+
+
 class VonMises(dist.VonMises):  # type: ignore[misc]
     """A von Mises distribution at any concentration; torch's has gradients between 3e-6 and 4e4 alone in float32."""
 
@@ -231,7 +234,17 @@ class FamilyLaw(Law):
         with torch.no_grad():
             probe = torch.ones(1, shape.features), torch.zeros(1, shape.size) if self.residual else None
             with _refusing(spec, AttributeError, TypeError):
-                self.centre = _centre(self.distribution(self(*probe)))
+                made = self.distribution(self(*probe))
+                self.centre = _centre(made)
+        support = getattr(made, "support", None)
+        self.event_dim, self.discrete = len(made.event_shape), support is not None and support.is_discrete
+        self.reparameterised = made.has_rsample and not self.discrete  # torch.bernoulli has a gradient, of zero
+        self.support = support if support is not None and _is_fixed(support) else None
+
+    @property
+    @override
+    def called(self) -> str:
+        return str(self.kind.__name__)
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
@@ -280,6 +293,13 @@ class FamilyLaw(Law):
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         named = zip(self.forms, parameters, strict=True)
         return tuple(self.moves[name](value, mean, scale) if name in self.moves else value for name, value in named)
+
+
+def _is_fixed(support: Any) -> bool:
+    """Whether where values are is the same whatever the parameters."""
+    if hasattr(support, "base_constraint"):
+        return _is_fixed(support.base_constraint)
+    return not any(isinstance(value, Tensor) for value in vars(support).values())
 
 
 Form = tuple[tuple[int, ...], Any, tuple[int, ...]]
@@ -374,6 +394,7 @@ class NormalMixture:
 class NormalMixtureLaw(Law):
     """What `NormalMixture` describes; its parameters are logits, locations and scales, (..., D K) each."""
 
+    reparameterised = False
     location_scale = True
     centred = True
 

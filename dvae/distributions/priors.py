@@ -21,6 +21,8 @@ from .base import Law, Parameters, Shape
 class Prior(Law):
     """A law without features: one distribution of (D,), the same for every sequence. One of one's own gives `prior`.
 
+    All coordinates are one event.
+
     Args:
         spec: its description.
         shape: what it is built for.
@@ -28,6 +30,8 @@ class Prior(Law):
     Raises:
         ValueError: another variable than a static latent without parents.
     """
+
+    event_dim = 1
 
     def __init__(self, spec: Any, shape: Shape):
         super().__init__()
@@ -70,6 +74,8 @@ class Mixture:
 class MixtureLaw(Prior):
     """What `Mixture` describes."""
 
+    reparameterised = False
+
     def __init__(self, spec: Mixture, shape: Shape):
         super().__init__(spec, shape)
         self.logits = nn.Parameter(torch.zeros(spec.components))
@@ -104,6 +110,8 @@ class Vamp:
 
 class VampLaw(Prior):
     """What `Vamp` describes."""
+
+    reparameterised = False
 
     guide: Any
 

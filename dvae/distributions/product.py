@@ -15,7 +15,7 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..constants import indices
-from .base import Law, LawSpec, Parameters, Shape
+from .base import Law, LawSpec, Parameters, Shape, is_real
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,27 @@ class ProductLaw(Law):
         own = {place: bool(parts[n].centred) for n, places in enumerate(self.places) for place in places}
         self.centred = any(own.values()) and tuple(own[place] for place in range(shape.size))
         with torch.no_grad():
-            probe, before = torch.randn(1, shape.features), torch.zeros(1, shape.size)
-            made = [self._part(n, probe, before, None) for n in range(len(parts))]
-        self.counts = [len(parameters) for parameters in made]
-        whole = [bool(part.distribution(p).event_shape) for part, p in zip(parts, made, strict=True)]
+            probe, before = torch.ones(1, shape.features), torch.zeros(1, shape.size)
+            self.counts = [len(self._part(n, probe, before, None)) for n in range(len(parts))]
+        self.discrete = any(part.discrete for part in parts)
+        self.reparameterised = all(part.reparameterised for part in parts)
+        supports = [part.support for part in parts]
+        if None in supports:
+            self.support = None
+        elif not all(map(is_real, supports)):
+            self.support = ProductSupport(list(zip(self.places, supports, strict=True)))
         self.events = [
-            *(places for places, one in zip(self.places, whole, strict=True) if one),
+            *(places for part, places in zip(parts, self.places, strict=True) if part.event_dim),
             *([part[n] for n in event] for law, part in zip(parts, self.places, strict=True) for event in law.events),
         ]
+
+    @override
+    def inside(self, size: int) -> Tensor | None:
+        found = [part.inside(len(places)) for part, places in zip(self.parts, self.places, strict=True)]  # type: ignore[operator]
+        if all(each is None for each in found):
+            return None
+        sizes = map(len, self.places)
+        return self._whole([torch.zeros(n) if own is None else own for own, n in zip(found, sizes, strict=True)])
 
     def _part(self, n: int, features: Tensor, previous: Tensor | None, t: int | None) -> Parameters:
         law: Any = self.parts[n]

@@ -32,6 +32,8 @@ class Triangular:
 class TriangularLaw(Law):
     """See `Triangular`; its parameters are (..., D) and (..., D * D)."""
 
+    event_dim = 1
+
     def __init__(self, size: int):
         super().__init__()
         self.size = size

@@ -224,8 +224,8 @@ class Reader:
                 law, place = self.laws[name], found.nonzero()[0].tolist()
                 raise ValueError(
                     f"{name} holds {values[name][tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}),"
-                    f" and by {law.factor}, {law.family}, values are {_meaning(law.support)}; give {name} another law,"
-                    " move such entries inside, or hide them by the 'mask' of the batch"
+                    f" and by {law.factor}, {law.law.called}, values are {_meaning(law.support)}; give {name} another"
+                    " law, move such entries inside, or hide them by the 'mask' of the batch"
                 )
 
     def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:

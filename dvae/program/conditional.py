@@ -10,11 +10,10 @@ from typing import Any
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
-from torch.distributions import constraints
 
 from ..constants import constant
 from ..data.units import Units
-from ..distributions.base import LawSpec, Parameters, Shape
+from ..distributions.base import LawSpec, Parameters, Shape, is_real
 from ..distributions.chain import DERIVATIVES, gaussian_chain
 from ..distributions.families import NormalLaw
 from ..distributions.precise import Offset
@@ -34,7 +33,6 @@ from ..networks.base import (
     valid_steps,
 )
 from ..networks.rows import Rows, select
-from ..turns import seeded
 from .groups import Groups
 
 CONSTANT = "1"
@@ -63,19 +61,6 @@ def evaluating(*modules: nn.Module) -> Iterator[None]:
             part.training = True
 
 
-def _is_fixed(support: Any) -> bool:
-    """Whether where values are is the same whatever the parameters."""
-    inner = [own for _, own in getattr(support, "parts", ())]
-    inner += [support.base_constraint] if hasattr(support, "base_constraint") else []
-    return all(map(_is_fixed, inner)) and not any(isinstance(value, Tensor) for value in vars(support).values())
-
-
-def _is_real(support: Any) -> bool:
-    while hasattr(support, "base_constraint"):
-        support = support.base_constraint
-    return support is constraints.real
-
-
 def like(module: nn.Module) -> Tensor:
     """A tensor of the module's type and device."""
     for tensor in module.parameters():
@@ -98,6 +83,9 @@ class Conditional(nn.Module):
 
     Raises:
         ValueError: a network and a law that do not go together.
+
+    Attributes:
+        discrete, reparameterised, whole: as the law declares (`Law.discrete`, `Law.event_dim`).
     """
 
     inside: Tensor | None
@@ -133,49 +121,38 @@ class Conditional(nn.Module):
         self.law = law.build(Shape(self.size, features, factor.local, factor.child, data, guide))
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # not registered here: they are the model's
-        with evaluating(self.law, *([guide] if guide else [])):  # statistics of what they normalise are of data
-            self._try_law(features)
+        self.discrete = self.law.discrete
+        self.reparameterised = self.law.reparameterised and not self.law.discrete
+        self.whole = self.law.event_dim == 1
+        self.support = None if self.law.support is None or is_real(self.law.support) else self.law.support
+        """Where its values are, if that is somewhere in particular and the same whatever the parents."""
+        self.events = [range(self.size)] if self.whole else self.law.events
+        """Coordinates that are one event each, and observed together."""
+        self.register_buffer("inside", self.law.inside(self.size), persistent=False)
+        self._seen = False  # whether the law has made a distribution, which was as declared
         for length in range(2, 9):
             self.check(length)
 
-    @torch.inference_mode(False)
-    def _try_law(self, features: int) -> None:
-        """Draws once, which tells what the law is: see the attributes.
+    def _declared(self, law: TorchDistribution) -> None:
+        """Refuse a distribution that is not as its law declares.
 
         Raises:
-            ValueError: a distribution of another shape.
+            ValueError: another event, or discrete values.
         """
-        rows = (1, 1) if self.factor.local else (1,)
-        with seeded(None):
-            read = torch.randn(*rows, features, requires_grad=True)
-            previous = torch.randn(*rows, self.size) if self.law.residual else None
-            parameters = self.law(read, previous)
-            law = self.law.distribution(parameters)
-            value = self.law.draw(parameters, self.law.noise((*rows, self.size), read))
-        if (law.batch_shape, law.event_shape) not in (((*rows, self.size), ()), (rows, (self.size,))):
+        event = (self.size,) if self.whole else ()
+        if tuple(law.event_shape) != event or not (self.whole or law.batch_shape[-1:] == (self.size,)):
             raise ValueError(
                 f"the law of {self.factor} makes a {type(law).__name__} of batch {tuple(law.batch_shape)} and event "
-                f"{tuple(law.event_shape)}; it has either one density for each coordinate, here batch "
-                f"{(*rows, self.size)} and no event, or one for all of a step, batch {rows} and event {(self.size,)}"
+                f"{tuple(law.event_shape)}; by its event_dim = {self.law.event_dim} it has "
+                + (f"the event {event}" if self.whole else f"no event, and the last dimension {self.size} in its batch")
             )
-        support: Any = None
         with suppress(NotImplementedError):  # a distribution that says nothing of its support
-            support = law.support
-        self.family = type(getattr(law, "base", law)).__name__
-        self.discrete = support is not None and support.is_discrete
-        """Whether its values are discrete."""
-        learns = value.requires_grad or not any(parameter.requires_grad for parameter in parameters)
-        self.reparameterised = learns and not self.discrete  # torch.bernoulli has a gradient, of zero
-        """Whether its draws have a gradient."""
-        self.whole = bool(law.event_shape)
-        """Whether all coordinates are one event."""
-        self.events = [range(self.size)] if self.whole else self.law.events
-        """Coordinates that are one event each, and observed together."""
-        self.support = None if support is None or not _is_fixed(support) or _is_real(support) else support
-        """Where its values are, if that is somewhere in particular and the same whatever the parents."""
-        nothing = torch.zeros_like(value)
-        somewhere = self.support is None or bool(torch.isfinite(law.log_prob(nothing)).all())
-        self.register_buffer("inside", None if somewhere else value.detach().flatten(), persistent=False)
+            if law.support is not None and law.support.is_discrete and not self.discrete:
+                raise ValueError(
+                    f"the law of {self.factor} makes a {type(law).__name__}, whose values are discrete; declare "
+                    "discrete = True and the support in the class of the law"
+                )
+        self._seen = True
 
     def check(self, length: int) -> None:
         """Refuses a residual law that reads what the factor does not, at sequences of this length.
@@ -277,6 +254,8 @@ class Conditional(nn.Module):
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         """The distribution of the child, see `Law.distribution`."""
         law, offset = self.law.distribution(parameters), self.offset
+        if not self._seen:
+            self._declared(law)
         return law if offset is None else Offset(law, offset, parameters[0].dtype)
 
     def mean(self, parameters: Parameters) -> Tensor:

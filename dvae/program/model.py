@@ -216,10 +216,10 @@ class DynamicalVAE(nn.Module):
                         f"summed out: sizes={{{name!r}: dvae.Discrete(states)}}"
                     )
         for name in self.summed:
-            if self.generator[name].family != "OneHotCategorical":
+            if (law := self.generator[name].law.called) != "OneHotCategorical":
                 raise ValueError(
                     f"{name} is summed out over its {self.sizes[name]} states, but the law of "
-                    f"{self.generator[name].factor} is {self.generator[name].family}; leave it to be that of categories"
+                    f"{self.generator[name].factor} is {law}; leave it to be that of categories"
                 )
 
     @torch.inference_mode(False)

@@ -33,6 +33,8 @@ class Own:
 class Full(Law):
     """A normal with full covariance, the same everywhere."""
 
+    event_dim = 1
+
     def __init__(self, shape):
         super().__init__()
         self.out = nn.Linear(shape.features, shape.size)
@@ -49,6 +51,8 @@ class Full(Law):
 
 class Classes(Law):
     """One class of so many, as its indicator."""
+
+    support, event_dim, discrete = dist.constraints.one_hot, 1, True
 
     def __init__(self, shape):
         super().__init__()

@@ -269,7 +269,7 @@ def test_a_class_of_ones_own_is_a_family():
     class Twice(dist.Poisson):
         """Its own name."""
 
-    assert built(Family(Twice)).generator["x"].family == "Twice"
+    assert built(Family(Twice)).generator["x"].law.called == "Twice"
 
 
 # ------------------------------------------------------------------------------------- the family of the docs page

@@ -11,6 +11,7 @@ import dvae
 from dvae import distributions
 from dvae.data.views import View
 from dvae.distributions import Shape
+from dvae.distributions.family import FAMILIES
 from dvae.networks import Recurrent
 
 LAWS = {
@@ -100,6 +101,8 @@ class Own:
 class Bernoulli(distributions.Law):
     """Its location is a probability."""
 
+    support, discrete = dist.constraints.boolean, True
+
     def __init__(self, shape):
         super().__init__()
         self.out = nn.Linear(shape.features, shape.size)
@@ -117,6 +120,8 @@ class Bernoulli(distributions.Law):
 class Stuck(Bernoulli):
     """A continuous family whose draws have no gradient."""
 
+    support, discrete, reparameterised = dist.constraints.real, False, False
+
     def distribution(self, parameters):
         return dist.Normal(parameters[0], 1.0)
 
@@ -126,6 +131,8 @@ class Stuck(Bernoulli):
 
 class Pairs(Bernoulli):
     """Two coordinates each are one event."""
+
+    support, discrete = dist.constraints.real, False
 
     def distribution(self, parameters):
         return dist.Normal(parameters[0].unflatten(-1, (-1, 2)), 1.0).to_event(1)
@@ -165,5 +172,46 @@ def test_latents_whose_draws_have_no_gradient_are_refused():
 
 @pytest.mark.parametrize("place", ["px", "qz", "pz"])
 def test_events_of_some_coordinates_are_refused(place):
-    with pytest.raises(ValueError, match="either"):
-        model(**{place: Pairs})
+    x = torch.randn(2, 3, 2)
+    with pytest.raises(ValueError, match=r"event \(2,\); by its event_dim = 0 it has no event"):
+        dvae.SequenceELBO().terms(model(**{place: Pairs}), x)
+
+
+def test_a_law_whose_values_are_discrete_without_saying_so_is_refused():
+    class Undeclared(Bernoulli):
+        discrete = False
+
+    with pytest.raises(ValueError, match="declare discrete = True"):
+        dvae.SequenceELBO().terms(model(px=Undeclared), torch.zeros(2, 3, 2))
+
+
+DECLARED = {
+    **FAMILIES,
+    "normals": distributions.StandardNormal(),
+    "cauchy": distributions.Family("Cauchy"),
+    "simplex": distributions.Family("Dirichlet"),
+    "binomial": distributions.Family("Binomial", {"total_count": 10}),
+    "heavy": distributions.Family("Pareto"),
+    "parts": distributions.Product(
+        (((0,), FAMILIES["positive"]), ((1, 2), FAMILIES["category"]), ((3,), FAMILIES["real"]))
+    ),
+    "mixture prior": distributions.Mixture(),
+    "flow prior": distributions.Flow(),
+}
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_laws_declare_what_their_distributions_are(name):
+    """Event, discreteness, gradients of draws, and a value with a density."""
+    prior = "prior" in name
+    law = DECLARED[name].build(Shape(4, 0 if prior else 5, not prior)).eval()
+    features = torch.randn(1, 0 if prior else 5, requires_grad=True)
+    parameters = law(features)
+    made = law.distribution(parameters)
+    drawn = law.draw(parameters, law.noise((1, 4), features))
+    assert len(made.event_shape) == law.event_dim
+    assert made.support.is_discrete == law.discrete
+    assert law.reparameterised == (drawn.requires_grad and not law.discrete) or name == "normals"
+    inside = law.inside(4)
+    value = torch.zeros(1, 4) if inside is None else inside[None]
+    assert law.support is None or torch.isfinite(made.log_prob(value)).all()
