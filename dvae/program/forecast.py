@@ -56,7 +56,7 @@ def forecast(
     local = {name for name in data if name in model.context and data[name].dim() == 3}
     seen = {name: value[:, :past] if name in local else value for name, value in data.items()}
     if past:
-        model._rollout(model.inference, model.encoder, seen, None, 1)  # refuses what cannot be read, of all sequences
+        model.rollout(seen, guide=True)  # refuses what cannot be read, of all sequences
     # what the guide makes of the past alone, once for all samples
     alike = model.forks and not redrawn and not model.grouped and model.latents[:1] == model.prior_order[:1]
     forked = model.latents[:1] if alike else ()
@@ -113,7 +113,7 @@ def _fixed(
 def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
     """Means of the data given latents from the guide, teacher-forced."""
     data = model.read(batch)
-    whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read
+    whole = model.rollout(data, guide=True)  # refuses what cannot be read
 
     def means(part: slice, count: int) -> dict[str, Tensor]:
         some = repeat(rows(data, part), count)
@@ -138,7 +138,7 @@ def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, T
     if not model.summed:
         raise ValueError(f"nothing is summed out in {model.generative}; discrete latents have sizes of dvae.Discrete")
     data = model.read(batch)
-    whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read
+    whole = model.rollout(data, guide=True)  # refuses what cannot be read
 
     def probabilities(part: slice, count: int) -> dict[str, Tensor]:
         some = repeat(rows(data, part), count)
@@ -150,7 +150,7 @@ def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, T
 
 def _given(model: Any, batch: AnyBatch, latents: Mapping[str, Tensor]) -> Any:
     """The generative run in which data and latents are known."""
-    rollout = model._rollout(model.generative, model.generator, batch, None, 1)
+    rollout = model.rollout(batch)
     rollout.values.update(latents)
     return rollout
 
@@ -184,7 +184,7 @@ def impute(
 def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int, particles: int) -> dict[str, Tensor]:
     """The data with draws of what is missing, each given latents from the guide and what came before it."""
     data = model.read(batch)
-    whole = model._rollout(model.inference, model.encoder, data, None, 1)  # refuses what cannot be read
+    whole = model.rollout(data, guide=True)  # refuses what cannot be read
     groups = whole.groups if model.grouped else None
 
     def draws(part: slice, count: int) -> dict[str, Tensor]:

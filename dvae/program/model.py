@@ -276,6 +276,29 @@ class DynamicalVAE(nn.Module):
             return False
         return not any(each.law.error_weight for each in laws)
 
+    def rollout(
+        self, batch: AnyBatch | None, length: int | None = None, size: int = 1, *, guide: bool = False
+    ) -> Rollout:
+        """A run over a batch in which nothing has been drawn yet: values that are known, and those to draw on demand.
+
+        `model` and `guide` put its laws into sample sites. Use it to look at laws step by step, as the oracle and
+        the particle filter do.
+
+        Args:
+            batch: see `model`; None for a free run.
+            length: T, where it is not that of the data.
+            size: B, where the batch does not tell.
+            guide: run the guide, not the model.
+
+        Raises:
+            ValueError: a batch that cannot be read.
+        """
+        if guide:
+            return self.reader.rollout(self.inference, self.encoder, self.read(batch), length, size)
+        found = self.reader.rollout(self.generative, self.generator, self.read(batch), length, size)
+        found.sums = self.sums
+        return found
+
     # The Pyro program ----------------------------------------------------------------------------------------------
 
     def model(
@@ -314,7 +337,7 @@ class DynamicalVAE(nn.Module):
         self._register()
         self._check_draws(draws or {})
         data = self.read(batch, size=size, curriculum=curriculum)
-        rollout = self._rollout(self.generative, self.generator, data, length, size)
+        rollout = self.rollout(data, length, size)
         prefixed = dict(rollout.prefix)
         for name, value in (prefix or {}).items():
             told = name in self.summed and not self.generative.local(name)
@@ -382,7 +405,7 @@ class DynamicalVAE(nn.Module):
         """
         self._register()
         self._check_draws(draws or {})
-        rollout = self._rollout(self.inference, self.encoder, self.read(batch, curriculum=curriculum), None, 1)
+        rollout = self.rollout(self.read(batch, curriculum=curriculum), guide=True)
         for name in self.observed:
             if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
                 raise ValueError(f"the guide reads {name}, the batch holds {', '.join(rollout.values) or 'nothing'}")
@@ -620,13 +643,6 @@ class DynamicalVAE(nn.Module):
         """
         added = {name: data[name] for name in self.view.names if name in data} if data else {}
         return {**values, **self.view.inverse(added | {n: v for n, v in values.items() if n in self.observed})}
-
-    def _rollout(
-        self, factorization: Factorization, conditionals: Any, batch: AnyBatch | None, length: int | None, size: int
-    ) -> Rollout:
-        rollout = self.reader.rollout(factorization, conditionals, self.read(batch), length, size)
-        rollout.sums = self.sums if factorization is self.generative else None
-        return rollout
 
 
 def _is_wide(batch: Any, name: str) -> bool:

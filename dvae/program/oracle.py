@@ -141,7 +141,7 @@ class Oracle:
 
     def _run(self, x: Tensor | Mapping[str, Tensor]) -> Rollout:
         """The model's run over a batch, with its values, lengths and observed entries."""
-        run = self.model._rollout(self.model.generative, self.model.generator, x, None, 1)
+        run = self.model.rollout(x)
         if missing := [name for name in self.model.observed if name not in run.values]:
             raise ValueError(f"the batch has no {', '.join(missing)}; the oracle needs a value of every data variable")
         if run.length != self.steps:

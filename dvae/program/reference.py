@@ -19,7 +19,7 @@ def reference(model: Any, batch: AnyBatch) -> None:
     Sites are "z_1", "x_1", "z_2", ... as in the equations. Each factor is given noise in place of every value that is
     not drawn yet, so that a network that reads what it should not changes the result. Slow.
     """
-    rollout = model._rollout(model.generative, model.generator, batch, None, 1)
+    rollout = model.rollout(batch)
     known = {name: value for name, value in rollout.values.items() if name not in model.observed}
     size, length = rollout.batch, rollout.length
 

@@ -116,7 +116,7 @@ class Filter:
     def __init__(self, model: DynamicalVAE, batch: AnyBatch, particles: int):
         self.model = model
         self.particles = particles
-        self.known = model._rollout(model.generative, model.generator, batch, None, 1)
+        self.known = model.rollout(batch)
         self.hidden = _hidden(self.known)
         self.shared = {name: value for name, value in self.known.values.items() if name not in self.hidden}
         self.late = _late(model)
@@ -346,7 +346,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
     Raises:
         ValueError: a batch that cannot be read.
     """
-    run = model._rollout(model.generative, model.generator, batch, None, 1)
+    run = model.rollout(batch)
     instead = "use importance_bound"
     if model.summed:
         return f"{', '.join(model.summed)} is summed out, exactly, and not followed by particles; {instead}"

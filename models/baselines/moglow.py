@@ -143,7 +143,7 @@ def start_flow(model: DynamicalVAE, windows: Any) -> None:
         units.fit(bridged(exact[WHOLE], exact.get("mask", {}).get(WHOLE)))
     data = model.read(batch)
     x = data[WHOLE]
-    run = model._rollout(model.generative, model.generator, data, None, 1)
+    run = model.rollout(data)
     with torch.no_grad():
         parameters = run.parameters(WHOLE, x)
     mask, centred = run.mask(WHOLE), model.generator[WHOLE].centred(x)

@@ -42,7 +42,6 @@ from ...data.views import WHOLE
 from ...distributions.base import LawSpec
 from ...distributions.kalman import LinearGaussianChain, update
 from ...distributions.triangular import InverseCholesky, Triangular, refuse_half
-from ...factorization.notation import Factorization
 from ...inference.training.options import Stage
 from ...inference.training.recipe import Recipe
 from ...networks import Dense, Input, Network, NetworkSpec
@@ -126,10 +125,10 @@ class KalmanVAE(DynamicalVAE):
     """The model of `KVAE`: a_t is there at the frames of which something was observed."""
 
     @override
-    def _rollout(
-        self, factorization: Factorization, conditionals: Any, batch: AnyBatch | None, length: int | None, size: int
+    def rollout(
+        self, batch: AnyBatch | None, length: int | None = None, size: int = 1, *, guide: bool = False
     ) -> Rollout:
-        run = super()._rollout(factorization, conditionals, batch, length, size)
+        run = super().rollout(batch, length, size, guide=guide)
         if WHOLE not in run.observed:
             return run
         seen = run.observed[WHOLE].any(-1)
@@ -138,7 +137,7 @@ class KalmanVAE(DynamicalVAE):
         present = present if valid is None else present | ~valid
         if not present.all():
             run.present = {"a": present}
-        if conditionals is self.encoder and run.present:
+        if guide and run.present:
             return Encoding(**{f.name: getattr(run, f.name) for f in fields(run)}, network=self.generator["a"].network)
         return run
 
@@ -427,7 +426,7 @@ def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLa
     if samples < 1:
         raise ValueError(f"samples is at least 1, got {samples}")
     data = {name: repeat(value, samples) for name, value in model.read(batch).items()}
-    run = model._rollout(model.inference, model.encoder, data, None, 1)
+    run = model.rollout(data, guide=True)
     present, valid = run.present.get("a"), None if run.lengths is None else valid_steps(run.lengths, run.length).t()
     a = model.guide(data)["a"].transpose(0, 1)
     chain, _, alpha = network.chain_of(a, None if present is None else present.t(), valid)

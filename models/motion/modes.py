@@ -241,13 +241,15 @@ class ModesModel(FutureModel):
         return super().guide(self.in_sets(batch) if draws else batch, **options)
 
     @override
-    def _rollout(self, factorization: Any, conditionals: Any, batch: Any, length: int | None, size: int) -> Rollout:
+    def rollout(
+        self, batch: AnyBatch | None, length: int | None = None, size: int = 1, *, guide: bool = False
+    ) -> Rollout:
         data = self.read(batch)
-        if MODE in factorization.context and MODE not in data and HISTORY in data:
+        if MODE in (self.inference if guide else self.generative).context and MODE not in data and HISTORY in data:
             history = data[HISTORY]
             drawn = torch.randint(self.modes, history.shape[:1], device=history.device)
             data = {**data, MODE: self._coded(drawn, history)}
-        rollout = super()._rollout(factorization, conditionals, data, length, size)
+        rollout = super().rollout(data, length, size, guide=guide)
         return replace(rollout, draws=self.modes) if WHOLE_SETS in data else rollout
 
     @override

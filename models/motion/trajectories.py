@@ -446,7 +446,7 @@ class TrajectoryModel(DynamicalVAE):
         bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
 
         def means(z: Tensor) -> Tensor:
-            rollout = self._rollout(self.generative, self.generator, data, data[GIVEN].shape[1], 1)
+            rollout = self.rollout(data, data[GIVEN].shape[1])
             rollout.mean_emission = (WHOLE,)
             rollout.values[self.latents[0]] = z
             return rollout.draw(WHOLE)

@@ -95,7 +95,7 @@ def test_the_sum_is_that_over_all_courses(equations, states):
     summed = torch.stack(list(model.log_joint(data, latents).values())).sum(0)
     torch.testing.assert_close(summed, every.logsumexp(0), rtol=0, atol=1e-10)
     posterior = every.softmax(0)
-    courses, run = model.sums.courses(STEPS), model._rollout(model.generative, model.generator, data, None, 1)
+    courses, run = model.sums.courses(STEPS), model.rollout(data)
     run.values.update(latents)
     for name, found in run.summation.probabilities().items():
         torch.testing.assert_close(

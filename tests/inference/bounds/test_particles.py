@@ -117,16 +117,16 @@ def textbook(model, batch, particles, resample_below):
     everyone = repeat(model.read(batch), particles)
     latents, n = {}, len(everyone["x"])
 
-    def program(factorization, conditionals):
-        rollout = model._rollout(factorization, conditionals, everyone, None, 1)
+    def program(guide=False):
+        rollout = model.rollout(everyone, guide=guide)
         rollout.values.update(latents)
         return rollout
 
     def guide():
-        return program(model.inference, model.encoder)
+        return program(guide=True)
 
     def generator():
-        return program(model.generative, model.generator)
+        return program()
 
     def draw(law, noise):
         return law.loc + law.scale * noise

@@ -57,7 +57,7 @@ def test_it_starts_where_training_data_are_noise_of_variance_1(mean, dtype):
     model = small().build({"x": 3}).to(dtype)
     start_flow(model, Sequences({"x": x}))
     torch.testing.assert_close(model.units["x"].scale.double(), x.var((0, 1)).mean().sqrt(), rtol=0.1, atol=0)
-    run = model._rollout(model.generative, model.generator, x, None, 1)
+    run = model.rollout(x)
     law, centred = run.evaluate("x", x), model.generator["x"].centred(x)
     noise, _ = getattr(law, "base", law).flow.to_noise(centred)
     torch.testing.assert_close(noise.mean((0, 1)).double(), torch.zeros(3).double(), rtol=0, atol=0.2)

@@ -98,7 +98,7 @@ def test_nothing_of_joints_that_are_not_given_is_read(windows):
     x = batch["x"].requires_grad_()
     for curriculum, unseen in ((0.2, slice(0, 0)), (0.3, slice(7, 11))):
         data = {"x": x, "y": x * shown, HIDDEN: hidden}
-        rollout = model._rollout(model.generative, model.generator, model.read(data, curriculum=curriculum), None, 1)
+        rollout = model.rollout(model.read(data, curriculum=curriculum))
         mean = rollout.parameters("x", x[:, 1:])[0]
         (slope,) = torch.autograd.grad(mean.sin().sum(), x)
         read = (slope != 0).any(0)

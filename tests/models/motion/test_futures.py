@@ -109,7 +109,7 @@ def test_decoders_read_their_own_means_in_training_and_gradients_flow_through_th
     drawn, data = model.guide(batch), model.read(batch)
     means = []
     for shift in (0, 1):
-        fed = model._rollout(model.generative, model.generator, {**data, "x": data["x"] + shift}, None, 1)
+        fed = model.rollout({**data, "x": data["x"] + shift})
         fed.feeding = model.feeding
         fed.values.update(drawn)
         means.append(fed.parameters("x", data["x"] + shift)[0])
