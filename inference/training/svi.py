@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
+from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -348,10 +349,15 @@ class SVI:
             on_device = self.fabric.to_device(placed)
             return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensors that it sees
         except ValueError as error:
-            # torch's distributions refuse NaN parameters and values before there is a term to look at
-            if "invalid values" not in str(error) and "within the support" not in str(error):
+            if not _by_distribution(error):
                 raise
             raise NonFiniteError(f"{where}: {reason(error).partition(chr(10))[0]}") from error
+
+
+def _by_distribution(error: ValueError) -> bool:
+    """Whether a distribution raised it: torch's refuse NaN parameters and values before there is a term to look at."""
+    *_, (frame, _) = walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__")).startswith(("torch.distributions", "pyro.distributions"))
 
 
 class _Bound(nn.Module):
