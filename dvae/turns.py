@@ -1,8 +1,8 @@
 """Threads take turns: Pyro's stack of handlers and torch's random state are one for the whole process.
 
 Two programs that ran at once would land on each other's stack, and draw from each other's random numbers. So `alone`
-is held while a model is built or a program runs: in `DynamicalVAE.running`, in the terms of a bound, in a step or a
-validation of `SVI`, and in `seeded`, which also sets and restores the random state. Threads wait for each other that
+is held while a model is built or a program runs: in `DynamicalVAE.running`, in the terms of a bound, in a step of
+`SVI`, and in `seeded`, which also sets and restores the random state. Threads wait for each other that
 long, not for a whole fit. Processes run side by side (`dvae.runs.sweep`). When a process forks while another thread
 holds the lock, the child starts with a free lock and without that thread's handlers.
 """

@@ -220,7 +220,6 @@ class SVI:
         rates = self.rates(self.state.step - 1)
         return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_frame(_sums(self.state.terms))}
 
-    @alone
     def evaluate(self, data: Any) -> dict[str, float]:
         """Return the terms of the unweighted bound on data, in nats per frame; the model is left in evaluation mode.
 
