@@ -36,7 +36,7 @@ from dvae.data.sequences import each
 from dvae.distributions import scan
 from dvae.distributions.chain import gaussian_chain
 from dvae.distributions.kalman import LinearGaussianChain
-from dvae.networks.base import shift
+from dvae.networks.loop import shift
 
 BATCH, STEPS, SIZE = 32, 125, 48
 TARGETS = {

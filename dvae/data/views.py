@@ -25,7 +25,7 @@ from typing_extensions import override
 
 from ..constants import indices
 from ..factorization.notation import Factorization
-from ..networks.base import valid_steps
+from ..networks.loop import valid_steps
 from .sequences import Batch
 
 WHOLE = "x"

@@ -65,7 +65,7 @@ class NormalLaw(Gaussian):
         loc, raw = self.out(features).chunk(2, dim=-1)
         # contiguous: on a slice, softplus is not vectorised and takes nine times as long
         scale = functional.softplus(raw.contiguous()) + self.min_scale
-        return self.moved(loc, previous), scale
+        return loc if previous is None else self.moved(loc, previous), scale
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class FixedNormalLaw(Gaussian):
             if end > self.steps:
                 raise ValueError(f"FixedNormal(steps={self.steps}) was given {end} steps; build it with so many")
             scale = scale[first:end] if loc.dim() == 3 else scale[first]
-        return self.moved(loc, previous), scale.expand_as(loc)
+        return loc if previous is None else self.moved(loc, previous), scale.expand_as(loc)
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from typing_extensions import override
 
 from ..constants import constant, indices, visible
 from ..factorization.relations import Relation
-from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, at, part, valid_steps
+from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, part
 from .extract import Extract, Extractors
-from .rows import Rows, select
+from .loop import Rows, each_at, select, valid_steps
 
 
 @dataclass(frozen=True)
@@ -297,9 +297,9 @@ class AttentionNetwork(Network):
 
     @override
     def step(self, state: Attending, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        drawn = self.extractors.drawn(state.extracted, drawn, state.lengths)
+        drawn = self.extractors.drawn(state.extracted, drawn, state.lengths) if self.extractors else drawn
         stream = self.origin.expand(state.batch, -1)
-        parts = [at(drawn[p.name], t + lag, stream, p.size) for p, lag in state.points if lag is not None]
+        parts = each_at(drawn, state.points, t, stream)
         if state.queries is not None and self.point is not None:
             stream = stream + self.point.add(state.queries, t, parts)
         if self.layers:

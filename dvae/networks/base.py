@@ -8,13 +8,11 @@ everything that does not depend on a variable being drawn computed once, in `sta
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +20,7 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..factorization.relations import Relation
-from .rows import Rows, select
+from .loop import select, shift
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "gelu": nn.GELU, "elu": nn.ELU}
 
@@ -49,49 +47,6 @@ class Input:
         if any(math.isinf(end) for interval in self.relation.intervals for end in interval):
             return None
         return tuple(lag for low, high in self.relation.intervals for lag in range(int(low), int(high) + 1))
-
-
-Computed = TypeVar("Computed")
-_ONCE: ContextVar[dict[Any, Any] | None] = ContextVar("once", default=None)
-
-
-@contextmanager
-def computing_once() -> Iterator[None]:
-    """Within it, `once` results are kept: for one evaluation of guide and model, whose parameters do not change."""
-    if _ONCE.get() is not None:
-        yield
-        return
-    token = _ONCE.set({})
-    try:
-        yield
-    finally:
-        _ONCE.reset(token)
-
-
-def once(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
-    """compute(), or its result for the same owner, such as a module, and the very same inputs within `computing_once`.
-
-    Factors that share a module (SRNN's h_t) then evaluate it once, without knowing of each other.
-    """
-    kept = _ONCE.get()
-    if kept is None:
-        return compute()
-    key = _key(owner, inputs)
-    if key not in kept:
-        kept[key] = (inputs, compute())  # the inputs are held, so that their ids stay theirs
-    result: Computed = kept[key][1]
-    return result
-
-
-def keep(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
-    """Tells `once` a result that came about in another way, such as within a loop."""
-    kept = _ONCE.get()
-    if kept is not None:
-        kept[_key(owner, inputs)] = (inputs, result)
-
-
-def _key(owner: object, inputs: Sequence[Any]) -> tuple[Any, ...]:
-    return id(owner), torch.is_grad_enabled(), *map(id, inputs)
 
 
 class Network(nn.Module):
@@ -220,108 +175,9 @@ class NetworkSpec(Protocol):
         ...
 
 
-def shift(values: Tensor, lag: int) -> Tensor:
-    """values[:, t + lag] at every t of (B, T, D), zero where t + lag is outside."""
-    if lag == 0:
-        return values
-    steps = values.shape[1]
-    moved = values[:, max(lag, 0) : steps + min(lag, 0)] if abs(lag) < steps else values[:, :0]
-    gap = min(abs(lag), steps)
-    return functional.pad(moved, (0, 0, gap, 0) if lag < 0 else (0, 0, 0, gap))
-
-
 def part(values: Tensor, lag: int | None) -> Tensor:
     """A parent's contribution at every step: itself if static, else shifted by its lag."""
     return values if lag is None else shift(values, lag)
-
-
-def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
-    """values[t] of a loop's draws, zero outside the sequence; `like` is any (B, ...) tensor."""
-    return values[t] if 0 <= t < len(values) else like.new_zeros(like.shape[0], size)
-
-
-def over(values: Sequence[Tensor], t: int, count: int, like: Tensor, size: int) -> Tensor:
-    """(B, N, D) of a loop's draws at N steps from t on, as `at` has them."""
-    return torch.stack([at(values, s, like, size) for s in range(t, t + count)], dim=1)
-
-
-def valid_steps(lengths: Tensor, length: int) -> Tensor:
-    """(B, T) True at the steps of a ragged batch that exist."""
-    return torch.arange(length, device=lengths.device) < lengths[:, None]
-
-
-def again(values: Tensor, n: int) -> Tensor:
-    """Every row n times over, (n B, ...), row after row; `once_valid` finds features of the rows as they were."""
-    repeated = values.repeat(n, *[1] * (values.dim() - 1))
-    keep(again, [repeated], (values, n))
-    return repeated
-
-
-def steps_of(values: Tensor) -> Sequence[Tensor]:
-    """The steps of values (B, T, ...), which `whole_of` knows."""
-    steps = values.unbind(1)
-    keep(steps_of, steps, values)
-    return steps
-
-
-def whole_of(steps: Sequence[Tensor]) -> Tensor:
-    """Values (B, T, ...) of these steps: what they are steps of, if that is known."""
-    return once(steps_of, steps, lambda: torch.stack(list(steps), dim=1))
-
-
-def once_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Tensor:
-    """The module's features of (B, T, D) or (B, D), 0 at padding; once for all that read the same values."""
-
-    def compute() -> Tensor:
-        first, n = once(again, [values], lambda: (values, 1))
-        if n > 1 and lengths is None:
-            return again(once_valid(module, first, None), n)
-        found: Tensor = module(values)
-        if lengths is None or found.dim() == 2:
-            return found
-        return found * valid_steps(lengths, found.shape[1])[..., None]
-
-    return once(module, [values, lengths], compute)
-
-
-def follow(
-    rows: Rows,
-    drawn: Sequence[Any],
-    module: nn.Module,
-    lengths: Tensor | None,
-    change: Callable[[Tensor], Tensor] | None = None,
-) -> Rows:
-    """What a module makes of the draws (B, D) of a loop so far, 0 at padding; once for all that read the same draws.
-
-    Args:
-        rows: of the steps before, to which those of the others are added.
-        drawn: by step; None where there is none yet.
-        module, lengths: see `once_valid`.
-        change: the module as the loop has it, with its work done that is the same at all steps.
-    """
-    there = drawn.values if isinstance(drawn, Rows) else drawn
-    fresh = [s for s, (made, value) in enumerate(zip(rows.values, there, strict=False)) if made is None is not value]
-    values = [drawn[s] for s in fresh]
-
-    def compute() -> Sequence[Tensor]:
-        return (
-            [(change or module)(values[0])]
-            if len(values) == 1
-            else steps_of(once_valid(module, whole_of(values), None))
-        )
-
-    for s, made in zip(fresh, once(module, [lengths, *values], compute) if fresh else [], strict=True):
-        rows[s] = made if lengths is None else made * (s < lengths)[:, None]
-    return rows
-
-
-def reverse(values: Tensor, lengths: Tensor | None) -> Tensor:
-    """(B, T, D) with every sequence's valid steps in reverse order, padding left behind them."""
-    if lengths is None:
-        return values.flip(1)
-    steps = torch.arange(values.shape[1], device=values.device)
-    order = torch.where(steps < lengths[:, None], lengths[:, None] - 1 - steps, steps)
-    return values.gather(1, order[..., None].expand_as(values))
 
 
 @dataclass

@@ -27,8 +27,9 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..factorization.relations import ALL
-from .base import AtOnce, Input, Network, once_valid
+from .base import AtOnce, Input, Network
 from .dct import cosine_basis
+from .loop import once_valid
 
 
 @dataclass(frozen=True)

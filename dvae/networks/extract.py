@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from .base import Input, follow, once_valid, perceptron
-from .rows import Rows
+from .base import Input, perceptron
+from .loop import Rows, follow, once_valid
 
 
 class ExtractorSpec(Protocol):

@@ -16,9 +16,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from ..distributions.families import KnownNoise
-from .base import Input, Network, NetworkSpec, valid_steps
+from .base import Input, Network, NetworkSpec
+from .loop import select, valid_steps
 from .recurrent import Recurrent
-from .rows import select
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ..constants import visible
-from .base import Input, Network, at
-from .rows import select
+from .base import Input, Network
+from .loop import at, select
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from .base import Chain, Hoisted, Input, Join, Network, at, keep, once, over, part, perceptron, reverse, shift
+from .base import Chain, Hoisted, Input, Join, Network, part, perceptron
 from .cells import GRU, LSTM
 from .extract import Extract, Extractors
-from .rows import Rows, select
+from .loop import Rows, at, each_at, keep, once, over, reverse, select, shift
 
 CELLS: dict[str, type[GRU] | type[LSTM]] = {"gru": GRU, "lstm": LSTM}
 
@@ -306,15 +306,15 @@ class RecurrentNetwork(Network):
 
     @override
     def step(self, state: RecurrentState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        values = self.extractors.drawn(state.extracted, drawn, state.lengths)
+        values = self.extractors.drawn(state.extracted, drawn, state.lengths) if self.extractors else drawn
         parts = [memory.step(memory_state, t, values) for memory, memory_state in state.memories]
         like = parts[0] if parts else state.hoisted.like
-        parts += [at(values[parent.name], t + lag, like, parent.size) for parent, lag in state.live]
+        parts += each_at(values, state.live, t, like) if state.live else []
         return self.join.add(state.hoisted, t, parts), state
 
     @override
     def stretch(self, state: RecurrentState, t: int, count: int, drawn: Any) -> tuple[Tensor, Any]:
-        values = self.extractors.drawn(state.extracted, drawn, state.lengths)
+        values = self.extractors.drawn(state.extracted, drawn, state.lengths) if self.extractors else drawn
         parts = [memory.stretch(memory_state, t, count, values) for memory, memory_state in state.memories]
         like = parts[0] if parts else state.hoisted.like
         parts += [over(values[parent.name], t + lag, count, like, parent.size) for parent, lag in state.live]

@@ -35,9 +35,9 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ..distributions.triangular import InverseCholesky, Triangular, refuse_half
-from .base import Input, Network, NetworkSpec, at, once, shift, valid_steps
+from .base import Input, Network, NetworkSpec
+from .loop import at, once, select, shift, valid_steps
 from .recurrent import Recurrent
-from .rows import select
 
 ORDER = 22
 """Terms of the series over a gap of norm 1: in double precision the rest is below rounding, 2^22 / 23! = 2e-16."""

@@ -19,7 +19,8 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..factorization.relations import ALL
-from .base import AtOnce, Input, Network, once, perceptron
+from .base import AtOnce, Input, Network, perceptron
+from .loop import once
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from ..data.units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float3
 from ..data.views import LOG_DET, WHOLE, View
 from ..distributions.product import ProductSupport
 from ..factorization.notation import Factorization
-from ..networks.base import again, once, valid_steps
+from ..networks.loop import again, once, valid_steps
 from .conditional import Conditional
 from .groups import GROUP, Groups
 from .rollout import Rollout

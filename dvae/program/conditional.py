@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
@@ -18,21 +18,8 @@ from ..distributions.chain import DERIVATIVES, gaussian_chain
 from ..distributions.families import NormalLaw
 from ..distributions.precise import Offset
 from ..factorization.notation import Factor
-from ..networks.base import (
-    Input,
-    Network,
-    NetworkSpec,
-    at,
-    follow,
-    indicator,
-    once,
-    once_valid,
-    over,
-    presence,
-    shift,
-    valid_steps,
-)
-from ..networks.rows import Rows, select
+from ..networks.base import Input, Network, NetworkSpec, indicator, presence
+from ..networks.loop import Rows, at, follow, once, once_valid, over, select, shift, valid_steps
 from .groups import Groups
 
 CONSTANT = "1"
@@ -265,6 +252,11 @@ class Conditional(nn.Module):
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Values (..., D) of the child, see `Law.draw`."""
         return self._placed(self.law.draw(parameters, noise))
+
+    @property
+    def drawing(self) -> Callable[[Parameters, Tensor], Tensor]:
+        """`draw`, for a loop: the law's own where values have no offset."""
+        return self.law.draw if self.offset is None else self.draw
 
     def _placed(self, value: Tensor) -> Tensor:
         offset = self.offset

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..data.sequences import refuse_table
 from ..data.views import WHOLE
-from ..networks.base import computing_once
+from ..networks.loop import computing_once
 from ..options import Count, Range, require
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like

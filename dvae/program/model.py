@@ -31,7 +31,7 @@ from ..factorization.inversion import guide
 from ..factorization.notation import Factor, Factorization, check_pair
 from ..factorization.relations import MaskFunction
 from ..networks import NetworkSpec, Recurrent
-from ..networks.base import once
+from ..networks.loop import once
 from ..options import Range, kind_of, problem
 from ..turns import alone
 from .batch import CHUNK, AnyBatch, Reader

@@ -27,8 +27,9 @@ from ..distributions.families import FixedNormal, FixedNormalLaw, Gaussian
 from ..distributions.family import Family
 from ..factorization.inversion import FAITHFUL, guide
 from ..factorization.notation import Factor, Factorization
-from ..networks.base import indicator, valid_steps
+from ..networks.base import indicator
 from ..networks.linear import Linear, LinearNetwork
+from ..networks.loop import valid_steps
 from ..options import Count, kind_of, require
 from ..turns import seeded
 from .conditional import Conditional, like

@@ -21,7 +21,8 @@ from torch.distributions import constraints
 
 from ..distributions.base import Parameters
 from ..factorization.notation import Block, Factorization
-from ..networks.base import again, computing_once, indicator, presence, steps_of, valid_steps
+from ..networks.base import indicator, presence
+from ..networks.loop import again, computing_once, steps_of, valid_steps
 from .conditional import Conditional, like
 from .groups import Grouped, Groups
 from .summed import Summation, Sums
@@ -440,6 +441,7 @@ class Rollout:
         hidden: Mapping[str, Hidden] | None,
         told: Mapping[str, Tensor],
     ) -> dict[str, Tensor]:
+        draw = {name: self.conditionals[name].drawing for name in live}
         states = {name: self.conditionals[name].start(given, self.batch, self.length, self.lengths) for name in live}
         padded = self._valid is not None and block.direction < 0  # a backward loop meets the padding first
         if len(live) == 1 and hidden is None and not padded and live[0] in noise and live[0] not in self.prefix:
@@ -473,7 +475,7 @@ class Rollout:
                 if known[t]:
                     continue
                 drawing = name in steps
-                value = conditional.draw(parameters, steps[name][t]) if drawing else conditional.mean(parameters)
+                value = draw[name](parameters, steps[name][t]) if drawing else conditional.mean(parameters)
                 if hidden is not None:
                     value = hidden[name].fill(told[name][:, t], value, t)
                 elif name in self.prefix and t < self.prefix[name].shape[1]:

@@ -24,7 +24,7 @@ from torch.distributions import kl_divergence
 
 from ...data.views import LOG_DET
 from ...factorization.graph import analytic_kl
-from ...networks.base import computing_once
+from ...networks.loop import computing_once
 from ...program.batch import AnyBatch, repeat
 from ...program.conditional import like
 from ...program.groups import GROUP, Groups

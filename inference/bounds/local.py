@@ -31,7 +31,7 @@ from ...distributions.base import Parameters
 from ...distributions.families import Gaussian
 from ...factorization.graph import audit
 from ...factorization.notation import Factor, Factorization, Parent
-from ...networks.base import computing_once
+from ...networks.loop import computing_once
 from ...program.batch import AnyBatch, repeat
 from ...program.conditional import Conditional
 from ...program.groups import GROUP

@@ -24,8 +24,8 @@ from ...data.sequences import each
 from ...data.views import LOG_DET, volume
 from ...distributions.base import Parameters
 from ...factorization.notation import Factor, Parent
-from ...networks.base import computing_once, indicator, presence, valid_steps
-from ...networks.rows import Rows, pick, select
+from ...networks.base import indicator, presence
+from ...networks.loop import Rows, computing_once, pick, select, valid_steps
 from ...program.batch import AnyBatch
 from ...program.conditional import Conditional, like
 from ...program.groups import GROUP

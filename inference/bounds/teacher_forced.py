@@ -15,7 +15,7 @@ from pyro import poutine
 from torch import Tensor
 
 from ...data.sequences import Batch, each
-from ...networks.base import valid_steps
+from ...networks.loop import valid_steps
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence as SequenceLaw

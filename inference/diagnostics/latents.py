@@ -10,7 +10,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from ...networks.base import valid_steps
+from ...networks.loop import valid_steps
 from ...program.batch import AnyBatch, repeat, rows
 from ...program.groups import GROUP
 from ...program.model import DynamicalVAE

@@ -20,7 +20,7 @@ from torch.distributions import constraints
 
 from ...data.sequences import Batch, InBatches, Source, mask_of
 from ...data.views import WHOLE
-from ...networks.base import valid_steps
+from ...networks.loop import valid_steps
 from ...program.model import DynamicalVAE
 
 WINDOWS = 128

@@ -27,8 +27,9 @@ from ...inference.training.options import Training
 from ...inference.training.recipe import Recipe
 from ...motion import Windows
 from ...networks import Input, Network, NetworkSpec
-from ...networks.base import once, perceptron, share_modules
+from ...networks.base import perceptron, share_modules
 from ...networks.cells import GRU
+from ...networks.loop import once
 from ...options import Size
 from ...program.rollout import SelfFeeding
 from ..motion.futures import FedBackNetwork

@@ -42,7 +42,8 @@ from ...inference.training.recipe import Recipe
 from ...inference.training.schedules import Ramp
 from ...motion import Windows
 from ...networks import Input, NetworkSpec
-from ...networks.base import AtOnce, once
+from ...networks.base import AtOnce
+from ...networks.loop import once
 from ...options import Share, Size
 from ...program.batch import AnyBatch
 from ..motion.poses import table

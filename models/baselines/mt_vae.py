@@ -42,7 +42,8 @@ from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...inference.training.schedules import Saturating
 from ...networks import Input, Network, NetworkSpec
-from ...networks.base import AtOnce, once
+from ...networks.base import AtOnce
+from ...networks.loop import once
 from ...networks.noise import Residual, half
 from ...networks.recurrent import summary
 from ...options import Amount, Size

@@ -22,7 +22,8 @@ from typing_extensions import override
 from ...distributions.base import LawSpec, Parameters, Shape
 from ...distributions.families import Gaussian
 from ...networks import Dense, Input, NetworkSpec, Recurrent
-from ...networks.base import Network, aligned, at, shift
+from ...networks.base import Network, aligned
+from ...networks.loop import at, shift
 from ...options import Extra, Size
 from ..method import LatentMethod
 

@@ -45,8 +45,9 @@ from ...distributions.triangular import InverseCholesky, Triangular, refuse_half
 from ...inference.training.options import Stage
 from ...inference.training.recipe import Recipe
 from ...networks import Dense, Input, Network, NetworkSpec
-from ...networks.base import presence, valid_steps
+from ...networks.base import presence
 from ...networks.cells import LSTM
+from ...networks.loop import valid_steps
 from ...networks.recurrent import lstm_cell
 from ...options import Range, Size
 from ...program.batch import AnyBatch, repeat

@@ -32,8 +32,9 @@ from ...motion import HUMAN36M, HUMANEVA, Heading, Skeleton
 from ...motion.data.protocols import Poses
 from ...motion.scoring import energies
 from ...networks import Input, Network
-from ...networks.base import once, perceptron, share_modules
+from ...networks.base import perceptron, share_modules
 from ...networks.cells import GRU
+from ...networks.loop import once
 from ...networks.recurrent import gru_cell
 from ...options import Amount, Size
 from ...program.batch import AnyBatch

@@ -35,7 +35,8 @@ from ...inference.training.trackers import Bar
 from ...motion import HUMAN36M, HUMANEVA, Skeleton
 from ...motion.data.protocols import Poses
 from ...networks import Input, Network, NetworkSpec
-from ...networks.base import once, perceptron
+from ...networks.base import perceptron
+from ...networks.loop import once
 from ...options import Size, flat
 from ...program.batch import CHUNK, AnyBatch, repeat, rows
 from ...program.groups import GROUP

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dvae.factorization.relations import Relation
 from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, NodeGraph, Recurrent, SelfAttention
-from dvae.networks.base import computing_once, shift
+from dvae.networks.loop import computing_once, shift
 from dvae.networks.recurrent import tie
 
 T = 6

@@ -6,7 +6,8 @@ import torch
 import dvae
 from dvae.distributions import FixedNormal
 from dvae.networks import WholeDecoder, WholeEncoder
-from dvae.networks.base import computing_once, share_modules
+from dvae.networks.base import share_modules
+from dvae.networks.loop import computing_once
 from dvae.testing import FactorizationContract
 
 NAMES = ("a", "b", "c")

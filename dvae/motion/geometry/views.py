@@ -13,7 +13,7 @@ from typing_extensions import override
 from ...constants import constant, indices
 from ...data.sequences import BESIDE, Batch
 from ...data.views import WHOLE, View
-from ...networks.base import valid_steps
+from ...networks.loop import valid_steps
 from . import kinematics
 from .rotations import in_time, size, to_matrix
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up

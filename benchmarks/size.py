@@ -1,0 +1,122 @@
+"""How large the project is, beside its targets: `python -m benchmarks.size`; a minute.
+
+lines      of code, without docstrings, comments and blank lines
+calls      between files of the project: in a training step, and in a forecast of 50 futures (second call, 60 frames)
+"""
+
+import ast
+import io
+import os
+import subprocess
+import sys
+import tokenize
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+import dvae
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ("dvae", "models", "inference")
+TARGETS = {
+    "lines of source": 25_000,
+    "lines of tests": 17_000,
+    "tests": 3_500,
+    "lines of benchmarks": 3_500,
+    "files of stored scores": 30,
+    "files in the largest folder": 15,
+    "dependencies": 15,
+    "calls, step of srnn": 57,
+    "calls, forecast of srnn": 621,
+    "calls, forecast of hit-dvae": 1_435,
+}
+"""At most. Calls: half of what this script counted before the layout of November 2026."""
+LAYOUT = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+
+
+def lines(file: Path) -> int:
+    """Lines of code of a Python file."""
+    text, found = file.read_text(encoding="utf-8"), set[int]()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in LAYOUT:
+            found |= {*range(token.start[0], token.end[0] + 1)}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            found -= {*range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1)}
+    return len(found)
+
+
+def calls(run: Callable[[], object]) -> int:
+    """Calls from a file of the project to another one."""
+    parts, places, count = tuple(str(ROOT / part) + os.sep for part in SOURCE), dict[str, str](), 0
+
+    def seen(frame, event, _) -> None:
+        nonlocal count
+        if event == "call" and frame.f_back is not None:
+            ours, theirs = (
+                places.setdefault(code.co_filename, os.path.realpath(code.co_filename))
+                for code in (frame.f_code, frame.f_back.f_code)
+            )
+            count += ours != theirs and ours.startswith(parts) and theirs.startswith(parts)
+
+    sys.setprofile(seen)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+def traced() -> dict[str, int]:
+    """Calls of two methods on the simulator's people."""
+    found, protocol = {}, dvae.motion.PROTOCOLS["simulated"]
+    windows = dvae.motion.windows(dvae.motion.simulate(clips=8), protocol, "train")
+    batch = windows.sample(4, torch.Generator().manual_seed(0))
+    for name in ("srnn", "hit-dvae"):
+        model = dvae.method(name).build(windows)
+
+        def step(model=model) -> None:
+            dvae.SequenceELBO().terms(model, batch).bound.sum().backward()
+
+        def forecast(model=model) -> None:
+            model.forecast({"x": batch["x"][:, : protocol.observed]}, protocol.predicted, 50)
+
+        for what, run in (("step", step), ("forecast", forecast)):
+            run()
+            found[f"calls, {what} of {name}"] = calls(run)
+    return found
+
+
+def measured() -> dict[str, int]:
+    """What there is of each row, and of some beside."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    files = [path for path in map(Path, listed) if not (ROOT / path).is_symlink()]
+    own = Counter[str]()
+    for path in files:
+        own[path.parts[0]] += lines(ROOT / path) if path.suffix == ".py" else 0
+    folders = Counter(path.parent for path in files if path.suffix == ".py" and path.parts[0] in SOURCE)
+    collected = subprocess.run(
+        [sys.executable, "-m", "pytest", "--collect-only", "-q"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return {
+        "lines of source": sum(own[part] for part in SOURCE),
+        "lines of tests": own["tests"],
+        "tests": sum("::" in line for line in collected.stdout.splitlines()),
+        "lines of benchmarks": own["benchmarks"],
+        "files of stored scores": sum(path.is_relative_to("benchmarks/scores") for path in files),
+        "files in the largest folder": max(folders.values()),
+        "dependencies": len(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]),
+        **traced(),
+    }
+
+
+if __name__ == "__main__":
+    shown = Table("", "now", "target", box=None)
+    for name, value in measured().items():
+        shown.add_row(name, f"{value:,}", f"{TARGETS[name]:,}" if name in TARGETS else "")
+    Console().print(shown)
