@@ -19,7 +19,7 @@ from ..models.family.equations import Equations
 from ..models.registry import judges
 from ..options import flat
 from ..runs import directory as runs
-from ..tables.scoring import panel_scores
+from ..tables.forecasts import panel_scores
 from . import tables
 from .console import UsageError, note
 

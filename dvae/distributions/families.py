@@ -11,11 +11,32 @@ import pyro.distributions as dist
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
+from torch.distributions import register_kl
 from torch.nn import functional
 from typing_extensions import override
 
 from .base import Law, Parameters, Shape
-from .normal import Normals
+
+HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
+
+
+class Normals(dist.Normal):
+    """Normals with locations and scales (..., D), whose densities and divergences take fewer passes than torch's.
+
+    They are written with quotients, which are used twice, in place of squares of scales: of a training step of STORN
+    that saves a hundredth to a twentieth (docs/results/speed.md).
+    """
+
+    @override
+    def log_prob(self, value: Tensor) -> Tensor:
+        distance = (value - self.loc) / self.scale
+        return torch.addcmul(-HALF_LOG_2_PI - self.scale.log(), distance, distance, value=-0.5)
+
+
+@register_kl(Normals, Normals)
+def _divergence(q: Normals, p: Normals) -> Tensor:
+    ratio, distance = q.scale / p.scale, (q.loc - p.loc) / p.scale
+    return torch.addcmul(torch.addcmul(-0.5 - ratio.log(), ratio, ratio, value=0.5), distance, distance, value=0.5)
 
 
 class Gaussian(Law):

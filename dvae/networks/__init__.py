@@ -7,12 +7,11 @@
 from .attention import Attention, SelfAttention
 from .base import Input, Network, NetworkSpec
 from .cosine import CosineDecoder, CosineEncoder
-from .dense import Dense
 from .graphconv import GraphConv
 from .graphs import FrameGraph, NodeGraph
 from .known import WithNoise
 from .linear import Linear
-from .recurrent import Recurrent
+from .recurrent import Dense, Recurrent
 from .sde import LinearSDE, LinearSDEGuide
 from .whole import WholeDecoder, WholeEncoder
 

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+import scipy
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -28,8 +30,33 @@ from typing_extensions import override
 
 from ..factorization.relations import ALL
 from .base import AtOnce, Input, Network
-from .dct import cosine_basis
 from .loop import once_valid
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
+def cosine_basis(
+    length: int, coefficients: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> Tensor:
+    """The first rows of the orthonormal DCT-II matrix: w_k cos(pi (t + 1/2) k / T), w_0 = sqrt(1/T), else sqrt(2/T).
+
+    As in Mao, Liu, Salzmann and Li, 2019, arXiv 1908.05436.
+
+    Args:
+        length: T.
+        coefficients: C, at most T.
+        dtype, device: of the matrix, which all who ask for it share.
+
+    Returns:
+        (C, T) with orthonormal rows: `basis @ v` are the coefficients of v (T, D), and
+        `basis.T @ c` the sequence of coefficients c (C, D).
+
+    Raises:
+        ValueError: C is not between 1 and T.
+    """
+    if not 1 <= coefficients <= length:
+        raise ValueError(f"a sequence of {length} steps has 1 to {length} coefficients, not {coefficients}")
+    return torch.from_numpy(scipy.fft.idct(np.eye(coefficients, length), axis=1, norm="ortho")).to(device, dtype)
 
 
 @dataclass(frozen=True)

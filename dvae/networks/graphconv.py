@@ -25,7 +25,7 @@ from typing_extensions import override
 
 from ..constants import indices
 from .base import AtOnce, Input
-from .dct import cosine_basis
+from .cosine import cosine_basis
 
 
 @dataclass(frozen=True)

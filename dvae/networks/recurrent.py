@@ -420,3 +420,33 @@ def summary(states: Tensor, direction: int, lengths: Tensor | None) -> Tensor:
     if lengths is None:
         return states[:, -1]
     return states[torch.arange(states.shape[0], device=states.device), lengths - 1]
+
+
+@dataclass(frozen=True)
+class Dense:
+    """A multilayer perceptron on pointwise parents (z_t, z_{t-1}, x_{t-3:t-1}, w).
+
+    Args:
+        widths: of the layers; () for none, the features are then the parents.
+        activation: "tanh", "relu", "gelu" or "elu".
+    """
+
+    widths: tuple[int, ...] = (64,)
+    activation: str = "tanh"
+
+    def build(self, inputs: Sequence[Input], local: bool, size: int) -> DenseNetwork:
+        """The network of a factor with these parents."""
+        return DenseNetwork(self, inputs, local)
+
+
+class DenseNetwork(RecurrentNetwork):
+    """What `Dense` describes: a recurrent network without a memory."""
+
+    def __init__(self, spec: Dense, inputs: Sequence[Input], local: bool):
+        for parent in inputs:
+            if parent.relation is not None and not (local and parent.lags is not None):
+                raise ValueError(
+                    f"Dense reads single steps of its parents, but {parent.name} is read at {parent.relation.name}; "
+                    "use networks.Recurrent or networks.Attention for this factor"
+                )
+        super().__init__(Recurrent(hidden=spec.widths, activation=spec.activation), inputs, local)

@@ -9,11 +9,10 @@
 
 from .columns import Column, Columns
 from .dataset import PanelData
-from .forecasts import PanelForecasts, PanelImputed
+from .forecasts import PanelForecasts, PanelImputed, panel_scores
 from .panel import Panel, Series
 from .proposing import Told, proposed
 from .protocol import Cut
-from .scoring import panel_scores
 from .windows import PanelWindows
 
 __all__ = [

@@ -1,18 +1,19 @@
-"""Draws of what a panel does not say: of its future, and of entries that are missing; as tables and pictures."""
+"""Draws of what a panel does not say: of its future, and of missing entries; as tables and pictures; their scores."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .. import files
+from ..data.sequences import HeldOutWindows, columns_of
 from ..inference.evaluation.result import canvas
-from ..inference.evaluation.scores import reaching
+from ..inference.evaluation.scores import CRPS, Measure, by_column, calibrated, reaching
 from ..options import nearest
 from .calendar import NUMBERS, Calendar
 
@@ -25,6 +26,8 @@ QUANTILES = (0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975)
 BANDS = {0.95: 0.15, 0.8: 0.3, 0.5: 0.5}
 """Shade of the intervals that a fan shows."""
 FORMATS = (".csv", ".parquet", ".npz")
+FEW = 12
+"""Columns up to which each has a score of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,3 +241,13 @@ def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **
             beside: dict[str, Any] = {"sequence": names, "step": first, "columns": list(found.columns)}
             beside |= {} if found.times is None else {"times": found.times}
             np.savez_compressed(file, allow_pickle=False, **arrays, **{n: np.array(own) for n, own in beside.items()})
+
+
+def panel_scores(windows: HeldOutWindows) -> list[Measure]:
+    """Proper scores and calibration, and the CRPS of each column in its unit where there are a few.
+
+    What the command line prints: `dvae.evaluate(model, windows, scores=dvae.tables.panel_scores)`.
+    """
+    columns = columns_of(windows)
+    found = [*calibrated(windows), *(by_column(CRPS, columns) if 1 < len(columns) <= FEW else [])]
+    return [replace(measure, headline=True) for measure in found]

@@ -10,7 +10,7 @@ from dvae.data.views import History, Parts, Views
 from dvae.factorization.relations import Relation
 from dvae.networks import GraphConv
 from dvae.networks.base import Input
-from dvae.networks.dct import cosine_basis
+from dvae.networks.cosine import cosine_basis
 
 OBSERVED, LENGTH, JOINTS = 4, 9, 5
 EVERYTHING = {"h": range(JOINTS), "lower": (0, 3), "upper": (1, 2, 4)}

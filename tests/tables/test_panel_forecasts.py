@@ -14,9 +14,8 @@ from dvae.runs import directory as runs
 from dvae.tables import Column, Columns, Panel
 from dvae.tables.calendar import NUMBERS, Calendar
 from dvae.tables.dataset import PanelData
-from dvae.tables.forecasts import QUANTILES, PanelForecasts, PanelImputed, needed
+from dvae.tables.forecasts import QUANTILES, PanelForecasts, PanelImputed, needed, panel_scores
 from dvae.tables.protocol import Cut
-from dvae.tables.scoring import panel_scores
 
 pd = pytest.importorskip("pandas")
 
