@@ -1,7 +1,7 @@
-"""How large the project is, beside its targets: `python -m benchmarks.size`; a minute.
+"""Print the size of the project and its targets: `python -m benchmarks.size`; takes a minute.
 
-lines      of code, without docstrings, comments and blank lines
-calls      between files of the project: in a training step, and in a forecast of 50 futures (second call, 60 frames)
+lines      lines of code, without docstrings, comments and blank lines
+calls      calls between files of the project, in a training step and in a forecast of 50 futures of 60 frames
 """
 
 import ast
@@ -93,7 +93,7 @@ def traced() -> dict[str, int]:
 
 
 def measured() -> dict[str, int]:
-    """What there is of each row, and of some beside."""
+    """Return the number of each row."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
     files = [path for path in map(Path, listed) if not (ROOT / path).is_symlink()]
     own = Counter[str]()

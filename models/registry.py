@@ -81,7 +81,7 @@ class Registry(UserDict[str, Any]):
         return self.data[name].load()  # type: ignore[no-any-return]
 
     def texts(self, name: str, *attributes: str) -> list[str | None]:
-        """Attributes of a class, read from its file where they are literals, as importing torch takes seconds.
+        """Return attributes of a class, read from its file if they are literals: importing torch takes seconds.
 
         Args:
             name: of a method or judge.
@@ -100,9 +100,9 @@ class Registry(UserDict[str, Any]):
 
 @cache
 def _literals(module: str, name: str) -> dict[str, str | None]:
-    """Texts that the body of a class assigns, and None for its fields; those of its bases where it has none."""
+    """Return the texts that the body of a class and of its bases assign to attributes; None for a dataclass field."""
     package, *parts = module.split(".")
-    spec = find_spec(package)  # of the package alone, as that of a module would import what lies above it
+    spec = find_spec(package)  # finding the module itself would import its packages
     file = Path(spec.origin or "").parent.joinpath(*parts).with_suffix(".py") if spec is not None else Path()
     if not file.is_file():
         return {}

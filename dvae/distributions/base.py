@@ -45,8 +45,8 @@ class Shape:
 class Law(nn.Module):
     """Features to the distribution of one variable.
 
-    A law of one's own gives `forward` and `distribution`, and declares what the program decides by: `support`,
-    `event_dim`, `discrete` and `reparameterised`, where they differ from those of independent normals.
+    A new law gives `forward` and `distribution`. It declares `support`, `event_dim`, `discrete` and `reparameterised`
+    where they differ from those of independent normals.
 
     Args:
         residual: share of the variable's own previous value that its location keeps, so that features give the rest:
@@ -58,9 +58,9 @@ class Law(nn.Module):
     """
 
     support: Any = constraints.real
-    """Where values of a step are, a constraint of torch; None where it depends on the parameters."""
+    """Constraint of torch on the values of a step; None if it depends on the parameters."""
     event_dim: int = 0
-    """1 where all coordinates of a step are one event, 0 where each has a density of its own."""
+    """1 if all coordinates of a step are one event, 0 if each has its own density."""
     discrete: bool = False
     """Whether values are discrete."""
     reparameterised: bool = True
@@ -91,7 +91,7 @@ class Law(nn.Module):
         return type(self).__name__.removesuffix("Law")
 
     def inside(self, size: int) -> Tensor | None:
-        """A value (D,) that has a density, to stand where nothing was observed; None where any has."""
+        """Return a value (D,) with a positive density, for entries that were not observed; None if 0 has one."""
         if self.support is None or is_real(self.support):
             return None
         if not self.support.is_discrete:

@@ -152,7 +152,7 @@ def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
 
 
 def each_at(drawn: Mapping[str, Sequence[Tensor]], parents: Sequence[Any], t: int, like: Tensor) -> list[Tensor]:
-    """The draws of parents (`base.Input`), each with its lag, at step t; static ones, of lag None, are left out."""
+    """Return the draws at step t + lag of each (parent, lag). Parents are `base.Input`; a lag of None is left out."""
     return [at(drawn[parent.name], t + lag, like, parent.size) for parent, lag in parents if lag is not None]
 
 

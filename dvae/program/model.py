@@ -279,16 +279,16 @@ class DynamicalVAE(nn.Module):
     def rollout(
         self, batch: AnyBatch | None, length: int | None = None, size: int = 1, *, guide: bool = False
     ) -> Rollout:
-        """A run over a batch in which nothing has been drawn yet: values that are known, and those to draw on demand.
+        """Return a run over a batch in which nothing has been drawn yet; it draws on demand.
 
-        `model` and `guide` put its laws into sample sites. Use it to look at laws step by step, as the oracle and
-        the particle filter do.
+        `model` and `guide` turn such a run into sample sites. Use it to evaluate conditional distributions step by
+        step, as the oracle and the particle filter do.
 
         Args:
             batch: see `model`; None for a free run.
-            length: T, where it is not that of the data.
-            size: B, where the batch does not tell.
-            guide: run the guide, not the model.
+            length: T, if it differs from that of the data.
+            size: B, if there is no batch.
+            guide: run the guide instead of the model.
 
         Raises:
             ValueError: a batch that cannot be read.

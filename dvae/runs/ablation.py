@@ -222,7 +222,7 @@ class Ablation(Result):
         runs = {arrow.run for arrow in arrows_of(self.generative, self.inference)}
         fitted = set() if self.comparison is None else self.comparison.rows.keys() - {WHOLE}
         if self.prices.keys() != runs or not runs >= self.notes.keys() | fitted:
-            raise ValueError("its prices, notes and fits are not those of its arrows")
+            raise ValueError("prices, notes or fits name other edges than those of the equations")
         counts = {len(costs) for costs in self.prices.values()}
         if len(counts) > 1 or not all(0 < count <= MOST for count in counts):
             raise ValueError(f"every arrow has a price in each of the same 1 to {MOST} random models")

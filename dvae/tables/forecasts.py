@@ -1,4 +1,4 @@
-"""Draws of what a panel does not say: of its future, and of missing entries; as tables and pictures; their scores."""
+"""Draws of the future of a panel and of its missing entries, as tables and pictures; and scores of forecasts."""
 
 from __future__ import annotations
 

@@ -221,7 +221,7 @@ class Bracket(Result):
         if not all(np.isfinite(values).all() for values in (self.frames, *real.values(), *simulated.values())):
             raise ValueError("bounds and numbers of frames are finite")
         if self.equations.keys() != {"generative", "inference"}:
-            raise ValueError("equations are those of a model and its guide")
+            raise ValueError("equations has not the keys generative and inference")
         if not all(isinstance(word, str) for word in called(self.data)):
             raise ValueError("what sequences and frames are called is no text")
 

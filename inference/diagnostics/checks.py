@@ -278,7 +278,7 @@ class PredictiveChecks(Result):
 
     @override
     def summary(self) -> dict[str, Any]:
-        """By model, program and statistic."""
+        """Return distances and tail areas by model, program and statistic."""
         found: dict[str, Any] = {}
         for (model, program, name), check in self.checks.items():
             found.setdefault(model, {}).setdefault(program, {})[name] = {

@@ -338,7 +338,7 @@ class Comparison(Result):
 
     @override
     def summary(self) -> dict[str, Any]:
-        """The ranking, and of every model its estimates, its difference to the best and its active units."""
+        """Return the ranking, and for every model its estimates, difference to the best and active units."""
         ranking = self.ranking
         models = {
             name: {

@@ -310,7 +310,7 @@ class Evaluation(Result):
 
     @override
     def summary(self) -> dict[str, Any]:
-        """Means and standard errors by method and score."""
+        """Return means and standard errors by method and score."""
         return {method: {name: vars(score) for name, score in self[method].items()} for method in self.rows}
 
     @override
@@ -322,7 +322,7 @@ class Evaluation(Result):
         if self.extents.get("clip", {len(self.clips)}) != {len(self.clips)}:
             raise ValueError(f"expected numbers of {len(self.clips)} clips")
         if unknown := {name for row in self.rows.values() for name in row.clip_means} - self.metrics.keys():
-            raise ValueError(f"nothing says how {', '.join(sorted(unknown))} are to be read")
+            raise ValueError(f"metrics has no entry for {', '.join(sorted(unknown))}")
 
     def _histogram(self, method: str, name: str) -> np.ndarray:
         found = self._row(method).histograms

@@ -1,13 +1,13 @@
 """Results as xarray datasets and as JSON.
 
-A result is a dataclass. The annotations of its fields say which are arrays, and of what dimensions:
+A result is a dataclass. The annotations of its fields name the dimensions of its arrays:
 
     frames: Annotated[np.ndarray, Dims("sequence")]
     bounds: Annotated[dict[str, np.ndarray], Dims("seed", "sequence", name="{}")]      a variable for each key
     rows: Annotated[dict[str, Row], MODELS]                                            the dimension "model"
 
-Arrays become variables. Those of several models are stacked, and the smaller ones padded with NaN. Everything else
-becomes attributes of the dataset. Nothing is lost: `unflatten` returns the same dataclass.
+Arrays become variables. Arrays of several models are stacked; the smaller ones are padded with NaN. Everything else
+becomes an attribute of the dataset. Nothing is lost: `unflatten` returns the same dataclass.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Dims:
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """An array of the result, or those of all models stacked.
+    """An array of the result, or the stacked arrays of all models.
 
     Args:
         dims: names of its dimensions.
         data: the numbers.
-        path: fields and keys that lead to it, without that of the model.
+        path: fields and keys that lead to the array, without the name of the model.
     """
 
     dims: tuple[str, ...]
@@ -65,13 +65,13 @@ class Variable:
 
 @dataclass(frozen=True)
 class Flat:
-    """A result taken apart.
+    """A result as variables and attributes.
 
     Args:
-        variables: by name.
-        models: names, in the order of the dimension "model".
-        attributes: everything else, in JSON's types; the shape of an array stands in its place.
-        sizes: of the arrays, by dimension.
+        variables: name to variable.
+        models: names of the models, in the order of the dimension "model".
+        attributes: everything else, in JSON's types. In place of an array they hold its shape.
+        sizes: dimension to the sizes of the arrays in it.
     """
 
     variables: dict[str, Variable]
@@ -81,7 +81,7 @@ class Flat:
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON holds it: tuples and arrays become lists, NaN None, and infinity a text."""
+    """Return the value in JSON's types: tuples and arrays become lists, NaN None, and infinity a text."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -94,10 +94,10 @@ def plain(value: Any) -> Any:
 
 
 def flatten(result: Any) -> Flat:
-    """Take a dataclass apart.
+    """Return the variables and attributes of a dataclass.
 
     Raises:
-        TypeError: an array that has not the dimensions its field declares.
+        TypeError: an array has other dimensions than its field declares.
     """
     found: dict[_Path, dict[str | None, np.ndarray]] = {}
     marks: dict[_Path, Dims] = {}
@@ -148,10 +148,10 @@ def flatten(result: Any) -> Flat:
 
 
 def unflatten(kind: Any, record: Flat) -> Any:
-    """Put a dataclass together again.
+    """Return the dataclass of a kind from its variables and attributes.
 
     Raises:
-        TypeError, ValueError: what is missing, of another type or of another shape.
+        TypeError, ValueError: a field is missing, or has another type or shape.
     """
     variables = {each.path: each for each in record.variables.values()}
 
@@ -220,7 +220,7 @@ def _padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _marked(hint: Any, value: Any = True) -> tuple[Any, Any]:
-    """The mark of a type, and the type without it and without None, but of None itself."""
+    """Return the mark of a type (`Dims` or `MODELS`), and the type without it; for a value of None, NoneType."""
     mark = None
     while True:
         if get_origin(hint) in (Union, UnionType) and NoneType in get_args(hint):

@@ -126,24 +126,24 @@ class Shown:
 
 
 class Result(Shown):
-    """Numbers with named dimensions, and how they were measured.
+    """Numbers with named dimensions, and the settings they were measured with.
 
-    Subclasses are dataclasses; `record.Dims` says which fields are arrays. `dataset`, JSON and netCDF follow from that.
+    A subclass is a dataclass. `record.Dims` marks its arrays; `dataset`, JSON and netCDF follow from these marks.
     """
 
     def summary(self) -> dict[str, Any]:
-        """What the table says, in JSON's types, for those who read the file by other means."""
+        """Return the numbers of the table in JSON's types, for readers of the file without this library."""
         return {}
 
     def labels(self) -> dict[str, Sequence[str]]:
-        """Coordinates of dimensions, by name."""
+        """Return the coordinates of dimensions by name."""
         return {}
 
     def check(self) -> None:
-        """Refuse fields that contradict each other, as in a file that was altered.
+        """Refuse fields that contradict each other, as in an altered file.
 
         Raises:
-            ValueError: saying what is wrong.
+            ValueError: they do; the message names them.
         """
 
     @property
@@ -155,7 +155,7 @@ class Result(Shown):
     def dataset(self) -> "xr.Dataset":
         """All arrays by name, with the dimensions "model", "seed", "sequence", "step", "column" and others.
 
-        Models that have fewer seeds, steps or columns are padded with NaN. Everything else is in `attrs`.
+        Arrays of a model with fewer seeds, steps or columns are padded with NaN. Everything else is in `attrs`.
         """
         import xarray as xr
 
@@ -168,7 +168,7 @@ class Result(Shown):
         )
 
     def document(self) -> dict[str, Any]:
-        """Everything, in JSON's types: a summary, variables with their dimensions, and all attributes."""
+        """Return everything in JSON's types: a summary, variables with their dimensions, and all attributes."""
         found = flatten(self)
         return {
             "kind": type(self).__name__,
@@ -183,10 +183,10 @@ class Result(Shown):
 
     @classmethod
     def of(cls, document: Any) -> Self:
-        """The result of which `document` is.
+        """Return the result from its `document`.
 
         Raises:
-            ValueError: something else.
+            ValueError: the document is not one of this kind of result.
         """
         try:
             if document["kind"] != cls.__name__:
@@ -207,10 +207,10 @@ class Result(Shown):
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """The result that `to_json` wrote.
+        """Return the result that `to_json` wrote.
 
         Raises:
-            ValueError: text that is not such a document.
+            ValueError: the text is not such a document.
         """
         try:
             document = json.loads(text)

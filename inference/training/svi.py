@@ -354,7 +354,7 @@ class SVI:
 
 
 def _by_distribution(error: ValueError) -> bool:
-    """Whether a distribution raised it: torch's refuse NaN parameters and values before there is a term to look at."""
+    """Return whether a distribution raised the error: torch's refuse NaN parameters and values."""
     *_, (frame, _) = walk_tb(error.__traceback__)
     return str(frame.f_globals.get("__name__")).startswith(("torch.distributions", "pyro.distributions"))
 
