@@ -13,6 +13,7 @@ list of predictors that GSPS's has, on Human3.6M).
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -49,10 +50,18 @@ ERRORS = ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm")
 REAL = ("APDE", "CMD", "limb stretch", "limb jitter", "pose NLL")
 
 
-def printed(columns: str, text: str) -> dict[str, dict[str, str]]:
-    """A table of a paper: rows by their names, cells by columns."""
-    lines = (line.split("|") for line in text.strip().splitlines())
-    return {name.strip(): dict(zip(columns.split(","), cells.split(), strict=True)) for name, cells in lines}
+def published() -> dict[str, dict[str, dict[str, str]]]:
+    """Tables of the papers by name: rows by their names, cells by columns."""
+    told = tomllib.loads(Path(__file__).with_name("published.toml").read_text(encoding="utf-8"))
+    found: dict[str, dict[str, dict[str, str]]] = {}
+    for name, printed in told.items():
+        lines = (line.split("|") for line in printed["rows"].splitlines())
+        columns = printed["columns"].split(",")
+        found[name] = {row.strip(): dict(zip(columns, cells.split(), strict=True)) for row, cells in lines}
+    return found
+
+
+PUBLISHED = published()
 
 
 @dataclass(frozen=True)
@@ -153,15 +162,7 @@ EXCHANGES: dict[str, dict[str, Any]] = {
     "Own poses, of the same windows": {"own": True},
     "Another's pose, and its motion as the truth, as in the public code": {"truth": "pose"},
 }
-ANOTHERS = printed(
-    "APD,ADE,FDE",
-    """
-    Human3.6M: TrajeVAE, 1 | 5.373 .370 .476
-    Human3.6M: TrajeVAE, 2 | 5.400 .362 .472
-    Human3.6M: TrajeVAE, 3 | 5.096 .375 .491
-    Human3.6M: TrajeVAE, 4 | 4.175 .332 .433
-    """,
-)
+ANOTHERS = PUBLISHED["trajevae, another's pose"]
 PAPERS = {
     "hit-dvae": Paper(
         "bandai2-by-style",
@@ -178,27 +179,7 @@ PAPERS = {
             *((name, HIT) for name in ("1,200 steps", "neither", "gsps", "dlow", "srnn")),
         ],
         ("ACC content", "FID content", "APD", "APDE", "energy score", *ERRORS[:4], "ADEm", "limb jitter"),
-        printed(
-            "ACC content,FID content,APD,ADE,FDE,MMADE,MMFDE,ADEm,FDEm,MMADEm,MMFDEm",
-            """
-            HumanEva-I: real motion | .883 – – – – – – – – – –
-            HumanEva-I: DLow | .527 3.472 4.853 .248 .262 .361 .337 .577 .717 .646 .753
-            HumanEva-I: GSPS | .516 1.604 5.825 .233 .244 .343 .311 .686 .794 .735 .825
-            HumanEva-I: HiT-DVAE | .726 .089 4.721 .282 .261 .335 .290 .579 .665 .610 .683
-            HumanEva-I: no scheduled sampling | .696 .359 4.777 .314 .300 .358 .315 .596 .708 .624 .727
-            HumanEva-I: no attention | .729 .264 3.921 .265 .243 .348 .295 .510 .604 .569 .650
-            HumanEva-I: no w | .740 .306 4.244 .287 .263 .360 .303 .535 .662 .591 .689
-            HumanEva-I: neither | .765 1.262 .023 .538 .621 .594 .660 .538 .622 .595 .662
-            Human3.6M: real motion | .855 – – – – – – – – – –
-            Human3.6M: DLow | .659 1.412 11.741 .425 .518 .495 .531 .896 1.284 .948 1.289
-            Human3.6M: GSPS | .650 2.030 14.757 .389 .496 .476 .525 1.013 1.372 1.065 1.381
-            Human3.6M: HiT-DVAE | .700 1.708 8.942 .472 .505 .497 .514 .804 1.034 .812 1.028
-            Human3.6M: no scheduled sampling | .650 1.751 10.339 .477 .513 .501 .519 .867 1.108 .877 1.101
-            Human3.6M: no attention | .705 1.475 7.189 .537 .569 .555 .567 .805 1.060 .826 1.056
-            Human3.6M: no w | .711 1.565 6.249 .528 .582 .557 .590 .735 .942 .753 .942
-            Human3.6M: neither | .642 .659 2.688 .752 .892 .787 .896 .897 1.184 .934 1.186
-            """,
-        ),
+        PUBLISHED["hit-dvae"],
         further=(
             Further("Other lengths of what is observed, in frames", (View(observed=5), View(observed=30)), (HIT,)),
             Further(
@@ -206,15 +187,7 @@ PAPERS = {
                 (View(judges="content+group"),),
                 (HIT, "gsps", "dlow"),
                 (*GROUPED, "ACC content", "FID content"),
-                printed(
-                    "ACC group,FID group,ACC content,FID content",
-                    """
-                    Human3.6M: real motion | .855 – .481 –
-                    Human3.6M: DLow | .659 1.412 .227 1.566
-                    Human3.6M: GSPS | .650 2.030 .222 1.915
-                    Human3.6M: HiT-DVAE | .700 1.708 .281 1.466
-                    """,
-                ),
+                PUBLISHED["hit-dvae, groups"],
             ),
         ),
     ),
@@ -230,43 +203,7 @@ PAPERS = {
         (("APD", "energy score", *ERRORS[:4], *REAL),),
         [(name, "3,000 steps") for name in TERMS],
         ("APD", "energy score", *ERRORS[:4], "pose NLL"),
-        printed(
-            "APD,ADE,FDE,MMADE,MMFDE,pose NLL",
-            """
-            Human3.6M: ERD | 0 .722 .969 .776 .995 –
-            Human3.6M: acLSTM | 0 .789 1.126 .849 1.139 –
-            Human3.6M: Pose-Knows | 6.723 .461 .560 .522 .569 –
-            Human3.6M: MT-VAE | .403 .457 .595 .716 .883 –
-            Human3.6M: HP-GAN | 7.214 .858 .867 .847 .858 –
-            Human3.6M: BoM | 6.265 .448 .533 .514 .544 –
-            Human3.6M: GMVAE | 6.769 .461 .555 .524 .566 –
-            Human3.6M: DeLiGAN | 6.509 .483 .534 .520 .545 –
-            Human3.6M: DSF | 9.330 .493 .592 .550 .599 –
-            Human3.6M: DLow | 11.741 .425 .518 .495 .531 –
-            Human3.6M: GSPS | 14.757 .389 .496 .476 .525 74.872
-            Human3.6M: no pose prior | 15.257 .389 .497 .477 .527 251.186
-            Human3.6M: no angles | 19.608 .397 .534 .506 .575 97.774
-            Human3.6M: no diversity | 6.318 .370 .488 .478 .529 64.731
-            Human3.6M: no reconstruction | 20.030 .479 .562 .513 .569 89.726
-            Human3.6M: no multimodal | 18.079 .394 .538 .520 .587 91.977
-            HumanEva-I: ERD | 0 .382 .461 .521 .595 –
-            HumanEva-I: acLSTM | 0 .429 .541 .530 .608 –
-            HumanEva-I: Pose-Knows | 2.308 .269 .296 .384 .375 –
-            HumanEva-I: MT-VAE | .021 .345 .403 .518 .577 –
-            HumanEva-I: HP-GAN | 1.139 .772 .749 .776 .769 –
-            HumanEva-I: BoM | 2.846 .271 .279 .373 .351 –
-            HumanEva-I: GMVAE | 2.443 .305 .345 .408 .410 –
-            HumanEva-I: DeLiGAN | 2.177 .306 .322 .385 .371 –
-            HumanEva-I: DSF | 4.538 .273 .290 .364 .340 –
-            HumanEva-I: DLow | 4.855 .251 .268 .362 .339 –
-            HumanEva-I: GSPS | 5.826 .233 .244 .343 .331 103.306
-            HumanEva-I: no pose prior | 7.574 .245 .293 .416 .430 363.847
-            HumanEva-I: no angles | 6.569 .235 .276 .406 .410 119.673
-            HumanEva-I: no diversity | 2.048 .214 .259 .384 .398 75.375
-            HumanEva-I: no reconstruction | 6.778 .567 .625 .606 .633 109.777
-            HumanEva-I: no multimodal | 6.474 .234 .283 .415 .421 113.630
-            """,
-        ),
+        PUBLISHED["gsps"],
         further=(
             Further(
                 "How far futures are apart, by parts of the body",
@@ -279,19 +216,7 @@ PAPERS = {
                 (View(parts="held"),),
                 ("gsps", "bom-parts"),
                 ("APD", *PARTED),
-                printed(
-                    ",".join(PARTED),
-                    """
-                    Human3.6M: BoM with parts | 0 4.408
-                    Human3.6M: DLow, lower held | 1.071 12.741
-                    Human3.6M: DLow, 50 of 1,000 | .780 7.280
-                    Human3.6M: GSPS | 0 13.150
-                    HumanEva-I: BoM with parts | 0 1.319
-                    HumanEva-I: DLow, lower held | .937 4.671
-                    HumanEva-I: DLow, 50 of 1,000 | .571 1.821
-                    HumanEva-I: GSPS | 0 5.096
-                    """,
-                ),
+                PUBLISHED["gsps, parts"],
                 {
                     LOWER: (LOWER, View(parts="free")),  # has learned to hold it
                     "dlow, 50 of 1,000": ("dlow", View(parts="nearest")),
@@ -312,56 +237,7 @@ PAPERS = {
         (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", *REAL[:4]),),
         [("6,000 steps", WHOLE), (WHOLE, TIME), (TIME, STANDARD), (FULL, "cvae-rnn")],
         ("ADE", "FDE", "MMFDE", "path error", "global ADE", "energy score", "APD"),
-        printed(
-            "APD,ADE,FDE,MMADE,MMFDE",
-            """
-            Human3.6M: TrajeVAE, 0 | 8.462 .518 .678 .596 .703
-            Human3.6M: TrajeVAE, 1 | 6.641 .463 .602 .581 .672
-            Human3.6M: TrajeVAE, 2 | 6.334 .450 .581 .581 .668
-            Human3.6M: TrajeVAE, 3 | 5.037 .375 .488 .579 .664
-            Human3.6M: TrajeVAE, 4 | 4.069 .325 .428 .584 .674
-            Human3.6M: + masked poses, 0 | 8.936 .539 .724 .616 .748
-            Human3.6M: + masked poses, 1 | 6.803 .472 .623 .594 .695
-            Human3.6M: + masked poses, 2 | 6.286 .448 .587 .587 .681
-            Human3.6M: + masked poses, 3 | 4.861 .361 .474 .585 .674
-            Human3.6M: + masked poses, 4 | 3.857 .312 .412 .594 .689
-            Human3.6M: + cosine transform, 0 | 9.483 .560 .742 .634 .762
-            Human3.6M: + cosine transform, 1 | 7.014 .487 .637 .602 .703
-            Human3.6M: + cosine transform, 2 | 6.561 .465 .604 .594 .688
-            Human3.6M: + cosine transform, 3 | 5.367 .389 .503 .590 .681
-            Human3.6M: + cosine transform, 4 | 4.524 .338 .443 .595 .692
-            Human3.6M: + learned prior, 0 | 1.860 .502 .694 .611 .740
-            Human3.6M: + learned prior, 1 | 1.749 .448 .622 .618 .753
-            Human3.6M: + learned prior, 2 | 1.719 .418 .577 .616 .750
-            Human3.6M: + learned prior, 3 | 1.725 .327 .449 .632 .767
-            Human3.6M: + learned prior, 4 | 1.720 .281 .385 .646 .783
-            Human3.6M: standard prior, 0 | 1.237 .525 .749 .634 .801
-            Human3.6M: standard prior, 1 | 1.220 .481 .695 .640 .811
-            Human3.6M: standard prior, 2 | 1.217 .466 .672 .642 .812
-            Human3.6M: standard prior, 3 | 1.248 .376 .549 .639 .802
-            Human3.6M: standard prior, 4 | 1.261 .339 .498 .641 .805
-            Human3.6M: CVAE-RNN, 0 | 9.579 .611 .723 .639 .724
-            Human3.6M: CVAE-RNN, 1 | 9.498 .603 .733 .647 .753
-            Human3.6M: CVAE-RNN, 2 | 9.496 .588 .714 .642 .745
-            Human3.6M: CVAE-RNN, 3 | 9.309 .516 .626 .614 .699
-            Human3.6M: CVAE-RNN, 4 | 9.242 .459 .560 .602 .679
-            Human3.6M: MoGlow, 0 | 1.786 .548 .776 .626 .803
-            Human3.6M: MoGlow, 1 | 1.813 .546 .773 .625 .801
-            Human3.6M: MoGlow, 2 | 1.861 .544 .768 .623 .797
-            Human3.6M: MoGlow, 3 | 1.844 .540 .766 .623 .798
-            Human3.6M: MoGlow, 4 | 1.858 .530 .750 .619 .790
-            Human3.6M: MotionGAN, 0 | 0 1.174 1.274 1.174 1.270
-            Human3.6M: MotionGAN, 1 | 0 .936 1.120 .958 1.147
-            Human3.6M: MotionGAN, 2 | 0 .904 1.131 .953 1.185
-            Human3.6M: MotionGAN, 3 | 0 .812 1.063 .948 1.220
-            Human3.6M: MotionGAN, 4 | 0 .675 .919 .932 1.226
-            Human3.6M: Motion Infilling, 0 | 0 1.203 1.209 1.197 1.207
-            Human3.6M: Motion Infilling, 1 | 0 >10⁴ >10⁴ >10⁴ >10⁴
-            Human3.6M: Motion Infilling, 2 | 0 >10⁴ >10⁴ >10⁴ >10⁴
-            Human3.6M: Motion Infilling, 3 | 0 22.727 76.233 22.801 76.326
-            Human3.6M: Motion Infilling, 4 | 0 1.067 1.220 1.258 1.468
-            """,
-        ),
+        PUBLISHED["trajevae"],
         tuple(map(View, range(5))),
         (
             Further("More paths", tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (AGAIN,)),
@@ -369,17 +245,7 @@ PAPERS = {
                 "One motion, at the mean of the prior",
                 tuple(View(count, single=True) for count in range(5)),
                 (AGAIN, "6,000 steps", WHOLE, TIME, STANDARD),
-                printed=printed(
-                    "ADE,FDE",
-                    """
-                    Human3.6M: DLow, – | 1.126 1.652
-                    Human3.6M: TrajeVAE, 0 | .529 .779
-                    Human3.6M: TrajeVAE, 1 | .491 .735
-                    Human3.6M: TrajeVAE, 2 | .477 .710
-                    Human3.6M: TrajeVAE, 3 | .396 .593
-                    Human3.6M: TrajeVAE, 4 | .345 .522
-                    """,
-                ),
+                printed=PUBLISHED["trajevae, one motion"],
             ),
             *(
                 Further(
