@@ -8,6 +8,7 @@ section, in `benchmarks/scores/tuning`: the script goes on where it was stopped,
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import isnan, nan, sqrt
@@ -23,6 +24,7 @@ from dvae import Training, motion
 from dvae.models import registry
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.scoring.energies import pose_prior_energy
+from dvae.options import tuples
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
@@ -77,143 +79,20 @@ class Section:
 
 
 PATHS = replace(motion.PROTOCOLS["bandai2-trajectories"], name="bandai2-paths-tuning", train=("A",), test=("B",))
-ABLATED: dict[str, dict[str, Any]] = {
-    "full": {},
-    "whole poses": {"complement": False},
-    "in time": {"complement": False, "cosine": False},
-    "standard prior": {"complement": False, "learned_prior": False},
-}
-"""TrajeVAE and its ablations; latents are 15 coefficients of 32 numbers, in time 60 frames of 32 or, named, 8."""
-WEIGHED = [
-    *[("full", beta) for beta in (1e-4, 1e-3, 1e-2, 0.1)],
-    *[("whole poses", beta) for beta in (1e-4, 1e-3, 1e-2)],
-    *[("in time", beta) for beta in (1e-4, 1e-3)],
-    *[("standard prior", beta) for beta in (1e-3, 1e-2, 0.1)],
-]
-"""Weights of the KL; a standard prior needs more of it to be where posteriors are."""
-ALONE = ("cvae", "pose-knows", "mt-vae", "rhp", "erd", "aclstm", "moglow", "srnn")
-"""Baselines that are tuned; the others are a CVAE but for its prior, its objective or a second stage."""
-BEFORE: dict[str, dict[str, Any]] = {"moglow": {"bound": 2.0}, "srnn": {"self_feeding": 1.0}}
-"""Their options where rates are compared."""
-SECTIONS = {
-    "hit-dvae": Section(
-        "hit-dvae",
-        Training(steps=1200, batch_size=16, learning_rate=2e-3, decay=0.8, validate_every=400),
-        {
-            "w 7.5": {},
-            "w .03": {"kl_static": 0.03},
-            "w .3": {"kl_static": 0.3},
-            "literal": {"kl_local": 0.0067, "kl_static": 0.1},
-            "no copies": {"nearest": False, "residual": 0.0},
-            "observed frames fed": {"feed_observed": True},
-            "no copies, no attention": {"nearest": False, "residual": 0.0, "attention": False},
-            "w .03, 2400 steps": {"kl_static": 0.03, "steps": 2400},
-            "2400 steps": {"steps": 2400},
-            "rate 1e-3": {"learning_rate": 1e-3},
-            "rate 4e-3": {"learning_rate": 4e-3},
-            "z .1": {"kl_local": 0.1},
-            "z .01": {"kl_local": 0.01},
-            "no residual": {"residual": 0.0},
-            "3 draws": {"samples": 3},
-            "10 draws": {"samples": 10},
-        },
-        options={"kl_static": 7.5},
-        judged=True,
-    ),
-    "gsps": Section(
-        "gsps",
-        Training(steps=3000, batch_size=16, learning_rate=3e-3, decay=0.5, validate_every=500),
-        {
-            "diversity 2 4": {},
-            "diversity 5 10": {"diversity": (5.0, 10.0)},
-            "diversity 1 2": {"diversity": (1.0, 2.0)},
-            "diversity 0": {"diversity": (0.0,)},
-            "20 coefficients": {"coefficients": 20},
-            "rate 1e-3": {"learning_rate": 1e-3},
-            "rate 1e-3, diversity 5 10": {"learning_rate": 1e-3, "diversity": (5.0, 10.0)},
-            "6500 steps": {"steps": 6500},
-            "alike from .01 m": {"pseudo_minimum": 0.01},
-            "10 x 1 draws": {"draws": (10, 1)},
-            "not turned": {"heading": False},
-        },
-        options={"diversity": (2.0, 4.0)},
-        judged=True,
-    ),
-    "trajevae": Section(
-        "trajevae",
-        Training(steps=6000, batch_size=16, learning_rate=5e-4, decay=0.8, validate_every=1000),
-        {
-            **{f"{name}, {beta:g}": {**ABLATED[name], "beta": beta} for name, beta in WEIGHED},
-            **{
-                f"in time, 8 each, {beta:g}": {**ABLATED["in time"], "latent": 8, "beta": beta}
-                for beta in (1e-4, 1e-3, 1e-2)
-            },
-            **{
-                f"in time, 8 each, standard prior, {beta:g}": {
-                    **ABLATED["in time"],
-                    "latent": 8,
-                    "learned_prior": False,
-                    "beta": beta,
-                }
-                for beta in (1e-3, 1e-2, 0.1)
-            },
-            "full, keep .05": {"keep": 0.05},
-            "full, keep .5": {"keep": 0.5},
-            "full, rate 1e-3": {"learning_rate": 1e-3},
-            "full, rate 2e-3": {"learning_rate": 2e-3},
-            "full, 24000 steps": {"steps": 24000},
-            "full, rate 2e-3, 8000 steps of 64": {"learning_rate": 2e-3, "batch_size": 64, "steps": 8000},
-            "full, keep .05, 24000 steps": {"keep": 0.05, "steps": 24000},
-            "full, 30 coefficients": {"components": 30},
-            "full, not turned": {"heading": False},
-        },
-        protocol=PATHS,
-    ),
-    "cvae-rnn": Section(
-        "cvae-rnn",
-        Training(steps=3000, batch_size=16, learning_rate=1e-3, decay=0.5, validate_every=500),
-        {
-            **{f"{beta:g}": {"beta": beta} for beta in (1e-3, 1e-2, 0.1)},
-            "0.001, keep .05": {"beta": 1e-3, "keep": 0.05},
-            "0.0001": {"beta": 1e-4},
-            "0.001, 6000 steps": {"beta": 1e-3, "steps": 6000},
-            "0.001, rate 3e-3": {"beta": 1e-3, "learning_rate": 3e-3},
-            **{f"{beta:g}, 12000 steps": {"beta": beta, "steps": 12000} for beta in (1e-4, 0.1)},
-        },
-        protocol=PATHS,
-    ),
-    "baselines": Section(
-        "cvae",
-        Training(batch_size=32, decay=0.5, validate_every=500),
-        {
-            f"{name}, {rate:g}": {**BEFORE.get(name, {}), "method": name, "learning_rate": rate}
-            for name in ALONE
-            for rate in (1e-3, 3e-3, 1e-2)
-        }
-        | {
-            f"moglow, 0.001, {name}": {"method": "moglow", "learning_rate": 1e-3, **options}
-            for name, options in {
-                "bound 1": {"bound": 1.0},
-                "bound .5": {"bound": 0.5},
-                "frames dropped": {"bound": 2.0, "frame_dropout": 0.3},
-            }.items()
-        }
-        | {
-            f"srnn, 0.001, {steps} steps": {**BEFORE["srnn"], "method": "srnn", "learning_rate": 1e-3, "steps": steps}
-            for steps in (3000, 16000)
-        },
-    ),
-    "best-of-many": Section(
-        "bom",
-        Training(steps=1000, decay=0.5, validate_every=500),
-        {
-            f"{name}, {rate:g}": {"method": name, "batch_size": batch, "learning_rate": rate}
-            for name, batch, rates in (("bom", 32, (1e-3, 3e-3, 1e-2)), ("bom-parts", 16, (3e-4, 1e-3, 3e-3)))
-            for rate in rates
-        },
-    ),
-}
-"""What was tried, by method."""
+
+
+def sections(file: Path) -> dict[str, Section]:
+    """What was tried, by method, from a file of TOML."""
+    found = {}
+    for name, told in tomllib.loads(file.read_text(encoding="utf-8")).items():
+        protocol = PATHS if told.pop("paths", False) else TUNING
+        training, options = Training(**told.pop("training")), tuples(told.pop("options", {}))
+        cases = {case: tuples(each) for case, each in told.pop("cases").items()}
+        found[name] = Section(training=training, cases=cases, options=options, protocol=protocol, **told)
+    return found
+
+
+SECTIONS = sections(Path(__file__).with_suffix(".toml"))
 
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
