@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -28,6 +29,7 @@ from dvae.inference.evaluation.evaluation import Row
 from dvae.inference.evaluation.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
 from dvae.inference.evaluation.uncertainty import decimals
 from dvae.inference.training.checkpoints import Run
+from dvae.options import tuples
 from dvae.runs.directory import Config
 from dvae.tables.dataset import PanelData
 from dvae.tables.domains import speech
@@ -95,83 +97,19 @@ class Section:
     particles: int = 100
 
 
-PLAIN: dict[str, Any] = {"embed": 0, "hidden": ()}
-"""Nothing between recurrent states and what is made of them: on few chorales a perceptron there learns late, and by
-heart."""
-FEW: dict[str, Any] = {"latent": 32, "warm_up": 600}
-CHORALES = Section(
-    {
-        BASELINE: Case(
-            {"width": 128, **PLAIN}, {"steps": 1000, "learning_rate": 5e-3, "decay": 0.5, "weight_decay": 0.1}
-        ),
-        "vae": Case({**FEW, "hidden": (200,)}),
-        "dkf": Case(
-            {**FEW, "width": 128, **PLAIN, "embed_latent": (), "decoder": (200,), "warm_up": 1500},
-            {"steps": 5500, "decay": 0.6, "weight_decay": 0.03},
-        ),
-        "storn": Case({**FEW, "width": 64, **PLAIN, "embed_latent": 0}),
-        "vrnn": Case({**FEW, "width": 64, "embed": (), "embed_latent": (), "hidden": ()}),
-        "srnn": Case({**FEW, "width": 32, **PLAIN, "decoder": (128,)}),
-        "rvae-causal": Case({**FEW, "width": 64}),
-        "rvae-noncausal": Case({**FEW, "width": 64}),
-        "dsae": Case({**FEW, "width": 64, "decoder": (200,)}),
-    },
-    {
-        "steps": 1200,
-        "batch_size": 16,
-        "learning_rate": 6e-3,
-        "decay": 0.7,
-        "weight_decay": 0.2,
-        "validate_every": 50,
-        "optimizer": "adamw",
-    },
-    Cut(observed=16, horizon=8),
-    unit="quarter note",
-)
-SIZE: dict[str, Any] = {"latent": 16, "warm_up": 300}
-SPEECH = Section(
-    {
-        BASELINE: Case({"width": 256, "hidden": ()}, {"learning_rate": 1e-3}),
-        "vae": Case({**SIZE, "hidden": (128, 64)}),
-        "dkf": Case({**SIZE, "width": 128, **PLAIN, "embed_latent": (), "decoder": (128,)}),
-        "storn": Case({**SIZE, "width": 128, "embed": 128, "hidden": (128,)}),
-        "vrnn": Case({**SIZE, "width": 128, "embed": (128,), "embed_latent": (32,), "hidden": (128,)}),
-        "srnn": Case({**SIZE, "width": 128, "embed": 128, "hidden": (64,), "decoder": (128,)}),
-        "rvae-causal": Case({**SIZE, "width": 128}),
-        "rvae-noncausal": Case({**SIZE, "width": 128}),
-        "dsae": Case({**SIZE, "width": 128, "decoder": (128,)}),
-    },
-    {"steps": 800, "batch_size": 32, "learning_rate": 3e-3, "decay": 0.5, "validate_every": 100},
-    Cut(observed=32, horizon=16, stride=64),
-    Cut(observed=32, horizon=32),
-    "frame",
-    particles=20,
-)
+def sections(file: Path) -> dict[str, Section]:
+    """What is compared, by domain, from a file of TOML."""
+    found = {}
+    for name, told in tomllib.loads(file.read_text(encoding="utf-8")).items():
+        cases = {
+            case: Case(tuples(each["options"]), each.get("training", {})) for case, each in told.pop("cases").items()
+        }
+        cuts = {which: Cut(**told.pop(which)) for which in ("forecast", "cut") if which in told}
+        found[name] = Section(cases, **cuts, **told)
+    return found
 
 
-def family(width: int, latent: int) -> dict[str, Case]:
-    """All members with their own networks, of one width."""
-    names = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae")
-    sized = {name: {"width": width} for name in names if name not in ("vae", "kvae")}
-    cases = {name: Case({"latent": latent, **sized.get(name, {})}) for name in names}
-    return {BASELINE: Case({"width": width}), **cases}
-
-
-SERIES: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5, "validate_every": 100}
-SECTIONS = {
-    "chorales": CHORALES,
-    "speech": SPEECH,
-    "japanese-vowels": Section(family(64, 16), {**SERIES, "steps": 750}, Cut(observed=5, horizon=2), unit="frame"),
-    "basic-motions": Section(family(64, 8), {**SERIES, "steps": 1000, "batch_size": 16}, Cut(observed=50, horizon=10)),
-    "macrodata": Section(
-        family(16, 4),
-        {**SERIES, "steps": 600},
-        Cut(observed=16, horizon=8, split="time"),
-        Cut(observed=16, horizon=8, split="time"),
-        "quarter",
-        season=4,
-    ),
-}
+SECTIONS = sections(Path(__file__).with_suffix(".toml"))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import fnmatch
 import json
 import statistics
 import sys
+import tomllib
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -43,46 +44,10 @@ from .pages import DOCS, refuse_unknown, require_gpu, same, table, write
 SCORES = Path(__file__).parents[1] / "scores"
 Accelerator = Literal["cpu", "cuda"]
 
-FUTURES: dict[str, dict[str, Any]] = {
-    "hit-dvae": {},
-    "gsps": {},
-    "cvae": {},
-    "gmvae": {"method": "cvae", "components": 50},
-    "bom": {},
-    "bom-parts": {},
-    "pose-knows": {},
-    "mt-vae": {},
-    "rhp": {},
-    "dlow": {},
-    "dsf": {},
-    "erd": {},
-    "aclstm": {},
-    "moglow": {"decay": 0.5},
-    "srnn": {"self_feeding": 1.0, "steps": 3000, "decay": 0.5},
-}
-"""Methods by what rows are called, with what their options are beside the presets."""
-STEPS = {
-    "hit-dvae": 380,
-    "gsps": 920,
-    "cvae": 2300,
-    "gmvae": 2300,
-    "bom": 570,
-    "bom-parts": 1450,
-    "pose-knows": 1900,
-    "mt-vae": 2300,
-    "rhp": 2800,
-    "dlow": 730,
-    "dsf": 730,
-    "erd": 1800,
-    "aclstm": 730,
-    "moglow": 1900,
-    "srnn": 4300,
-    "trajevae": 5000,
-    "cvae-rnn": 1900,
-    "motion-infilling": 770,
-}
-"""Of about four minutes on one processor; those of `dlow` and `dsf` are beside the ones of the CVAE below them."""
-PATHS: dict[str, dict[str, Any]] = {"trajevae": {}, "cvae-rnn": {}, "motion-infilling": {"keep": 0.15, "gap": 0.0}}
+_TOLD = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+FUTURES: dict[str, dict[str, Any]] = _TOLD["futures"]
+PATHS: dict[str, dict[str, Any]] = _TOLD["paths"]
+STEPS: dict[str, int] = _TOLD["steps"]
 ALIKE, ALIKE_PATHS = (
     {row: {**options, "steps": STEPS[row]} for row, options in methods.items()} for methods in (FUTURES, PATHS)
 )
