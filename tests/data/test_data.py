@@ -132,7 +132,7 @@ def test_arrays_do_not_say_which_steps_are_observed(model, name, data):
 def test_reference_rows_know_training_arrays(model):
     windows = dvae.ArrayWindows(X, observed=4)
     rows = [
-        dvae.evaluate(model, windows, training_windows=training, references=["mean"], **QUIET).rows["mean"]
+        dvae.evaluate(model, windows, training_windows=training, references=["mean"], **QUIET)["mean"]
         for training in (X, {"x": X}, windows)
     ]
     assert rows[0] == rows[1] == rows[2]
