@@ -18,8 +18,7 @@ from __future__ import annotations
 import itertools
 import json
 import sys
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -33,8 +32,7 @@ from torch import Tensor
 import dvae
 from dvae import motion
 from dvae.data.views import WHOLE
-from dvae.inference.evaluation.estimates import Crossed, Estimate
-from dvae.inference.evaluation.record import plain
+from dvae.inference.evaluation.estimates import Crossed
 from dvae.inference.evaluation.result import canvas
 from dvae.inference.training.checkpoints import LAST, load_weights
 from dvae.motion import bodies
@@ -53,6 +51,7 @@ from dvae.motion.segments.completion import (
 from dvae.motion.segments.dataset import SegmentData, thinned
 from dvae.motion.segments.embodied import SHAPE, Segments
 
+from .engine import fitted, folder, interval, kept, said
 from .pages import DOCS, table, write
 
 PARTS = ("prediction", "completion", "grid", "uncertainty", "tuning")
@@ -286,18 +285,6 @@ class Run:
         return certain(self.some, sight, *how)
 
 
-def kept(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
-    """What is in a file, or what is measured, and then is."""
-    if not file.exists():
-        begun = time.process_time()
-        found = {**measure(), "seconds": time.process_time() - begun}
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(plain(found)))
-        print(f"{file}: {found['seconds']:.0f} s of processor time", flush=True)
-    read: dict[str, Any] = json.loads(file.read_text())
-    return read
-
-
 def millimetres(values: Tensor) -> list[Any]:
     """Of metres, to a hundredth."""
     return (1000 * values.double()).round(decimals=2).tolist()  # type: ignore[no-any-return]
@@ -345,10 +332,9 @@ def recurrent(data: SegmentData, seed: int, out: Path, budget: Budget) -> Any:
     method = dvae.method("mix-and-match", **RESIDUAL)
     torch.manual_seed(seed)
     model = method.build(windows)
-    resume, every = (out / "state.json").exists(), max(budget.steps // 3, 1)
     recipe = method.train(windows, None, budget.steps)
-    told: dict[str, Any] = {"config": method.config(), "validate_every": every, "progress": False, **TRAINING}
-    dvae.fit(model, recipe, out=out, resume=resume, seed=seed, **told)
+    told: dict[str, Any] = {"config": method.config(), "validate_every": max(budget.steps // 3, 1), **TRAINING}
+    fitted(model, recipe, out=out, seed=seed, **told)
     load_weights(model, out / LAST)
     return model.eval()
 
@@ -495,12 +481,6 @@ def over(rows: Sequence[Mapping[str, Any]], values: Sequence[Any]) -> Crossed | 
     return Crossed.of(sums[:, some] / weights[some], weights[some])
 
 
-def said(found: Estimate, digits: int = 1) -> str:
-    """Mean, and its errors over takes and over runs."""
-    values = found.mean, found.sequences, found.seeds
-    return " ± ".join("–" if np.isnan(value) else f"{value:.{digits}f}" for value in values)
-
-
 def mean(rows: Sequence[Mapping[str, Any]], name: str, digits: int = 1) -> str:
     """Of what runs measured by segment."""
     if not rows or any(name not in row for row in rows):
@@ -509,20 +489,9 @@ def mean(rows: Sequence[Mapping[str, Any]], name: str, digits: int = 1) -> str:
     return "–" if found is None else said(found.estimate(), digits)
 
 
-def interval(found: Estimate, digits: int = 1) -> str:
-    """Of 95 %, over takes and runs, or over takes where there is one run."""
-    low, high = found.interval(error="sequences" if np.isnan(found.total) else "total")
-    return "–" if np.isnan(low) else f"{low:.{digits}f} to {high:.{digits}f}"
-
-
 def found_in(out: Path, name: str) -> list[dict[str, Any]]:
     """What all runs measured of a part."""
     return [json.loads(file.read_text()) for file in sorted(out.glob(f"*/{folder(name)}.json"))]
-
-
-def folder(name: Any) -> str:
-    """Of a part, or of what was seen."""
-    return str(name).replace(", ", "-").replace(" ", "-")
 
 
 Curves = dict[str, tuple[list[Mapping[str, Any]], str]]
@@ -557,7 +526,7 @@ def by_time(drawn: Curves) -> str:
     if {OURS, SUP} <= drawn.keys():
         pairs = [(at(*drawn[OURS], n), at(*drawn[SUP], n)) for n in shown]
         less = [None if ours is None or theirs is None else ours.estimate(theirs) for ours, theirs in pairs]
-        lines.append([f"{OURS} minus {SUP}, 95 %", *("–" if cell is None else interval(cell) for cell in less)])
+        lines.append([f"{OURS} minus {SUP}, 95 %", *(interval(cell, alone=True) for cell in less)])
     rows = next(iter(drawn.values()))[0]
     many = [sum(row[n] is not None for row in next(iter(rows[0]["errors"].values()))) for n in shown]
     lines.append(["segments", *map(str, many)])
@@ -586,7 +555,7 @@ def completions(found: Mapping[Sight, Sequence[Mapping[str, Any]]]) -> str:
             [
                 str(sight),
                 said(chamfers.estimate()),
-                interval(chamfers.estimate()),
+                interval(chamfers.estimate(), alone=True),
                 f"{np.mean(more):.1f} ({min(more):.1f}, {max(more):.1f})" if more else "–",
                 *(mean(rows, name) for name in ("floor", "seen", "vertices", "duration")),
                 f"{np.median(np.concatenate([row['left'] for row in rows])):.2g}",

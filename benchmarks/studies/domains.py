@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +27,6 @@ from dvae.inference.evaluation.estimates import Crossed, Estimate
 from dvae.inference.evaluation.evaluation import Row
 from dvae.inference.evaluation.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
 from dvae.inference.evaluation.uncertainty import decimals
-from dvae.inference.training.checkpoints import Run
 from dvae.options import tuples
 from dvae.runs.directory import Config
 from dvae.tables.dataset import PanelData
@@ -36,6 +34,7 @@ from dvae.tables.domains import speech
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 
+from . import engine
 from .pages import DOCS, table, write
 
 FORECASTS = 100
@@ -228,13 +227,11 @@ def fitted(section: Section, data: Data, case: str, seed: int, out: Path) -> Any
         training = dvae.Training(seed=seed, progress=False, **options)
         torch.manual_seed(seed)
         model = method.build(data.training.schema)
-        start, resumed = time.process_time(), Run(out).exists
         windows = data.training.windows("train")
         source = Alike(windows) if "lengths" in windows.all() else windows
         recipe = method.train(source, data.training.windows("validation"), training.steps)
         kept = Config(method, data.training.schema, data.training.kind, data.training.recorded(), training).written()
-        dvae.fit(model, recipe, out=out, resume=resumed, config=kept, **vars(training))
-        seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
+        seconds = engine.fitted(model, recipe, out=out, config=kept, seed=seed, **options)
         file.write_text(json.dumps({"seconds": seconds}))
     return dvae.load(out).model, json.loads(file.read_text())["seconds"]
 

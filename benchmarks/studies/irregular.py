@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -23,11 +22,12 @@ from dvae import distributions
 from dvae.data.sequences import gaps
 from dvae.data.units import Coordinate
 from dvae.inference.evaluation.estimates import Crossed
-from dvae.inference.training.checkpoints import Run, load_weights
+from dvae.inference.training.checkpoints import load_weights
 from dvae.networks import Dense, LinearSDE, LinearSDEGuide, Recurrent
 from dvae.networks.base import share_modules
 from dvae.tables.domains import domain
 
+from . import engine
 from .domains import said
 from .pages import DOCS, table, write
 
@@ -106,15 +106,13 @@ def run(fitted_on: str, latent: int, seed: int, out: Path, part: str) -> None:
         return
     train, validation = (batch_of(utterances(each), KEPT[fitted_on], seed) for each in ("train", "validation"))
     torch.manual_seed(seed)
-    model, start = built(train, latent), time.process_time()
+    model = built(train, latent)
     if (out / "fitted.json").exists():
         load_weights(model, out)
         seconds = json.loads((out / "fitted.json").read_text())["seconds"]
     else:
-        resumed = Run(out).exists
-        how = {"steps": STEPS[latent], "seed": seed, "progress": False, **TRAINING}
-        dvae.fit(model, train, validation, out=out, resume=resumed, **how)
-        seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
+        how = {"steps": STEPS[latent], "seed": seed, **TRAINING}
+        seconds = engine.fitted(model, train, validation, out=out, **how)
         (out / "fitted.json").write_text(json.dumps({"seconds": seconds}))
     found: dict[str, Any] = {"seconds": seconds}
     torch.manual_seed(seed)

@@ -36,6 +36,7 @@ from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.judges.quality import STILL, RealOrMade, quality
 from dvae.program.batch import rows
 
+from .engine import folder, said
 from .pages import DOCS, table, write
 
 NAMED: dict[str, dict[str, Any]] = {
@@ -186,11 +187,6 @@ def windows(name: str, data: Path | None, raw: Path | None, every: int) -> dict[
 def method_of(options: Mapping[str, Any]) -> Any:
     """The method of a case."""
     return dvae.method("mix-and-match", **{**OPTIONS, **options})
-
-
-def folder(name: str) -> str:
-    """Of a section, or a case."""
-    return name.replace(", ", "-").replace(" ", "-")
 
 
 def fitted(
@@ -350,10 +346,7 @@ class Case:
 
     def said(self, score: str, digits: int = 3) -> str:
         """Mean, and its errors over clips and over seeds."""
-        found = self.estimate(score)
-        return " ± ".join(
-            "–" if np.isnan(value) else f"{value:.{digits}f}" for value in (found.mean, found.sequences, found.seeds)
-        )
+        return said(self.estimate(score), digits)
 
     def interval(self, score: str) -> str:
         """Of 95 %, within what percentages can be."""

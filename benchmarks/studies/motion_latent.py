@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -27,13 +26,13 @@ from dvae.inference.evaluation.held import clip_places
 from dvae.inference.evaluation.record import plain
 from dvae.inference.evaluation.result import canvas
 from dvae.inference.evaluation.scores import clip_means
-from dvae.inference.training.checkpoints import Run
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 from dvae.runs.directory import Config
 
+from .engine import fitted, folder, interval, said
 from .pages import DOCS, table, write
 
 TUNING, HELD = "tuning", "held out"
@@ -78,11 +77,6 @@ SECTIONS = {TUNING: NAMED | WAYS | SIZES | WEIGHTS, HELD: NAMED}
 SWEPT = {"numbers of z": {16: "z of 16", 32: "z of 32", 64: FULL, 128: "z of 128"}}
 SWEPT["weight of the KL"] = {0.001: "KL 0.001", 0.01: FULL, 0.1: "KL 0.1", 1: "KL 1"}
 """What figure 3 of the paper varies, and the cases that have it."""
-
-
-def folder(name: str) -> str:
-    """Of a section, or a case."""
-    return name.replace(" ", "-")
 
 
 @cache
@@ -146,10 +140,8 @@ def run(section: str, case: str, seed: int, out: Path, file: Path, other: Path |
     config = Config(method, data.schema, data.kind, data.recorded(), training).written()
     torch.manual_seed(seed)
     model = method.build(data.schema)
-    start, resumed = time.process_time(), Run(out).exists
     recipe = method.train(data.windows("train"), data.windows("validation"), steps)
-    dvae.fit(model, recipe, out=out, resume=resumed, config=config, **vars(training))
-    seconds = None if resumed else time.process_time() - start  # of a run that was not stopped
+    seconds = fitted(model, recipe, out=out, config=config, steps=steps, seed=seed, **TRAINING)
     tests = {SAME: data.windows("test")}
     if other is not None and section == HELD:
         tests[OTHER] = elsewhere(other, data.timed)
@@ -194,9 +186,7 @@ class Read:
 
     def said(self, test: str, score: str, digits: int = 1) -> str:
         """Mean, and its errors over takes and over seeds."""
-        found = self.estimate(test, score)
-        values = () if found is None else (found.mean, found.sequences, found.seeds)
-        return " ± ".join("–" if np.isnan(value) else f"{value:.{digits}f}" for value in values) or "–"
+        return said(self.estimate(test, score), digits)
 
     def errors(self, test: str) -> np.ndarray:
         """Vertex errors of all segments and seeds, in millimetres."""
@@ -214,10 +204,8 @@ def scored(cases: Mapping[str, Read], test: str) -> str:
     lines = []
     for name, case in cases.items():
         found = case.estimate(test, ERROR)
-        low, high = found.interval() if found else (np.nan, np.nan)
-        interval = "–" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
         median = f"{np.median(case.errors(test)):.1f}"
-        lines.append([name, case.said(test, ERROR), interval, median, case.said(test, DURATION)])
+        lines.append([name, case.said(test, ERROR), interval(found), median, case.said(test, DURATION)])
         lines[-1] += [case.said(test, "ELBO"), *map(case.falling, falls)]
     return table(header, lines)
 
@@ -229,9 +217,7 @@ def against(cases: Mapping[str, Read], test: str) -> str:
     for first, second in ((FULL, FIRST), (FULL, linear), (FIRST, linear), (SHAPED, FULL)):
         if {first, second} <= cases.keys():
             estimate = cases[first].crossed(test, ERROR).estimate(cases[second].crossed(test, ERROR))
-            low, high = estimate.interval()
-            told = "–" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
-            lines.append([f"{first} minus {second}", f"{estimate.mean:.1f}", told])
+            lines.append([f"{first} minus {second}", f"{estimate.mean:.1f}", interval(estimate)])
     return table(["", "vertex error (mm)", "95 %"], lines)
 
 

@@ -39,6 +39,7 @@ from dvae.motion.geometry.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 from dvae.runs.sweep import sweep
 
+from .engine import folder
 from .pages import DOCS, refuse_unknown, require_gpu, same, table, write
 
 SCORES = Path(__file__).parents[1] / "scores"
@@ -280,11 +281,6 @@ def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         {name: value for name, value in options.items() if name not in training},
         {name: value for name, value in options.items() if name in training},
     )
-
-
-def folder(row: str) -> str:
-    """What the runs of a row are called, before their seed."""
-    return row.replace(", ", "-").replace(",", "").replace(" ", "-")
 
 
 def work(

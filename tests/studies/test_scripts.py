@@ -648,7 +648,7 @@ def test_papers(folder, page, monkeypatch):
         (("APD", "ADE"),),
         [("trajevae", "whole poses")],
         ("ADE",),
-        papers.printed("APD,ADE", "Human3.6M: TrajeVAE, 0 | 8.462 .518"),
+        {"Human3.6M: TrajeVAE, 0": {"APD": "8.462", "ADE": ".518"}},
         (ranking.View(0), ranking.View(1)),
         [
             papers.Further("One motion", [ranking.View(1, single=True)], ["trajevae"]),
