@@ -774,7 +774,7 @@ def test_a_run_is_judged_and_shown_on_other_motion_with_gaps(tmp_path, capsys):
     assert main(["fit", "vae", "--data", "simulated", *QUICK, "--out", run]) == 0
     few = ["--samples", "2"]
     assert main(["evaluate", run, *other, *few, "--log-score-particles", "2", "--out", str(tmp_path / "e.json")]) == 0
-    assert np.isfinite(json.loads((tmp_path / "e.json").read_text())["rows"]["vae"]["scores"]["log score"]["mean"])
+    assert np.isfinite(json.loads((tmp_path / "e.json").read_text())["summary"]["vae"]["log score"]["mean"])
     criticise = ["--simulations", "2", "--draws", "2", "--samples", "19", "--out", str(tmp_path / "c.json")]
     assert main(["check", "calibration", run, *other, *criticise]) == 0
     assert main(["compare", run, *other, *few, "--particles", "2", "--contrasts", "2"]) == 0
