@@ -81,7 +81,7 @@ def same(ours, theirs):
         assert type(ours) is type(theirs)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(found())
 def test_a_result_comes_back_from_json(result):
     same(result, Found.from_json(result.to_json()))

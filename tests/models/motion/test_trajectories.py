@@ -274,7 +274,7 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     torch.manual_seed(0)
     method = small(width=32, feedforward=32, latent=16, dropout=0.0)
     model = method.build(windows)
-    options = {"steps": 400, "batch_size": 16, "learning_rate": 1e-3, "progress": False, "accelerator": "cpu"}
+    options = {"steps": 150, "batch_size": 16, "learning_rate": 2e-3, "progress": False, "accelerator": "cpu"}
     dvae.fit(model, method.train(windows, steps=options.pop("steps")), **options)
     walk = Straight(windows)
     paths = {joint: walk.path(joint) for joint in ("LWrist", "RFoot")}
