@@ -163,7 +163,8 @@ def is_real(support: Any) -> bool:
     """Whether a constraint allows all real numbers."""
     while hasattr(support, "base_constraint"):
         support = support.base_constraint
-    return support is constraints.real
+    parts = getattr(support, "parts", ())  # of a product
+    return all(is_real(own) for _, own in parts) if parts else support is constraints.real
 
 
 class LawSpec(Protocol):

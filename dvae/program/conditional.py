@@ -124,7 +124,7 @@ class Conditional(nn.Module):
         """Refuse a distribution that is not as its law declares.
 
         Raises:
-            ValueError: another event, or discrete values.
+            ValueError: another event, or another support.
         """
         event = (self.size,) if self.whole else ()
         if tuple(law.event_shape) != event or not (self.whole or law.batch_shape[-1:] == (self.size,)):
@@ -133,11 +133,15 @@ class Conditional(nn.Module):
                 f"{tuple(law.event_shape)}; by its event_dim = {self.law.event_dim} it has "
                 + (f"the event {event}" if self.whole else f"no event, and the last dimension {self.size} in its batch")
             )
+        support: Any = None
         with suppress(NotImplementedError):  # a distribution that says nothing of its support
-            if law.support is not None and law.support.is_discrete and not self.discrete:
+            support = law.support
+        if support is not None and not is_real(support):
+            declared = self.law.support is None or not is_real(self.law.support)
+            if not declared or support.is_discrete != self.discrete:
                 raise ValueError(
-                    f"the law of {self.factor} makes a {type(law).__name__}, whose values are discrete; declare "
-                    "discrete = True and the support in the class of the law"
+                    f"the law of {self.factor} makes a {type(law).__name__} on {support}; declare it in the class of "
+                    f"the law: support (of torch.distributions.constraints), and discrete = {support.is_discrete}"
                 )
         self._seen = True
 

@@ -177,11 +177,15 @@ def test_events_of_some_coordinates_are_refused(place):
         dvae.SequenceELBO().terms(model(**{place: Pairs}), x)
 
 
-def test_a_law_whose_values_are_discrete_without_saying_so_is_refused():
+@pytest.mark.parametrize("kind", [dist.Bernoulli, dist.Exponential])
+def test_a_law_that_does_not_declare_its_support_is_refused(kind):
     class Undeclared(Bernoulli):
-        discrete = False
+        support, discrete = dist.constraints.real, False
 
-    with pytest.raises(ValueError, match="declare discrete = True"):
+        def distribution(self, parameters):
+            return kind(parameters[0], validate_args=False)
+
+    with pytest.raises(ValueError, match=f"declare it .* discrete = {kind is dist.Bernoulli}"):
         dvae.SequenceELBO().terms(model(px=Undeclared), torch.zeros(2, 3, 2))
 
 
