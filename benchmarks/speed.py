@@ -32,7 +32,6 @@ from torch.utils._pytree import tree_leaves
 
 import dvae
 from dvae import motion
-from dvae.data.sequences import each
 from dvae.distributions import scan
 from dvae.distributions.chain import gaussian_chain
 from dvae.distributions.kalman import LinearGaussianChain
@@ -91,7 +90,7 @@ def stopwatch() -> Callable[[], float]:
 
 def moved(batch: Any, device: torch.device) -> Any:
     """A batch on a device."""
-    return each(batch, lambda value: value.to(device))
+    return batch.map(lambda value: value.to(device))
 
 
 def layers(model: nn.Module, x: Tensor) -> Callable[[], None]:

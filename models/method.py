@@ -10,9 +10,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import torch
 from typing_extensions import override
 
+from ..data.batch import WHOLE
 from ..data.schema import Schema
 from ..data.sequences import Hiding, bridged
-from ..data.views import WHOLE, View
+from ..data.views import View
 from ..distributions import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
 from ..distributions.priors import VampLaw
 from ..factorization.inversion import guide
@@ -259,7 +260,7 @@ def rising(level: float, steps: int) -> Ramp:
 def fit_units(model: DynamicalVAE, train: Any) -> None:
     """Takes the units of x from 1024 windows of the training data, as the model sees them."""
     seen = model.read(train.sample(1024, torch.default_generator), precise=True)
-    model.units[WHOLE].fit(bridged(seen[WHOLE], seen.get("mask", {}).get(WHOLE)))
+    model.units[WHOLE].fit(bridged(seen[WHOLE], seen.mask()))
 
 
 def start_priors(model: DynamicalVAE, train: Any) -> None:

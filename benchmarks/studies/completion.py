@@ -31,7 +31,7 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.data.views import WHOLE
+from dvae.data.batch import WHOLE
 from dvae.inference.evaluation.estimates import Crossed
 from dvae.inference.evaluation.result import canvas
 from dvae.inference.training.checkpoints import LAST, load_weights

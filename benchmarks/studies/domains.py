@@ -22,7 +22,6 @@ import tyro
 from torch import Tensor
 
 import dvae
-from dvae.data.sequences import each
 from dvae.inference.evaluation.estimates import Crossed, Estimate
 from dvae.inference.evaluation.evaluation import Row
 from dvae.inference.evaluation.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
@@ -164,7 +163,7 @@ class Alike:
 
 def trimmed(batch: Mapping[str, Any], some: Tensor) -> dict[str, Any]:
     """Rows of a batch, without what is padding in all of them."""
-    part = dict(each(batch, lambda value: value[some]))
+    part = dict(batch.map(lambda value: value[some]))
     longest = int(part["lengths"].max()) if "lengths" in part else None
     return {name: value[:, :longest] if value.dim() == 3 else value for name, value in part.items()}
 

@@ -23,7 +23,6 @@ from torch.distributions import Normal
 
 import dvae
 from dvae import motion
-from dvae.data.sequences import past_of
 from dvae.inference.bounds.probe import Redrawn
 from dvae.inference.evaluation.estimates import Crossed, Estimate
 from dvae.inference.evaluation.held import reproducibly
@@ -290,7 +289,7 @@ def heard(model: Any, windows: Mapping[str, motion.Windows], seed: int, budget: 
 def observations(test: motion.Windows, budget: Budget) -> Any:
     """The pasts of some windows, evenly over all of them."""
     some = torch.linspace(0, len(test) - 1, min(budget.observations, len(test))).long()
-    return rows(past_of(test.all(), test.protocol.observed), some)
+    return rows(test.all().past(test.protocol.observed), some)
 
 
 def run(

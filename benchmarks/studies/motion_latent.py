@@ -20,7 +20,6 @@ import tyro
 
 import dvae
 from dvae import motion
-from dvae.data.sequences import each
 from dvae.inference.evaluation.estimates import Crossed, Estimate
 from dvae.inference.evaluation.held import clip_places
 from dvae.inference.evaluation.record import plain
@@ -117,7 +116,7 @@ def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
     for side in ("left", "right"):
         own = [np.flatnonzero([kind == (content, side) for kind in kinds]) for content in ("walk", "run")]
         ends.append(np.stack([generator.choice(those, PAIRS // 2) for those in own]))
-    first, second = (each(test.all(), lambda value, some=some: value[some]) for some in np.concatenate(ends, 1))
+    first, second = (test.all().rows(some) for some in np.concatenate(ends, 1))
     found = interpolate(model, first, second, STEPS)
     lasts = [test.timed.lasts(batch["x"]) for batch in (first, second)]
     falling, shorter = falls(found.durations), (lasts[1] < lasts[0]).to(found.durations.device)

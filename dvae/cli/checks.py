@@ -12,7 +12,6 @@ import numpy as np
 import tyro
 
 from .. import files, motion
-from ..data.sequences import each as of_each
 from ..factorization.inversion import FAITHFUL
 from ..inference.diagnostics.bracket import bracket
 from ..inference.diagnostics.calibration import calibrate
@@ -150,9 +149,9 @@ def posterior(
     loaded, opened = opening.forecaster(run, data, missing, failed)
     batch = opened.windows("test").all()
     some = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
-    kept = of_each(batch, lambda value: value[some, :frames] if value.dim() == 3 else value[some])
-    if "lengths" in kept and frames is not None:
-        kept = {**kept, "lengths": kept["lengths"].clamp(max=frames)}
+    kept = batch.map(lambda value: value[some, :frames] if value.dim() == 3 else value[some])
+    if kept.lengths is not None and frames is not None:
+        kept["lengths"] = kept.lengths.clamp(max=frames)
     document: dict[str, Any] = {"windows": some.tolist(), "frames": frames}
     path = out or run / f"{opening.record('posterior', loaded, opened)}.json"
     stein = stein_discrepancy(loaded.model, kept, draws=stein_draws, seed=seed)

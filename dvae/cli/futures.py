@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +12,7 @@ import torch
 import tyro
 
 from .. import motion
-from ..data.sequences import Sequences, each, gapped, past_of
+from ..data.sequences import Sequences
 from ..inference.training.checkpoints import Run
 from ..models.motion.trajectories import TrajectoryModel
 from ..motion.data.dataset import SIMULATED
@@ -124,7 +123,7 @@ def forecast(
     check_files(out, figure, ".npz", ".bvh", "")
     chosen: Sequence[int] = range(len(windows))
     if suffix == ".bvh":
-        chosen = [_liveliest(windows.positions(gapped(windows.all())).numpy(), None)]
+        chosen = [_liveliest(windows.positions(windows.all().mask_to_nan()).numpy(), None)]
     if draw_emission is None and suffix == ".npz":
         draw_emission = loaded.model.is_drawn()
     futures = draw_futures(loaded, windows, chosen, samples, seed, horizon, fix, draw_emission)
@@ -155,7 +154,7 @@ def _completed(
         raise UsageError(f"{loaded.path} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
     if paths.exact and not (paths.joints or paths.paths):
         raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
-    positions = windows.positions(gapped(windows.all())).numpy()
+    positions = windows.positions(windows.all().mask_to_nan()).numpy()
     chosen = _liveliest(positions, paths.window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]
     given = _told(joint_names(paths.joints), truth, paths.paths, windows.skeleton)
@@ -271,9 +270,9 @@ def _fillings(model: Any, windows: motion.Windows, samples: int, seed: int, draw
     listed, parts = windows.all(), []
     with seeded(seed):
         for some in torch.arange(len(windows)).split(64):
-            made = model.impute(each(listed, itemgetter(some)), samples, draw=drawn)["x"]
+            made = model.impute(listed.rows(some), samples, draw=drawn)["x"]
             parts.append(windows.positions(made).numpy())
-    seen = windows.skeleton.with_root(listed["mask"].unflatten(-1, (-1, 3)), True)[..., 0].numpy()
+    seen = windows.skeleton.with_root(listed.mask().unflatten(-1, (-1, 3)), True)[..., 0].numpy()
     emission = "drawn" if drawn else "mean"
     return motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), seen, emission)
 
@@ -330,7 +329,7 @@ def animate(
             )
         loaded = load_run(Path(source), data, failed=failed)
         windows = windows_of(data_of(data, loaded, missing=missing), clip)
-        chosen = _liveliest(windows.positions(gapped(windows.all())).numpy(), window)
+        chosen = _liveliest(windows.positions(windows.all().mask_to_nan()).numpy(), window)
         futures = draw_futures(loaded, windows, [chosen], samples or 5, seed, fix=fix)
     elif fix:
         raise UsageError(f"--fix is about the futures that a run draws; {source} is no run directory")
@@ -421,8 +420,8 @@ def draw_futures(
         )
     observed, horizon = loaded.schema.protocol.observed, horizon or loaded.schema.protocol.predicted
     keys = windows.keys
-    some = each(windows.all(), itemgetter(list(chosen)))
-    past, future = past_of(some, observed), gapped(some)[:, observed:][:, :horizon]
+    some = windows.all().rows(list(chosen))
+    past, future = some.past(observed), some.mask_to_nan()[:, observed:][:, :horizon]
     with seeded(seed):
         whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # parts are fixed as a whole
         parts = []
@@ -432,7 +431,7 @@ def draw_futures(
             made = model.forecast(given, whole, samples, draw_emission=drawn, **held)["x"][:, :, :horizon]
             parts.append(windows.positions(made).numpy())
             del made  # with many samples the largest thing here
-    observed_frames, truth = (windows.positions(x).numpy() for x in (gapped(past), future))
+    observed_frames, truth = (windows.positions(x).numpy() for x in (past.mask_to_nan(), future))
     forecasts, emission = np.concatenate(parts, axis=1), "drawn" if drawn else "mean"
     return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], forecasts, observed_frames, truth, emission)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import pi
 from pathlib import Path
@@ -13,8 +13,7 @@ import torch
 import tyro
 
 from .. import motion
-from ..data.sequences import Batch
-from ..data.views import WHOLE
+from ..data.batch import WHOLE
 from ..inference.diagnostics.posteriors import Descent
 from ..inference.training.checkpoints import CheckpointError
 from ..motion.segments.completion import Deviations, glimpsed
@@ -83,7 +82,7 @@ class Glimpse:
         if self.frames is not None and (self.seconds, self.fps) != (None, None):
             raise ValueError("--frames are seen at unknown times, --seconds and --fps at known ones; give either")
 
-    def of(self, model: Any, truth: Batch, seed: int) -> dict[str, torch.Tensor]:
+    def of(self, model: Any, truth: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tensor]:
         """What is seen of x (B, N, D) and beta (B, S)."""
         if self.seen is None:
             raise UsageError("--from names what is looked at, and --seen what of it: surfaces, points or markers")
@@ -170,7 +169,7 @@ def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
         return None
 
 
-def _known(opened: Any, takes: Collection[str]) -> Batch | None:
+def _known(opened: Any, takes: Collection[str]) -> Mapping[str, Any] | None:
     """Some segments for training, of other takes than these."""
     others = [clip for clip in opened.segments if clip.split == "train" and clip.labels["source"] not in takes]
     clips = thinned(others, MOST_KNOWN)

@@ -5,21 +5,22 @@ from typing import TYPE_CHECKING
 from ..lazy import importing
 
 if TYPE_CHECKING:
+    from .batch import Batch
     from .schema import Schema, SchemaError
-    from .sequences import ArrayWindows, HeldOutWindows, Sequences, gaps, past_of, since_observed
+    from .sequences import ArrayWindows, HeldOutWindows, Sequences, gaps, since_observed
 
 __all__ = [
     "ArrayWindows",
+    "Batch",
     "HeldOutWindows",
     "Schema",
     "SchemaError",
     "Sequences",
     "gaps",
-    "past_of",
     "since_observed",
 ]
 
-_PLACES = {name: "schema" if name.startswith("Schema") else "sequences" for name in __all__}
+_PLACES = dict.fromkeys(__all__, "sequences") | {"Batch": "batch", "Schema": "schema", "SchemaError": "schema"}
 
 if not TYPE_CHECKING:
     __getattr__ = importing(__name__, _PLACES)

@@ -1,9 +1,9 @@
 """Data: what the loop, evaluation, comparison and criticism need of them, as protocols, and sequences in memory.
 
-A batch is a dict of tensors with one sequence in each row. Local variables are (B, T, D), static ones (B, D); "lengths"
-(B,) counts the valid frames of right-padded sequences, and "mask" (B, T, D) is True where an entry of the observed
-variable was observed (or maps several such names to masks). "beside" maps names to what some views read, as the turns
-of joints beside their positions; any other model passes over it.
+A batch is a `Batch`, or a dictionary of which one can be made. Local variables are (B, T, D), static ones (B, D);
+"lengths" (B,) counts the valid frames of right-padded sequences, and "mask" (B, T, D) is True where an entry of the
+observed variable was observed (or maps several such names to masks). "beside" maps names to what some views read, such
+as the turns of joints beside their positions.
 
 | who | asks for |
 |---|---|
@@ -18,9 +18,8 @@ as they are drawn.
 
 import hashlib
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -29,19 +28,16 @@ from torch import Tensor
 from typing_extensions import Protocol, runtime_checkable  # typing's own, in Python 3.11, evaluates properties
 
 from ..options import Count, require
+from .batch import Batch
 from .blocks import hash_values, ranges
 from .units import exceeds_float32
-
-Batch = Mapping[str, Any]
-BESIDE = "beside"
-"""Name in batches of what some views read beside the data, and no other model."""
 
 
 @runtime_checkable
 class Source(Protocol):
     """Training data: anything that draws batches, such as windows of sequences."""
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
+    def sample(self, batch_size: int, generator: torch.Generator) -> Mapping[str, Any]:
         """Return a batch, drawn with the generator alone."""
 
 
@@ -58,7 +54,7 @@ class Fingerprinted(Protocol):
 class Listed(Protocol):
     """Data that can be had whole."""
 
-    def all(self) -> Batch:
+    def all(self) -> Mapping[str, Any]:
         """All sequences, one in each row, always in the same order."""
 
 
@@ -69,7 +65,7 @@ class InBatches(Protocol):
     def __len__(self) -> int:
         """How many sequences."""
 
-    def batches(self, batch_size: int) -> Iterator[Batch]:
+    def batches(self, batch_size: int) -> Iterator[Mapping[str, Any]]:
         """All sequences, so many in a batch, always in the same order."""
 
 
@@ -138,10 +134,11 @@ class Sequences:
     batch: Batch
 
     def __post_init__(self) -> None:
-        rows = {name: len(value) for name, value in leaves(self.batch).items()}
+        object.__setattr__(self, "batch", Batch(self.batch))
+        rows = {name: len(value) for name, value in self.batch.leaves().items()}
         if len(set(rows.values())) != 1 or 0 in rows.values():
             raise ValueError(f"every variable needs the same number of sequences, at least one; given {rows}")
-        for name, value in leaves(self.batch).items():
+        for name, value in self.batch.leaves().items():
             if value.is_floating_point():
                 self._check(name, value)
 
@@ -151,7 +148,7 @@ class Sequences:
                 f"{name} has shape {tuple(value.shape)}; a local variable is (sequences, frames, features), "
                 "a static one (sequences, features)"
             )
-        lengths, mask = self.batch.get("lengths"), mask_of(self.batch, name)
+        lengths, mask = self.batch.lengths, self.batch.mask(name)
         count, first = 0, None
         for rows in ranges(value):
             bad = ~torch.isfinite(value[rows])
@@ -171,17 +168,17 @@ class Sequences:
             )
 
     def __len__(self) -> int:
-        return len(next(iter(leaves(self.batch).values())))
+        return len(next(iter(self.batch.leaves().values())))
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return `batch_size` different sequences in random order; all of them if there are no more."""
         chosen = torch.randperm(len(self), generator=generator)[:batch_size]
-        return each(self.batch, itemgetter(chosen))
+        return self.batch.rows(chosen)
 
     def batches(self, batch_size: int) -> Iterator[Batch]:
         """Yield all sequences in order, `batch_size` at a time."""
         for start in range(0, len(self), batch_size):
-            yield each(self.batch, itemgetter(slice(start, start + batch_size)))
+            yield self.batch.rows(slice(start, start + batch_size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,15 +200,14 @@ class Hiding:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return a batch of the source, with a mask."""
-        batch = self.source.sample(batch_size, generator)
-        x, seen, kept = batch["x"], mask_of(batch), (1 - self.share) ** 0.5
+        batch = Batch(self.source.sample(batch_size, generator))
+        x, seen, kept = batch["x"], batch.mask(), (1 - self.share) ** 0.5
         steps, entries = (
             torch.rand(*x.shape[:2], count, generator=generator) < kept for count in (1, max(self.together) + 1)
         )
         left = (steps & entries)[..., list(self.together)].to(x.device)
         left = left if seen is None else seen & left
-        masks = batch.get("mask")
-        return {**batch, "mask": {**masks, "x": left} if isinstance(masks, Mapping) else left}
+        return batch | {"mask": {**batch["mask"], "x": left} if isinstance(batch.get("mask"), Mapping) else left}
 
     @property
     def fingerprint(self) -> str:
@@ -220,34 +216,10 @@ class Hiding:
         return found
 
 
-def each(batch: Mapping[str, Any], change: Callable[[Any], Tensor]) -> Batch:
-    """Return the batch with every tensor changed."""
-    return {n: each(v, change) if isinstance(v, Mapping) else change(v) for n, v in batch.items()}
-
-
-def mask_of(batch: Batch, name: str = "x") -> Tensor | None:
-    """True where a variable was observed, as its values; None where all of it was."""
-    mask = batch.get("mask")
-    return mask.get(name) if isinstance(mask, Mapping) else mask
-
-
-def gapped(batch: Batch) -> Tensor:
-    """The x of a batch, NaN where it was not observed."""
-    x: Tensor = batch["x"]
-    mask = mask_of(batch)
-    return x if mask is None else torch.where(mask, x, torch.nan)
-
-
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
     """Means over some dimensions of what is not NaN."""
     found: Tensor = values.mean(dims)
     return values.nanmean(dims) if found.isnan().any() else found
-
-
-def past_of(batch: Batch, observed: int) -> dict[str, Any]:
-    """A batch as forecasts see it: of x, its mask and what lies beside it, the first frames alone; all context."""
-    known = {name: batch[name] for name in ("x", "mask", BESIDE) if name in batch}
-    return {**batch, **each(known, lambda value: value[:, :observed])}
 
 
 def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
@@ -335,15 +307,6 @@ def since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
     return (clock - torch.cat([clock[:, :1], last[:, :-1]], 1)).to(steps.dtype)
 
 
-def leaves(batch: Batch) -> dict[str, Tensor]:
-    """Every tensor by name; those of a mapping under "name/key"."""
-    flat: dict[str, Tensor] = {}
-    for name, value in batch.items():
-        inner = leaves(value) if isinstance(value, Mapping) else None
-        flat |= {name: value} if inner is None else {f"{name}/{key}": each for key, each in inner.items()}
-    return flat
-
-
 def refuse_table(data: Any) -> None:
     """Raise a TypeError for a table, such as a pandas `DataFrame`: the roles of its columns are unknown."""
     for kind in type(data).__mro__:
@@ -399,8 +362,8 @@ def sequences(data: Any) -> Sequences:
         return data
     if isinstance(data, Mapping):
         x, mask = unmasked(data.get("x"))
-        own = data if mask is None or "mask" in data else {**data, "x": x, "mask": mask}
-        return Sequences(each(own, tensor_of))
+        own = Batch(data) if mask is None or "mask" in data else Batch(data) | {"x": x, "mask": mask}
+        return Sequences(own.map(tensor_of))
     if isinstance(data, Tensor | np.ndarray):
         check_real(data, "x")
         x, mask = unmasked(data)
@@ -409,9 +372,9 @@ def sequences(data: Any) -> Sequences:
                 f"x has shape {tuple(x.shape)}, expected (sequences, frames, features); a single sequence is "
                 "x[None], and windows of a long one are dvae.tables.PanelData.of(x, cut=...).windows('train')"
             )
-        return Sequences(each({"x": x} if mask is None else {"x": x, "mask": mask}, tensor_of))
+        return Sequences(Batch({"x": x} if mask is None else {"x": x, "mask": mask}).map(tensor_of))
     if isinstance(data, Listed):
-        return Sequences(data.all())
+        return Sequences(Batch(data.all()))
     raise TypeError(
         "expected x as a tensor (N, T, D), a dict of tensors, or an object with sample() or all(), "
         f"got {type(data).__name__}"
@@ -568,5 +531,5 @@ class ArrayWindows:
         """All windows, x `(N, T, D)`, whole numbers as floating-point ones, and the mask if there is one."""
         x = tensor_of(self.x)
         wide = torch.float64 if exceeds_float32(x.dtype) else torch.get_default_dtype()
-        batch = {"x": x if x.is_floating_point() else x.to(wide)}
-        return batch if self.mask is None else {**batch, "mask": tensor_of(self.mask)}
+        batch = Batch(x=x if x.is_floating_point() else x.to(wide))
+        return batch if self.mask is None else batch | {"mask": tensor_of(self.mask)}

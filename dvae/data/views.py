@@ -9,7 +9,8 @@ what a model says of what it sees. All views here keep volume. A view that is no
 `log_det`, so that a model has no density, or sets `View.measured`: densities are then of what the model sees.
 
 >>> view = dvae.data.views.Parts({"legs": [0, 2], "arms": [1]})
->>> {name: value.tolist() for name, value in view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])}).items()}
+>>> batch = dvae.data.Batch(x=torch.tensor([[[1.0, 2.0, 3.0]]]))
+>>> {name: value.tolist() for name, value in view(batch).items()}
 {'legs': [[[1.0, 3.0]]], 'arms': [[[2.0]]]}
 """
 
@@ -17,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,19 +26,14 @@ from typing_extensions import override
 from ..constants import indices
 from ..factorization.notation import Factorization
 from ..networks.loop import valid_steps
-from .sequences import Batch
-
-WHOLE = "x"
-"""Name of the data where a view makes several variables of them."""
-LOG_DET = "log_det"
-"""Name, in batches that were seen and among the terms of a bound, of the log-determinant of a view."""
+from .batch import WHOLE, Batch
 
 
 class View:
     """What a model sees of the data; this view, all as it is.
 
     What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Values
-    that were seen are seen as they are; `LOG_DET` is among them, where a view changes volume.
+    that were seen are seen as they are.
     """
 
     names: tuple[str, ...] = ()
@@ -59,7 +54,7 @@ class View:
             ValueError: saying why.
         """
 
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         """The data as they are seen.
 
         Args:
@@ -69,11 +64,11 @@ class View:
         Raises:
             ValueError: data that cannot be seen so.
         """
-        return dict(data)
+        return data
 
-    def inverse(self, seen: Batch) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> Batch:
         """The data that are seen so; values (..., B, T, D) of these and of what the view added, (B, ...)."""
-        return dict(seen)
+        return seen
 
     def log_det(self, data: Batch) -> Tensor:
         """Log of the absolute determinant of the Jacobian: (B,), 0 of a view that keeps volume.
@@ -96,19 +91,20 @@ class View:
         Raises:
             ValueError: one of whole sequences, some of whose entries are missing or padding, or one of another shape.
         """
-        log_det, partial = self.log_det(data), {"lengths", "mask"} & data.keys()
-        if log_det.dim() == 1 and not partial:
+        log_det = self.log_det(data)
+        if log_det.dim() == 1 and not data.partial:
             return log_det
         if WHOLE not in data or log_det.shape != data[WHOLE].shape:
             raise ValueError(
                 f"{self} changes volume by a log_det {tuple(log_det.shape)}, of data with "
-                f"{' and '.join(sorted(partial)) or 'all their entries'}; it is (B,) of complete sequences, or "
+                f"{' and '.join(n for n in ('lengths', 'mask') if n in data) or 'all their entries'}; it is (B,) of "
+                "complete sequences, or "
                 "(B, T, D) by entry of x, of which those that are missing or padding do not count"
             )
-        if WHOLE in data.get("mask", {}):
-            log_det = torch.where(data["mask"][WHOLE], log_det, 0.0)
-        if "lengths" in data:
-            log_det = log_det.masked_fill(~valid_steps(data["lengths"], log_det.shape[1])[..., None], 0)
+        if (mask := data.mask()) is not None:
+            log_det = torch.where(mask, log_det, 0.0)
+        if data.lengths is not None:
+            log_det = log_det.masked_fill(~valid_steps(data.lengths, log_det.shape[1])[..., None], 0)
         return log_det.sum(-1)
 
 
@@ -123,8 +119,8 @@ class Offered(View):
     names: tuple[str, ...] = ()
 
     @override
-    def inverse(self, seen: Batch) -> dict[str, Any]:
-        return {name: value for name, value in seen.items() if name not in self.names}
+    def inverse(self, seen: Batch) -> Batch:
+        return Batch({name: value for name, value in seen.items() if name not in self.names})
 
 
 class Views(View):
@@ -157,20 +153,20 @@ class Views(View):
             view.check(sizes, context, generative)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         for view in self.views:
-            data = view(data, beside)
-        return dict(data)
+            data = Batch(view(data, beside))
+        return data
 
     @override
-    def inverse(self, seen: Batch) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> Batch:
         for view in reversed(self.views):
-            seen = view.inverse(seen)
-        return dict(seen)
+            seen = Batch(view.inverse(seen))
+        return seen
 
     @override
     def log_det(self, data: Batch) -> Tensor:
-        return super().log_det(data) if self.keeps_volume else volume({LOG_DET: self.counted(data)})
+        return super().log_det(data) if self.keeps_volume else Batch(log_det=self.counted(data)).volume
 
     @property
     @override
@@ -182,15 +178,9 @@ class Views(View):
         found = []
         for view in self.views:
             found += [] if view.keeps_volume else [view.counted(data)]
-            data = view(data)
+            data = Batch(view(data))
         whole = any(each.dim() == 1 for each in found)
-        return torch.stack([volume({LOG_DET: each}) if whole else each for each in found]).sum(0)
-
-
-def volume(seen: Batch) -> Tensor:
-    """(B,) the log-determinant in a batch that was seen through a view that changes volume."""
-    found: Tensor = seen[LOG_DET]
-    return found.sum(-1) if found.dim() == 2 else found
+        return torch.stack([Batch(log_det=each).volume if whole else each for each in found]).sum(0)
 
 
 @dataclass(frozen=True)
@@ -202,7 +192,7 @@ class Parts(View):
 
     Example:
         >>> view = Parts({"legs": [0, 2], "arms": [1]})
-        >>> view({"x": torch.tensor([[[1.0, 2.0, 3.0]]])})["legs"]
+        >>> view(Batch(x=torch.tensor([[[1.0, 2.0, 3.0]]])))["legs"]
         tensor([[[1., 3.]]])
     """
 
@@ -221,10 +211,10 @@ class Parts(View):
             raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         if WHOLE not in data:
-            return dict(data)
-        seen, masks = dict(data), dict(data.get("mask", {}))
+            return data
+        seen, masks = Batch(data), data.masks()
         whole, mask = seen.pop(WHOLE), masks.pop(WHOLE, None)
         size = sum(map(len, self.parts.values()))
         if whole.dim() < 2 or whole.shape[-1] != size:
@@ -234,15 +224,15 @@ class Parts(View):
             seen.setdefault(name, whole.index_select(-1, own))
             if mask is not None:
                 masks[name] = mask.index_select(-1, own)
-        return {**seen, "mask": masks} if mask is not None else seen
+        return seen | {"mask": masks} if mask is not None else seen
 
     @override
-    def inverse(self, seen: Batch) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> Batch:
         if not self.parts.keys() <= seen.keys():
-            return dict(seen)
+            return seen
         order = [place for part in self.parts.values() for place in part]
         whole = torch.cat([seen[name] for name in self.parts], dim=-1)
-        return {**seen, WHOLE: whole.index_select(-1, indices(map(order.index, range(len(order))), whole))}
+        return seen | {WHOLE: whole.index_select(-1, indices(map(order.index, range(len(order))), whole))}
 
 
 @dataclass(frozen=True)
@@ -274,12 +264,12 @@ class History(View):
                 )
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         if self.of not in data or self.history in data or beside is not None:
-            return dict(data)
-        masks = data.get("mask", {})
-        seen = {**data, self.history: data[self.of]}
-        return {**seen, "mask": {**masks, self.history: masks[self.of]}} if self.of in masks else seen
+            return data
+        masks = data.masks()
+        seen = data | {self.history: data[self.of]}
+        return seen | {"mask": {**masks, self.history: masks[self.of]}} if self.of in masks else seen
 
 
 @dataclass(frozen=True)
@@ -295,7 +285,7 @@ class Past(View):
         also: names of context over the same frames, of which the past says nothing more.
 
     Example:
-        >>> {name: tuple(value.shape) for name, value in Past("s")({"x": torch.zeros(2, 5, 3)}).items()}
+        >>> {name: tuple(value.shape) for name, value in Past("s")(Batch(x=torch.zeros(2, 5, 3))).items()}
         {'x': (2, 4, 3), 's': (2, 3)}
     """
 
@@ -309,12 +299,12 @@ class Past(View):
         return self.frames
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         if WHOLE not in data or self.name in data or beside is not None:
-            return dict(data)
-        if "lengths" in data:
+            return data
+        if data.lengths is not None:
             raise ValueError("windows that go on from their first frames have one length; leave 'lengths' out")
-        whole, masks, now = data[WHOLE], data.get("mask", {}), self.frames
+        whole, masks, now = data[WHOLE], data.masks(), self.frames
         if whole.shape[1] < now:
             raise ValueError(f"this model goes on from {now} frames, and was given {whole.shape[1]}")
         for name in self.also:
@@ -324,7 +314,7 @@ class Past(View):
                     f"whole window, (B, {now} + T, D); got {tuple(data[name].shape)}"
                 )
         later = {name: data[name][:, now:] for name in (WHOLE, *self.also) if name in data}
-        seen = {**data, **later, self.name: whole[:, :now].flatten(1)}
+        seen = data | {**later, self.name: whole[:, :now].flatten(1)}
         if WHOLE in masks:
             seen["mask"] = {**masks, WHOLE: masks[WHOLE][:, now:], self.name: masks[WHOLE][:, :now].flatten(1)}
         if whole.shape[1] == now:
@@ -333,8 +323,8 @@ class Past(View):
         return seen
 
     @override
-    def inverse(self, seen: Batch) -> dict[str, Any]:
+    def inverse(self, seen: Batch) -> Batch:
         if self.name not in seen:
-            return dict(seen)
+            return seen
         first = seen[self.name].unflatten(-1, (self.frames, -1))
-        return {**seen, WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}
+        return seen | {WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}

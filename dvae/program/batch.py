@@ -5,26 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..data.sequences import BESIDE, Batch, mask_of, refuse_table, tensor_of
+from ..data.batch import WHOLE, Batch
+from ..data.sequences import refuse_table, tensor_of
 from ..data.units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float32
-from ..data.views import LOG_DET, WHOLE, View
+from ..data.views import View
 from ..distributions.product import ProductSupport
 from ..factorization.notation import Factorization
 from ..networks.loop import again, once, valid_steps
 from .conditional import Conditional
-from .groups import GROUP, Groups
+from .groups import Groups
 from .rollout import Rollout
 
 CHUNK = 2048
 """Sequences times samples that a forecast holds at once."""
 
-AnyBatch = Tensor | Batch
+AnyBatch = Tensor | Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Reader:
 
     def read(
         self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor], wide: Collection[str] = ()
-    ) -> dict[str, Any]:
+    ) -> Batch:
         """The batch by name, in this precision, as the model sees it; what was read stays as it is.
 
         Args:
@@ -71,7 +73,7 @@ class Reader:
                 that float32 does not resolve.
         """
         if batch is None:
-            return {}
+            return Batch()
         names = tuple(dict.fromkeys((*self.view.names, *self.sizes)))
         whole = WHOLE if self.view.parts else self.observed[0]
         refuse_table(batch)
@@ -79,28 +81,25 @@ class Reader:
             if len(self.observed) > 1 and not self.view.parts:
                 raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
             batch = {whole: batch}
-        if unknown := [
-            name for name in batch if name not in (*names, *self.extras, "lengths", "mask", GROUP, LOG_DET, BESIDE)
-        ]:
+        if unknown := [name for name in batch if name not in (*names, *self.extras, *Batch.reserved)]:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
         exact = {*wide, whole, *self.view.names} if wide else set()  # views make the variables of these
-        values = _tensors(batch, dtype, names, exact)
+        values = _tensors(Batch(batch), dtype, names, exact)
         if "mask" in values:
-            masks = values["mask"] if isinstance(values["mask"], Mapping) else {whole: values["mask"]}
-            values["mask"] = masks
-            for name, seen in masks.items():
-                self._check_mask(name, seen, values)
-        seen = self.view(values)
-        seen.pop(BESIDE, None)
-        if self.density and whole in values and LOG_DET not in values and not self.view.keeps_volume:
-            seen[LOG_DET] = self.view.counted(values)
-        seen = {name: value for name, value in seen.items() if name in values or name not in self.made}
+            values["mask"] = values.masks(whole)
+            for name, mask in values.masks().items():
+                self._check_mask(name, mask, values)
+        shown = self.view(values)
+        made = {name for name in shown if name in self.made and name not in values}
+        seen = Batch({name: value for name, value in shown.items() if name not in made and name != "beside"})
+        if self.density and whole in values and values.log_det is None and not self.view.keeps_volume:
+            seen["log_det"] = self.view.counted(values)
         narrow = [n for n, v in seen.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
         seen |= {name: _narrowed(name, seen[name], dtype, seen) for name in narrow}
         if "mask" in seen:  # of context too, which is told no more of it
-            known = {name: mask for name, mask in seen["mask"].items() if name in seen}
+            known = {name: mask for name, mask in seen.masks().items() if name in seen}
             for name in known.keys() & self.laws.keys():
                 for event in map(list, self.laws[name].events):
                     if not torch.equal(known[name][..., event].any(-1), known[name][..., event].all(-1)):
@@ -115,7 +114,7 @@ class Reader:
             seen["mask"] = {name: mask for name, mask in known.items() if name in kept}
         return seen
 
-    def _check_mask(self, name: str, mask: Tensor, values: Mapping[str, Any]) -> None:
+    def _check_mask(self, name: str, mask: Tensor, values: Batch) -> None:
         if name not in (*self.observed, self.view.history, WHOLE) or name not in values:
             given = {n: v for n, v in values.items() if isinstance(v, Tensor)}
             raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(given)}")
@@ -129,7 +128,7 @@ class Reader:
         self,
         factorization: Factorization,
         conditionals: Any,
-        values: dict[str, Any],
+        batch: Batch,
         length: int | None,
         size: int,
     ) -> Rollout:
@@ -137,17 +136,16 @@ class Reader:
 
         Args:
             factorization, conditionals: what is run.
-            values: of `read`.
+            batch: of `read`.
             length: T; None for the batch's.
             size: B, where the batch does not tell.
 
         Raises:
             ValueError: a batch that cannot be read.
         """
-        lengths, masks = values.get("lengths"), values.get("mask", {})
-        index = values[GROUP] if self.grouped and GROUP in values else None
+        lengths, masks, index = batch.lengths, batch.masks(), batch.group if self.grouped else None
         groups = None if index is None else once(self, [index], lambda: Groups.of(index))
-        values = {name: value for name, value in values.items() if name in self.sizes}
+        values = {name: value for name, value in batch.items() if name in self.sizes}
         for name, value in values.items():
             self.check(name, value)
         size, length = _extent(values, length, size)
@@ -259,12 +257,12 @@ def _no_lengths(lengths: Tensor, length: int) -> str:
     return f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}"
 
 
-def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> dict[str, Any]:
+def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
     """Tensors, floating-point ones and those of these names in a precision; the others are counts and masks."""
-    found: dict[str, Any] = {}
+    found = Batch()
     for name, each in batch.items():
         if isinstance(each, Mapping):
-            found[name] = _tensors(each, dtype, names if name == BESIDE else (), ())
+            found[name] = _tensors(Batch(each), dtype, names if name == "beside" else (), ())
             continue
         tensor = tensor_of(each)
         if tensor.is_floating_point() or name in names:
@@ -281,7 +279,7 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
     """
     if dtype is not torch.float32 or not exceeds_float32(value.dtype) or value.dim() < 2 or not value.numel():
         return value.to(dtype)
-    mask, lengths = mask_of(batch, name), batch.get("lengths")
+    mask, lengths = batch.mask(name), batch.lengths
     if mask is None and lengths is None and value.dtype not in (torch.uint32, torch.uint64):  # torch has no aminmax
         least, most = value.flatten(0, -2).aminmax(dim=0)  # a quick look: the deviation is at least range / sqrt(2 N)
         bound = RESOLVED * math.sqrt(2 * value.numel() / value.shape[-1])
@@ -302,7 +300,7 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
 
 def _moments(name: str, value: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation (D,) in float64 of the observed entries; NaN without any."""
-    mask, lengths, known = mask_of(batch, name), batch.get("lengths"), value.double()
+    mask, lengths, known = batch.mask(name), batch.lengths, value.double()
     if mask is not None and mask.shape == value.shape:
         known = torch.where(torch.as_tensor(mask, device=value.device), known, torch.nan)
     if lengths is not None and value.dim() == 3:
@@ -324,7 +322,7 @@ def check_scale(batch: AnyBatch, names: Collection[str]) -> None:
         ValueError: the greatest standard deviation is below `units.SMALLEST`, and not 0.
     """
     refuse_table(batch)
-    given = batch if isinstance(batch, Mapping) else {WHOLE: batch}
+    given = Batch(batch if isinstance(batch, Mapping) else {WHOLE: batch})
     for name in given.keys() & {*names}:
         value = tensor_of(given[name])
         if not value.is_floating_point() or value.dim() < 2 or not value.numel():
@@ -383,15 +381,21 @@ def repeat(value: Any, samples: int) -> Any:
 
     Each time its groups are others.
     """
-    if isinstance(value, Mapping):
-        found = {name: repeat(v, samples) for name, v in value.items()}
-        return found | ({GROUP: Groups.of(value[GROUP]).again(samples).place} if GROUP in value else {})
-    return again(value, samples)
+    if not isinstance(value, Mapping):
+        return again(value, samples)
+    batch = value if isinstance(value, Batch) else Batch(value)
+    found = batch.map(partial(again, n=samples))
+    if batch.group is not None:
+        found["group"] = Groups.of(batch.group).again(samples).place
+    found.reader = batch.reader
+    return found
 
 
 def rows(value: Any, part: slice) -> Any:
     """Some of the sequences of a batch, or of a tensor (B, ...)."""
-    return {name: rows(v, part) for name, v in value.items()} if isinstance(value, Mapping) else value[part]
+    if isinstance(value, Mapping):
+        return (value if isinstance(value, Batch) else Batch(value)).rows(part)
+    return value[part]
 
 
 def in_chunks(

@@ -12,13 +12,13 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from ..data.batch import WHOLE, Batch
 from ..data.sequences import refuse_table
-from ..data.views import WHOLE
 from ..networks.loop import computing_once
 from ..options import Count, Range, require
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
-from .groups import GROUP, Groups
+from .groups import Groups
 
 WEIGHT = "log weight"
 """Beside what is drawn, how much more likely the latents are given what was observed than under the guide."""
@@ -41,9 +41,9 @@ def forecast(
     require(Count, horizon=horizon, samples=samples)
     require(Annotated[int, Range(1)], chunk=chunk)
     data = model.read(batch)
-    told: Any = batch if isinstance(batch, Mapping) else {}
+    told: Any = batch if isinstance(batch, Mapping) else ()
     redrawn = [name for name in model.shared if name not in told]  # for every sample anew
-    if "lengths" in data:
+    if data.lengths is not None:
         raise ValueError("forecast continues sequences of one length; cut the batch to it, or forecast them in turn")
     first = data.get(model.view.history or model.observed[0])
     size, past = (len(next(v for v in data.values() if isinstance(v, Tensor))), 0) if first is None else first.shape[:2]
@@ -54,7 +54,7 @@ def forecast(
     fixed = _fixed(model, given, data, size, horizon)
     drawn = model.is_drawn() if draw_emission is None else draw_emission
     local = {name for name in data if name in model.context and data[name].dim() == 3}
-    seen = {name: value[:, :past] if name in local else value for name, value in data.items()}
+    seen = data | {name: data[name][:, :past] for name in local}
     if past:
         model.rollout(seen, guide=True)  # refuses what cannot be read, of all sequences
     # what the guide makes of the past alone, once for all samples
@@ -90,9 +90,7 @@ def forecast(
     return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
 
-def _fixed(
-    model: Any, given: Mapping[str, Tensor], data: Mapping[str, Any], size: int, horizon: int
-) -> dict[str, Tensor]:
+def _fixed(model: Any, given: Mapping[str, Tensor], data: Batch, size: int, horizon: int) -> dict[str, Tensor]:
     """What is fixed as the model sees it, that of data over past and future."""
     free = {*model.observed, *(name for name in model.latents if not model.generative.local(name))}
     for name, value in given.items():
@@ -103,7 +101,7 @@ def _fixed(
         shape = (size, horizon, model.sizes[name]) if name in model.observed else (size, model.sizes[name])
         if value.shape != shape:
             raise ValueError(f"the fixed {name} has shape {tuple(value.shape)}, expected {shape}")
-    fixed: dict[str, Tensor] = {name: value for name, value in model.view(given, data).items() if name in given}
+    fixed: dict[str, Tensor] = {name: value for name, value in model.view(Batch(given), data).items() if name in given}
     for name in fixed.keys() & {*model.observed}:
         past = data[name] if name in data else data[model.view.history][..., list(model.view.parts[name])]
         fixed[name] = torch.cat([past, fixed[name]], dim=1)
@@ -160,9 +158,8 @@ def impute(
 ) -> dict[str, Tensor]:
     """The data, where they are missing with means given latents from the guide, or draws one after the other."""
     refuse_table(batch)
-    given: Any = batch if isinstance(batch, Mapping) else {}
-    masks = given.get("mask", {})
-    masks = masks if isinstance(masks, Mapping) else {WHOLE if model.view.parts else model.observed[0]: masks}
+    given = Batch(batch if isinstance(batch, Mapping) else {})
+    masks = given.masks(WHOLE if model.view.parts else model.observed[0])
     if not masks:
         raise ValueError("nothing is missing in this batch; give a 'mask' that is False where entries are to be filled")
     drawn = model.is_drawn() if draw is None else draw
@@ -245,6 +242,6 @@ def _resampled(
     return {name: torch.cat([each[name] for each in found], 1) for name in found[0]}
 
 
-def _together(model: Any, data: Mapping[str, Any], size: int, chunk: int) -> int:
+def _together(model: Any, data: Batch, size: int, chunk: int) -> int:
     """The most sequences times samples at once: at least all sequences, where groups of them share latents."""
-    return max(chunk, size) if model.grouped and GROUP in data else chunk
+    return max(chunk, size) if model.grouped and data.group is not None else chunk

@@ -18,9 +18,6 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints, kl_divergence, register_kl
 
-GROUP = "group"
-"""Name in batches of the index (B,) of every sequence's group."""
-
 
 @dataclass(frozen=True)
 class Groups:
@@ -44,7 +41,7 @@ class Groups:
             ValueError: no whole numbers (B,).
         """
         if index.dim() != 1 or index.is_floating_point():
-            raise ValueError(f"{GROUP} is {index.dtype} {tuple(index.shape)}; expected whole numbers (B,)")
+            raise ValueError(f"group is {index.dtype} {tuple(index.shape)}; expected whole numbers (B,)")
         _, place, count = torch.unique(index, return_inverse=True, return_counts=True)
         rows = torch.arange(len(place), device=place.device)
         # by the least row: of several writes to one place a GPU leaves open which is the last

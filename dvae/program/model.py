@@ -21,8 +21,9 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
+from ..data.batch import Batch
 from ..data.units import Coordinate, Units, exceeds_float32
-from ..data.views import LOG_DET, View, volume
+from ..data.views import View
 from ..distributions.base import LawSpec
 from ..distributions.families import Normal, StandardNormal
 from ..distributions.family import FAMILIES
@@ -365,15 +366,15 @@ class DynamicalVAE(nn.Module):
                     rollout.know(name, self._site(name, rollout))
         precision = like(self).dtype  # whatever autocast computes in
         factors = {name: -e.to(precision) for name, e in self.penalties(rollout, data, draws or {}).items()}
-        if LOG_DET in data and self.likelihood:
-            factors[LOG_DET] = volume(data)
+        if data.log_det is not None and self.likelihood:
+            factors["log_det"] = data.volume
         with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if factors else nullcontext():
             for name, value in factors.items():
                 unit = dist.Unit(value, validate_args=False)  # a loss that is not finite is told by the step
                 pyro.sample(name, unit, obs=value.new_empty((*value.shape, 0)), infer={"is_auxiliary": True})
         return rollout.states | rollout.values
 
-    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> Mapping[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> Mapping[str, Tensor]:
         """Energies that the program adds at its end as `pyro.factor` sites; none, unless a subclass has some.
 
         Args:
@@ -575,7 +576,7 @@ class DynamicalVAE(nn.Module):
             self.reader.check(name, value)
         with self.running():
             trace = poutine.trace(poutine.condition(self.model, data=dict(latents))).get_trace(batch)
-            names = [name for name in (*self.generative.variables, LOG_DET) if name in trace]
+            names = [name for name in (*self.generative.variables, "log_det") if name in trace]
             trace.compute_log_prob(site_filter=lambda name, site: name in names)
         return {name: trace.nodes[name]["log_prob"] for name in names}
 
@@ -592,9 +593,7 @@ class DynamicalVAE(nn.Module):
         with alone, evaluating(self) if self.training else nullcontext():
             yield
 
-    def read(
-        self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False
-    ) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
         """Return a batch by name, in the model's precision and the view's form, with missing entries filled.
 
         A batch that was read before stays as it is. Variables that sequences share are drawn if the batch does not
@@ -615,10 +614,13 @@ class DynamicalVAE(nn.Module):
                 "the model's parameters are on the meta device and have no values; build the model outside of "
                 "`torch.device('meta')`, or call `to_empty(device='cpu')` and load weights"
             )
+        reader = self.reader, like(self).dtype
+        if isinstance(batch, Batch) and batch.reader == reader and not precise:
+            return batch
         means = {name: units.filling for name, units in self.units.items()}
         # by guide and model both, but for what they share
         wide = {name for name in self.units if name in self.wide or (precise and _is_wide(batch, name))}
-        data = dict(once(self, [batch], lambda: self.reader.read(batch, like(self).dtype, means, wide)))
+        data = Batch(once(self, [batch], lambda: self.reader.read(batch, reader[1], means, wide)))
         one = {name: data.pop(name) for name in self.shared if name in data and data[name].dim() == 1}
         size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
         for name, spec in self.shared.items():
@@ -626,12 +628,13 @@ class DynamicalVAE(nn.Module):
                 law = spec.distribution(self.sizes[name], curriculum)
                 value = one[name] if name in one else pyro.sample(name, law, infer=SHARED)
                 data[name] = once(self, [value, size], partial(self._of_each, value, size))  # by guide and model both
+        data.reader = None if precise else reader
         return data
 
     def _of_each(self, value: Tensor, size: int) -> Tensor:
         return value.to(like(self)).expand(size, -1)
 
-    def shown(self, values: Mapping[str, Tensor], data: Mapping[str, Any] | None = None) -> dict[str, Tensor]:
+    def shown(self, values: Mapping[str, Tensor], data: Batch | None = None) -> dict[str, Tensor]:
         """Values that the model made, with those of the data as the data are: back through the view.
 
         Args:
@@ -642,7 +645,7 @@ class DynamicalVAE(nn.Module):
             The same with the whole, where the view makes parts of it.
         """
         added = {name: data[name] for name in self.view.names if name in data} if data else {}
-        return {**values, **self.view.inverse(added | {n: v for n, v in values.items() if n in self.observed})}
+        return {**values, **self.view.inverse(Batch(added | {n: v for n, v in values.items() if n in self.observed}))}
 
 
 def _is_wide(batch: Any, name: str) -> bool:

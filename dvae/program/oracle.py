@@ -22,7 +22,6 @@ import scipy
 import torch
 from torch import Tensor
 
-from ..data.views import LOG_DET, volume
 from ..distributions.families import FixedNormal, FixedNormalLaw, Gaussian
 from ..distributions.family import Family
 from ..factorization.inversion import FAITHFUL, guide
@@ -33,7 +32,6 @@ from ..networks.loop import valid_steps
 from ..options import Count, kind_of, require
 from ..turns import seeded
 from .conditional import Conditional, like
-from .groups import GROUP
 from .model import DynamicalVAE
 from .rollout import Rollout
 from .summed import Discrete
@@ -150,7 +148,7 @@ class Oracle:
         if run.groups is not None:
             raise ValueError(
                 f"sequences of a group share {', '.join(self.model.grouped)}, and the oracle knows sequences one by "
-                f"one; leave {GROUP!r} out of the batch"
+                f"one; leave 'group' out of the batch"
             )
         if self.model.sums is not None:
             self.model.sums.require_data(run.hidden)
@@ -269,7 +267,7 @@ class Oracle:
         seen = self.model.read(x)
         run = self._run(seen)
         evidence: Tensor = self._weighed(run, *self._mixture(run)).logsumexp(1)
-        return evidence + volume(seen) if LOG_DET in seen else evidence
+        return evidence if seen.log_det is None else evidence + seen.volume
 
     def _weighed(self, run: Rollout, logs: Tensor, means: Tensor, precision: Tensor) -> Tensor:
         """(B, C): log joint of the data and each course that the states may take."""

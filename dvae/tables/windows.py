@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data.batch import Batch
 from ..data.blocks import cut, hash_list, row_blocks
-from ..data.sequences import Sequences, columns_of, gapped, past_of
+from ..data.sequences import Sequences, columns_of
 from ..inference.evaluation.held import on_device_of, reproducibly
 from ..options import Count, require
-from ..program.groups import GROUP
 from ..program.model import DynamicalVAE
 from .calendar import Calendar
 from .encoding import COVARIATES, GAPS, STATICS, PanelSchema, whole
@@ -183,7 +183,7 @@ class PanelWindows:
         digest.update(b")")
         return digest.hexdigest()
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Any]:
+    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Windows drawn with replacement, every start alike; of whole sequences, different ones.
 
         In a panel with groups they are of so few groups that each has several.
@@ -219,7 +219,7 @@ class PanelWindows:
         found._windows = which[list(places)], starts[list(places)]
         return found
 
-    def all(self) -> dict[str, Any]:
+    def all(self) -> Batch:
         """The listed windows, as `keys` has them."""
         return self._cut(*self._windows)
 
@@ -249,7 +249,7 @@ class PanelWindows:
         if self.skipped:
             warnings.warn(f"forecasts leave out {self.too_short}", stacklevel=2)
         batch = self.all()
-        past, known = past_of(batch, observed), gapped(batch).numpy()
+        past, known = batch.past(observed), batch.mask_to_nan().numpy()
         with reproducibly(model, seed):
             parts = [
                 model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
@@ -274,7 +274,7 @@ class PanelWindows:
         _require_model(model)
         require(Count, samples=samples, particles=particles)
         batch = self.all()
-        if "mask" not in batch:
+        if (mask := batch.mask()) is None:
             raise ValueError(f"nothing is missing in {self.panel.name}")
         with reproducibly(model, seed):
             parts = [
@@ -282,8 +282,8 @@ class PanelWindows:
                 for part in Sequences(batch).batches(AT_ONCE)
             ]
         count, steps = batch["x"].shape[:2]
-        lengths = batch.get("lengths", torch.full((count,), steps))
-        lacking = ~batch["mask"].numpy() & (np.arange(steps) < lengths[:, None].numpy())[..., None]
+        lengths = torch.full((count,), steps) if batch.lengths is None else batch.lengths
+        lacking = ~mask.numpy() & (np.arange(steps) < lengths[:, None].numpy())[..., None]
         keys = [(name, start) for _, name, start in self.keys]
         draws = np.concatenate(parts, 1, dtype=np.float64)
         return PanelImputed(draws, lacking, columns_of(self), keys, *self.times(steps))
@@ -333,11 +333,11 @@ class PanelWindows:
         told = (now > start) & (end > now)  # of what it observes something was, and something of its future
         return which[told], starts[told]
 
-    def _cut(self, which: Tensor, starts: Tensor) -> dict[str, Any]:
+    def _cut(self, which: Tensor, starts: Tensor) -> Batch:
         """The windows of ranges that start at these steps of their sequences."""
         lengths = self._lengths[which] if self.length is None else self.length
         x = torch.from_numpy(self.schema.encoded(cut(self._values, which, starts, lengths).numpy())).double()
-        batch: dict[str, Any] = {"x": x}
+        batch = Batch(x=x)
         if isinstance(lengths, Tensor) and (lengths != lengths[0]).any():
             batch["lengths"] = lengths
         if self._missing:
@@ -349,7 +349,7 @@ class PanelWindows:
         if COVARIATES in batch and (observed := self.schema.cut.observed) is not None:
             batch[COVARIATES] = held(batch[COVARIATES], observed, self.schema)
         if self.schema.columns.group:
-            batch[GROUP] = torch.tensor(self._grouped(which.tolist(), starts.tolist()))
+            batch["group"] = torch.tensor(self._grouped(which.tolist(), starts.tolist()))
         if self._static is not None:
             batch[STATICS] = self._static[which]
         return batch

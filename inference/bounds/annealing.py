@@ -20,16 +20,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ...data.sequences import each
 from ...program.batch import AnyBatch, repeat
 from ...program.conditional import like
-from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
 from ..diagnostics.latents import joined, split
 from ..evaluation.held import reproducibly
@@ -121,7 +118,7 @@ def annealed_bound(
     require_likelihood(model)
     data = model.read(batch)
     require_latents(model)
-    if model.grouped and GROUP in data:
+    if model.grouped and data.group is not None:
         raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
     size = require_data(model, data)
     if not size:
@@ -133,7 +130,7 @@ def annealed_bound(
         for first in bar.track(range(0, size, at_once), description="annealing"):
             part = slice(first, first + at_once)
             start = None if given is None else {name: value[part] for name, value in given.items()}
-            some = each(data, itemgetter(part))
+            some = data.rows(part)
             lengths = _Annealing(model, some, temperatures, min(chains, TRIED), leaps).lengths()
             found.append(_Annealing(model, some, temperatures, chains, leaps).run(lengths, start))
     bound, error, effective, accepted = (torch.cat(parts) for parts in zip(*found, strict=True))

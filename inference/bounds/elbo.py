@@ -22,12 +22,11 @@ from pyro.infer import ELBO
 from torch import Tensor
 from torch.distributions import kl_divergence
 
-from ...data.views import LOG_DET
 from ...factorization.graph import analytic_kl
 from ...networks.loop import computing_once
 from ...program.batch import AnyBatch, repeat
 from ...program.conditional import like
-from ...program.groups import GROUP, Groups
+from ...program.groups import Groups
 from ...program.model import DynamicalVAE
 from ...program.rollout import Rollout, Sequence
 from ...turns import alone
@@ -148,7 +147,7 @@ class SequenceELBO(ELBO):
             fn, value, run = site["fn"], site["value"], site["infer"].get("run")
             if run is not None:
                 terms.frames = _frames(run)
-            if name == LOG_DET:
+            if name == "log_det":
                 terms.log_likelihood[name] = fn.log_prob(value)
             elif isinstance(fn, Unit):
                 terms.energies[name] = -fn.log_prob(value)
@@ -199,7 +198,7 @@ def site_log_prob(fn: Any, value: Tensor) -> Tensor:
 def log_densities(trace: Any) -> dict[str, Tensor]:
     """Of the sample sites of a trace, energies apart: see `site_log_prob`."""
     sites = sites_of(trace).items()
-    return {n: site_log_prob(s["fn"], s["value"]) for n, s in sites if n == LOG_DET or not isinstance(s["fn"], Unit)}
+    return {n: site_log_prob(s["fn"], s["value"]) for n, s in sites if n == "log_det" or not isinstance(s["fn"], Unit)}
 
 
 def total(logs: Mapping[str, Tensor]) -> Tensor:
@@ -368,7 +367,7 @@ def importance_bound(
         if not model.latents:
             evidence = _log_weights(model, data, options)
             return ImportanceBound(evidence, torch.zeros_like(evidence), particles)
-        groups = Groups.of(data[GROUP]) if model.grouped and GROUP in data else None
+        groups = Groups.of(data.group) if model.grouped and data.group is not None else None
         weights = partial(_repeated_weights, model, data, options)
         return importance_mean(weights, size, particles, chunk, groups)
 

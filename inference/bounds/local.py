@@ -34,7 +34,6 @@ from ...factorization.notation import Factor, Factorization, Parent
 from ...networks.loop import computing_once
 from ...program.batch import AnyBatch, repeat
 from ...program.conditional import Conditional
-from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
 from ..evaluation.held import reproducibly
 from .elbo import joint_and_guide, require_data, require_latents, require_likelihood, sites_of
@@ -239,7 +238,7 @@ def local_guide(
         )
     require_local(model)
     data = model.read(batch)
-    if model.grouped and GROUP in data:
+    if model.grouped and data.group is not None:
         raise ValueError("sequences of a group share latents, and have no guide of their own; leave 'group' out")
     require_data(model, data)
     with reproducibly(model, seed):

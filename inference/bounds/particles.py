@@ -13,22 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...data.sequences import each
-from ...data.views import LOG_DET, volume
 from ...distributions.base import Parameters
 from ...factorization.notation import Factor, Parent
 from ...networks.base import indicator, presence
 from ...networks.loop import Rows, computing_once, pick, select, valid_steps
 from ...program.batch import AnyBatch
 from ...program.conditional import Conditional, like
-from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
 from ...program.rollout import Rollout
 from .elbo import require_data, require_likelihood
@@ -97,11 +93,11 @@ def particle_bound(
             raise ValueError(refused)
         parts = []
         for first in range(0, size, at_once):
-            some = each(data, itemgetter(slice(first, first + at_once)))
+            some = data.rows(slice(first, first + at_once))
             part = Filter(model, some, particles).run(resample_below)
             parts.append((part.bound, part.effective, part.resamplings))
         bound, effective, resamplings = (torch.cat(found, dim=-1) for found in zip(*parts, strict=True))
-        return ParticleBound(bound + (volume(data) if LOG_DET in data else 0), effective, resamplings, particles)
+        return ParticleBound(bound + (0 if data.log_det is None else data.volume), effective, resamplings, particles)
 
 
 class Filter:
@@ -353,7 +349,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
     if run.groups is not None:
         return (
             f"particles are of one sequence each, but groups share {', '.join(model.grouped)}; {instead}, or leave "
-            f"{GROUP!r} out of the batch, where every sequence is a group"
+            "'group' out of the batch, where every sequence is a group"
         )
     for block in model.inference.blocks:
         if block.direction < 0:

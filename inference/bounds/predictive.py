@@ -26,10 +26,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from ...data.sequences import each
-from ...data.views import LOG_DET
 from ...program.batch import AnyBatch, repeat
-from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
 from .elbo import ImportanceBound, importance_mean, log_densities, require_likelihood, sites_of, total
 
@@ -63,11 +60,11 @@ def predictive_bound(
         data = model.read(batch)
         size, length = data[model.observed[0]].shape[:2]
         observed -= model.view.past  # the others are context, and given anyhow
-        if model.grouped and GROUP in data:
+        if model.grouped and data.group is not None:
             raise ValueError(
                 f"groups share {', '.join(model.grouped)}, and a log score is of one sequence; leave it out"
             )
-        if "lengths" in data:
+        if data.lengths is not None:
             raise ValueError("a log score needs sequences of one length, but these have lengths")
         first = 0 if model.view.past else 1
         if particles < 1 or not first <= observed < length:
@@ -76,13 +73,13 @@ def predictive_bound(
                 f"expected at least 1 particle, and observed frames from {taken + first} to {taken + length - 1}; got "
                 f"{particles} and {taken + observed}"
             )
-        log_det = data.get(LOG_DET, torch.zeros(size, length))
+        log_det = torch.zeros(size, length) if data.log_det is None else data.log_det
         if log_det.dim() == 1:
             raise ValueError(
                 "the view changes the volume of whole sequences, and what of that is due to the future is not known; "
                 "leave the log score out, or give the view a log_det by entry, (B, T, D)"
             )
-        past = each(data, lambda value: value[:, :observed] if value.dim() == 3 else value)
+        past = data.map(lambda value: value[:, :observed] if value.dim() == 3 else value)
 
         def log_weights(count: int) -> Tensor:
             whole = repeat(data, count)

@@ -6,7 +6,6 @@ References: Burda et al., 2016, arXiv 1509.00519 (importance-weighted bound, act
 
 import math
 from collections.abc import Iterable, Sequence
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from ...data.sequences import Batch, each
+from ...data.batch import Batch
 from ...networks.loop import valid_steps
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
@@ -39,7 +38,7 @@ def bounds(
     found: list[dict[str, Tensor]] = []
     steps: dict[str, Tensor] = {}
     for part in parts:
-        piece = on_device_of(model, each(batch, itemgetter(part)))
+        piece = on_device_of(model, batch.rows(part))
         terms = SequenceELBO().terms(model, piece)
         draws = [importance_bound(model, piece, particles=particles) for _ in range(estimates)]
         values = torch.stack([draw.bound for draw in draws])
@@ -75,7 +74,7 @@ def filtered(
     """The particle bound in nats a sequence (N,)."""
     found = []
     for part in parts:
-        bound = particle_bound(model, on_device_of(model, each(batch, itemgetter(part))), particles).bound
+        bound = particle_bound(model, on_device_of(model, batch.rows(part)), particles).bound
         refuse_non_finite(name, "particle bound", bound.isfinite(), keys[part])
         found.append(bound.double().cpu())
     return {"particle bound": torch.cat(found).numpy()}
@@ -85,14 +84,14 @@ def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict
     """Latent to (D,): the variance over sequences of the posterior mean, pooled over steps."""
     sums: dict[str, Tensor] = {}
     for part in parts:
-        piece = on_device_of(model, each(batch, itemgetter(part)))
+        piece = on_device_of(model, batch.rows(part))
         draws = [_posterior_means(model, piece) for _ in range(_GUIDE_DRAWS)]
         for name in draws[0]:
             means = torch.stack([draw[name] for draw in draws]).double()
             mean, noise = means.mean(0), means.var(0) / _GUIDE_DRAWS
             valid = torch.ones_like(mean)
-            if "lengths" in piece and mean.shape[1] > 1:
-                valid = valid * valid_steps(piece["lengths"], mean.shape[1])[..., None]
+            if piece.lengths is not None and mean.shape[1] > 1:
+                valid = valid * valid_steps(piece.lengths, mean.shape[1])[..., None]
             moments = torch.stack([(valid * value).sum(0) for value in (torch.ones_like(mean), mean, mean**2, noise)])
             sums[name] = sums[name] + moments if name in sums else moments
     found = {}
@@ -128,8 +127,8 @@ def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> di
             density = site_log_prob(site["fn"], site["value"]).unflatten(0, (len(rows), size)).double()
             density = density[..., None] if density.dim() == 2 else density
             valid = torch.ones_like(density[0], dtype=torch.bool)
-            if "lengths" in batch and density.shape[2] > 1:
-                valid = valid_steps(batch["lengths"], density.shape[2])
+            if batch.lengths is not None and density.shape[2] > 1:
+                valid = valid_steps(batch.lengths, density.shape[2])
             density = density.masked_fill(~valid, -math.inf)
             own = density[torch.arange(len(rows)), rows]
             mixture = density.logsumexp(1) - valid.sum(0).clamp(min=1).double().log()

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -29,10 +28,9 @@ from rich.console import Group
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.sequences import HeldOutWindows, Listed, called, clusters, each, sequences, take_split
-from ...data.views import LOG_DET
+from ...data.batch import Batch
+from ...data.sequences import HeldOutWindows, Listed, called, clusters, sequences, take_split
 from ...program.batch import AnyBatch, repeat
-from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
 from ..bounds.annealing import annealed_bound
 from ..bounds.elbo import joint_and_guide, require_latents, require_likelihood
@@ -293,16 +291,16 @@ def bracket(
     require_latents(model)
     data = take_split(data, "test")
     whole, notes = sequences(data).batch, []
-    if GROUP in whole and model.grouped:
+    if whole.group is not None and model.grouped:
         raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
     windows = data if isinstance(data, HeldOutWindows) else None
     size = length_of(whole)
     keys = [("data", str(n), 0) for n in range(size)] if windows is None else clusters(windows)
     chance = torch.Generator().manual_seed(seed)
     chosen = torch.randperm(size, generator=chance)[:count]
-    batch, keys = each(whole, itemgetter(chosen)), [keys[n] for n in chosen.tolist()]
+    batch, keys = whole.rows(chosen), [keys[n] for n in chosen.tolist()]
     parts = [slice(first, first + batch_size) for first in range(0, len(keys), batch_size)]
-    read = [model.read(on_device_of(model, each(batch, itemgetter(part)))) for part in parts]
+    read = [model.read(on_device_of(model, batch.rows(part))) for part in parts]
     if fitting:
         try:
             require_local(model)
@@ -368,19 +366,18 @@ def _called(windows: HeldOutWindows) -> dict[str, Any]:
     return {"called": list(called(windows.description))} if "called" in windows.description else {}
 
 
-def _frames(model: DynamicalVAE, data: Mapping[str, Any]) -> Tensor:
+def _frames(model: DynamicalVAE, data: Batch) -> Tensor:
     x: Tensor = data[model.observed[0]]
-    found: Tensor = data["lengths"] if "lengths" in data else torch.full((len(x),), x.shape[1])
-    return found
+    return torch.full((len(x),), x.shape[1]) if data.lengths is None else data.lengths
 
 
-def _simulated(model: DynamicalVAE, real: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _simulated(model: DynamicalVAE, real: Batch) -> tuple[Batch, dict[str, Tensor]]:
     """Sequences drawn from the model, as it sees them, of the same lengths and context; and their latents."""
     x = real[model.observed[0]]
-    kept = {name: value for name, value in real.items() if name not in (*model.observed, "mask", LOG_DET)}
+    kept = Batch({name: value for name, value in real.items() if name not in (*model.observed, "mask", "log_det")})
     drawn = model.model(kept, length=x.shape[1] if x.dim() == 3 else None, size=len(x))
     latents = {name: drawn[name] for name in model.latents}
-    seen = {**kept, **{name: drawn[name] for name in model.observed}}
+    seen = kept | {name: drawn[name] for name in model.observed}
     return (seen if model.view.keeps_volume else model.read(model.shown(seen, kept))), latents
 
 

@@ -20,7 +20,8 @@ from rich.text import Text
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.sequences import HeldOutWindows, called, columns_of, gapped, mean_of_known, past_of, scales_of
+from ...data.batch import Batch
+from ...data.sequences import HeldOutWindows, called, columns_of, mean_of_known, scales_of
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
@@ -364,7 +365,7 @@ def predictive_checks(
         raise ValueError("there is no statistic to check")
     for each in models.values():
         require_likelihood(each)
-    truth = gapped(held.batch)
+    truth = held.batch.mask_to_nan()
     _, frame = called(windows.description)
     firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
     checks: dict[str, dict[str, dict[str, Check]]] = {label: {} for label in models}
@@ -403,15 +404,15 @@ def predictive_checks(
     )
 
 
-def _forecast(model: DynamicalVAE, batch: dict[str, Tensor], observed: int, samples: int, drawn: bool) -> Tensor:
+def _forecast(model: DynamicalVAE, batch: Batch, observed: int, samples: int, drawn: bool) -> Tensor:
     """The last observed frames and the future, (S, B, seam + H, D)."""
     x = batch["x"]
-    seen, horizon = past_of(batch, observed), x.shape[1] - observed
+    seen, horizon = batch.past(observed), x.shape[1] - observed
     future = model.forecast(seen, horizon, samples, draw_emission=drawn)["x"]
     return torch.cat([seen["x"][None, :, -_SEAM:].expand(samples, -1, -1, -1), future], 2)
 
 
-def _posterior(model: DynamicalVAE, batch: dict[str, Tensor], observed: int, samples: int, drawn: bool) -> Tensor:
+def _posterior(model: DynamicalVAE, batch: Batch, observed: int, samples: int, drawn: bool) -> Tensor:
     """(S, B, T, D)."""
     repeated = repeat(batch, samples)
     return decode(model, repeated, model.guide(repeated), not drawn).unflatten(0, (samples, -1))

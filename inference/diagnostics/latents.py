@@ -10,9 +10,9 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from ...data.batch import Batch
 from ...networks.loop import valid_steps
 from ...program.batch import AnyBatch, repeat, rows
-from ...program.groups import GROUP
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import log_densities, require_data, require_latents, require_likelihood, total
 
@@ -48,7 +48,7 @@ def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
     )
 
 
-def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | None) -> list[dict[str, Any]]:
+def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | None) -> list[Batch]:
     """Batches of one sequence each, as the model reads them, of those whose posteriors have a score.
 
     Args:
@@ -70,7 +70,7 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
                 "through posteriors on the whole line alone, such as those of distributions.Normal()"
             )
     data = model.read(batch)
-    if model.grouped and GROUP in data:
+    if model.grouped and data.group is not None:
         raise ValueError("sequences of a group have one posterior together; leave 'group' out of the batch")
     size = require_data(model, data)
     chosen = range(size) if sequences is None else sequences
@@ -97,13 +97,13 @@ class Inferred:
         FloatingPointError: draws that are not finite.
     """
 
-    def __init__(self, model: DynamicalVAE, data: Mapping[str, Any], guide: Callable[..., Any] | None, draws: int):
+    def __init__(self, model: DynamicalVAE, data: Batch, guide: Callable[..., Any] | None, draws: int):
         self.model, self.data, self.guide = model, data, guide or model.guide
         self._like = self._of_guide(1)
         self.shapes: Shapes = {name: (v.shape[1] if v.dim() == 3 else 0, v.shape[-1]) for name, v in self._like.items()}
         there = {name: torch.ones_like(value, dtype=torch.bool) for name, value in self._like.items()}
-        if "lengths" in data:
-            valid = [(steps, valid_steps(data["lengths"], steps)[..., None]) for steps, _ in self.shapes.values()]
+        if data.lengths is not None:
+            valid = [(steps, valid_steps(data.lengths, steps)[..., None]) for steps, _ in self.shapes.values()]
             there = {n: v & ok if steps else v for (n, v), (steps, ok) in zip(there.items(), valid, strict=True)}
         self.there = joined(there)[0]
         self.draws = self.drawn(draws)

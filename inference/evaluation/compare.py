@@ -9,15 +9,14 @@ bound per frame. What their differences are sure of stands in `comparison`.
 import dataclasses
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...data.sequences import Batch, HeldOutWindows, Listed, called, clusters, each, leaves, sequences, take_split
-from ...program.groups import GROUP
+from ...data.batch import Batch
+from ...data.sequences import HeldOutWindows, Listed, called, clusters, sequences, take_split
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..bounds.particles import obstacle
@@ -128,7 +127,7 @@ def compare(
             f"{' and '.join(f'those of {label}, of {what}' for what, label in of.items())}; evaluate compares forecasts"
         )
     batch = sequences(data).batch
-    alone = batch[GROUP].tolist() if GROUP in batch else range(length_of(batch))
+    alone = batch.group.tolist() if batch.group is not None else range(length_of(batch))
     keys = [("data", str(n), 0) for n in alone] if windows is None else clusters(windows)
     chosen = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]
     shared: dict[str, Any] = {"seed": seed, "batch_size": batch_size, "progress": progress}
@@ -211,7 +210,7 @@ def _measured(
             found["variances"] = variances(model, batch, parts("active units", len(keys), batch_size))
         with reproducibly(model, seed):
             pieces = parts("information", len(chosen), max(1, _PAIRS // max(1, len(chosen))))
-            found["information"] = information(model, each(batch, itemgetter(chosen)), pieces)
+            found["information"] = information(model, batch.rows(chosen), pieces)
     return found
 
 
@@ -264,7 +263,7 @@ def _each(contenders: Mapping[str, list[Any]]) -> Iterator[tuple[str, str, Any]]
 def _fingerprint(batch: Batch) -> str:
     """SHA-256 of every tensor of the batch: its name, shape, type and values."""
     digest = hashlib.sha256()
-    for name, value in sorted(leaves(batch).items()):
+    for name, value in sorted(batch.leaves().items()):
         values = np.ascontiguousarray(value.cpu().numpy())
         digest.update(f"{name} {values.shape} {values.dtype}".encode() + values.tobytes())
     return digest.hexdigest()

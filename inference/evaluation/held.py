@@ -1,7 +1,7 @@
 """Models on held-out windows: windows prepared once for all models, and each model run under the same conditions."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ...data.sequences import Batch, HeldOutWindows, called, clusters, each, gapped, held_out_windows, mask_of, past_of
-from ...program.batch import rows
+from ...data.batch import Batch
+from ...data.sequences import HeldOutWindows, called, clusters, held_out_windows
 from ...program.conditional import evaluating
 from ...program.model import DynamicalVAE
 from ...turns import seeded
@@ -40,20 +40,20 @@ class Held:
     @property
     def futures(self) -> Tensor:
         """The frames to predict `(N, H, D)`, NaN where they were not observed."""
-        return gapped(self.batch)[:, self.observed :]
+        return self.batch.mask_to_nan()[:, self.observed :]
 
     @property
     def mask(self) -> Tensor | None:
         """`(N, T, D)`, True where x was observed; None where all of it was."""
-        return mask_of(self.batch)
+        return self.batch.mask()
 
-    def part(self, part: slice) -> dict[str, Any]:
+    def part(self, part: slice) -> Batch:
         """Some windows, whole."""
-        return {name: rows(value, part) for name, value in self.batch.items()}
+        return self.batch.rows(part)
 
-    def past(self, part: slice) -> dict[str, Any]:
-        """Some windows as forecasts see them: x `(B, O, D)`, see `past_of`."""
-        return past_of(self.part(part), self.observed)
+    def past(self, part: slice) -> Batch:
+        """Some windows as forecasts see them: x `(B, O, D)`, see `Batch.past`."""
+        return self.part(part).past(self.observed)
 
     @property
     def clips(self) -> dict[str, int]:
@@ -96,14 +96,14 @@ def hold(data: Any) -> Held:
         ValueError: whole sequences; windows that are ragged, or leave nothing to observe or to predict.
     """
     windows = held_out_windows(data)
-    batch = windows.all()
+    batch = Batch(windows.all())
     observed = windows.protocol.observed
     if observed is None:
         raise ValueError(
             "whole sequences have no future; cut them, with observed and horizon steps, to forecast; compare compares "
             "bounds of whole ones"
         )
-    if "lengths" in batch:
+    if batch.lengths is not None:
         raise ValueError("evaluation needs windows of one length, but these have lengths")
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
@@ -136,7 +136,7 @@ def reproducibly(model: nn.Module, seed: int) -> Iterator[None]:
         yield
 
 
-def on_device_of(model: nn.Module, batch: Batch) -> dict[str, Any]:
+def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
     """The batch on the device of the model, and in its floating type where it does not read batches by itself."""
     parameter = next(model.parameters())
     reads = isinstance(model, DynamicalVAE)  # and takes means off before it rounds
@@ -144,7 +144,7 @@ def on_device_of(model: nn.Module, batch: Batch) -> dict[str, Any]:
     def moved(value: Tensor) -> Tensor:
         return value.to(parameter.device) if reads or not value.is_floating_point() else value.to(parameter)
 
-    return dict(each(batch, moved))
+    return Batch(batch).map(moved)
 
 
 def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:

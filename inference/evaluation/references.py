@@ -7,13 +7,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ...data.batch import Batch
 from ...data.sequences import (
-    Batch,
     HeldOutWindows,
     bridged,
     columns_of,
-    gapped,
-    mask_of,
     mean_of_known,
     sequences,
     take_split,
@@ -40,7 +38,7 @@ def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
         batch: x `(B, T, D)`, with or without a mask of it.
         observed: O.
     """
-    x, mask = batch["x"][:, :observed], mask_of(batch)
+    x, mask = batch["x"][:, :observed], batch.mask()
     if mask is None:
         return x[:, -1], None
     mask = mask[:, :observed]
@@ -160,8 +158,8 @@ def nearest_neighbours(
         )
     if len(training) < samples:
         raise ValueError(f"{samples} neighbours were asked of {len(training)} training windows; use fewer")
-    here = last_places({"x": observed} | ({} if mask is None else {"mask": mask}), frames)
-    there = last_places({"x": training} | ({} if training_mask is None else {"mask": training_mask}), frames)
+    here = last_places(Batch(x=observed) | ({} if mask is None else {"mask": mask}), frames)
+    there = last_places(Batch(x=training) | ({} if training_mask is None else {"mask": training_mask}), frames)
     nearest = distances(here[0], there[0], here[1], there[1]).topk(samples, largest=False).indices
     return bridged(training, training_mask)[nearest.T, frames:]
 
@@ -257,7 +255,7 @@ class References:
         return 1, again
 
     def _mean(self) -> tuple[int, Forecaster]:
-        mean = mean_of_known(gapped(self._known), (0, 1))
+        mean = mean_of_known(self._known.mask_to_nan(), (0, 1))
         return 1, lambda part: mean.expand(1, len(self.held.x[part]), self._horizon, -1)
 
     def _climatology(self) -> tuple[int, Forecaster]:
@@ -285,7 +283,7 @@ class References:
 
     def _past(self, part: slice) -> tuple[Tensor, int, Tensor | None]:
         past = self.held.past(part)
-        return past["x"], self._horizon, mask_of(past)
+        return past["x"], self._horizon, past.mask()
 
     @cached_property
     def _known(self) -> Batch:
@@ -295,5 +293,5 @@ class References:
     def _training(self) -> tuple[Tensor, Tensor | None]:
         """As much of training windows as those to forecast have, and its mask."""
         listed, frames = self._known, self.held.x.shape[1]
-        mask = mask_of(listed)
+        mask = listed.mask()
         return listed["x"][:, :frames], None if mask is None else mask[:, :frames]

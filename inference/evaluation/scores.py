@@ -22,7 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...data.sequences import Batch, HeldOutWindows, bridged, called, columns_of, gapped, mask_of, scales_of
+from ...data.batch import Batch
+from ...data.sequences import HeldOutWindows, bridged, called, columns_of, scales_of
 from . import metrics
 
 
@@ -235,8 +236,8 @@ def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
     forecasts which do not heed the past are told too. Steps and distances are in standard deviations of each column's
     observed frames.
     """
-    batch, observed = windows.all(), windows.protocol.observed
-    past = gapped(batch)[:, :observed].double()
+    batch, observed = Batch(windows.all()), windows.protocol.observed
+    past = batch.mask_to_nan()[:, :observed].double()
     scale = torch.from_numpy(np.nanstd(past.numpy(), (0, 1)))
     scale = torch.where(scale > 0, scale, 1.0)
     last = bridged(past, ~past.isnan())[:, -1:]
@@ -275,9 +276,9 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             if truth.shape[-1] != len(columns):
                 raise ValueError(f"{len(columns)} columns ({', '.join(columns)}) are not the {truth.shape[-1]} of x")
-            mask = mask_of(past)
+            mask = past.mask()
             seen = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
-            return measure.function(forecasts[..., column], truth[..., column], {**past, **seen}, index)
+            return measure.function(forecasts[..., column], truth[..., column], past | seen, index)
 
         return _part(measure, function, lambda truth: truth[..., column])
 

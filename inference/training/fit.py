@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from ...data.batch import WHOLE
 from ...data.schema import Schema
 from ...data.sequences import Fingerprinted, InBatches, Source, as_source, in_batches, is_divided, take_split
-from ...data.views import WHOLE
 from ...program.batch import check_scale
 from ...program.conditional import like
 from ...program.model import DynamicalVAE

@@ -12,14 +12,15 @@ does not change.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from ...data.sequences import Batch, InBatches, Source, mask_of
-from ...data.views import WHOLE
+from ...data.batch import WHOLE, Batch
+from ...data.sequences import InBatches, Source
 from ...networks.loop import valid_steps
 from ...program.model import DynamicalVAE
 
@@ -61,7 +62,7 @@ def last_value_bound(
             entries[..., places] = 0.0
             entries[..., places[0]] = torch.where(same, stays, (1 - stays) / (len(places) - 1)).log()
         total += float(entries.masked_fill(~seen, 0.0)[:, model.view.past :].sum())
-        lengths = batch.get("lengths")
+        lengths = Batch(batch).lengths
         frames += len(x) * (x.shape[1] - model.view.past) if lengths is None else int(lengths.sum())
     return total / frames
 
@@ -112,10 +113,11 @@ def _log_density(away: Tensor, spread: Tensor, discrete: Tensor) -> Tensor:
     return torch.where(discrete, (ends[1] - ends[0]).clamp(min=1e-12).log(), density)
 
 
-def _values(batch: Batch) -> tuple[Tensor, Tensor]:
+def _values(given: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """x (B, T, D) in double precision, and where it was observed."""
-    x, mask = torch.as_tensor(batch[WHOLE]).double().cpu(), mask_of(batch)
+    batch = Batch(given)
+    x, mask = torch.as_tensor(batch[WHOLE]).double().cpu(), batch.mask()
     seen = torch.ones_like(x, dtype=torch.bool) if mask is None else torch.as_tensor(mask).cpu()
-    if "lengths" in batch:
-        seen = seen & valid_steps(torch.as_tensor(batch["lengths"]).cpu(), x.shape[1])[..., None]
+    if batch.lengths is not None:
+        seen = seen & valid_steps(torch.as_tensor(batch.lengths).cpu(), x.shape[1])[..., None]
     return torch.where(seen, x, 0.0), seen

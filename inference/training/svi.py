@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ...data.sequences import Batch, InBatches, each, in_batches, refuse_table, tensor_of
+from ...data.batch import Batch
+from ...data.sequences import InBatches, in_batches, refuse_table, tensor_of
 from ...options import kind_of
+from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
 from ...program.protocols import Program
 from ...turns import alone, no_fork, seeded
@@ -165,7 +167,7 @@ class SVI:
 
     @alone
     @torch.inference_mode(False)
-    def step(self, batch: Batch | Tensor) -> Terms:
+    def step(self, batch: AnyBatch) -> Terms:
         """Take one optimiser step, in training mode, and return the terms of the bound before it.
 
         Args:
@@ -331,14 +333,14 @@ class SVI:
         return _per_frame(dict(zip(sums, totals, strict=True)))
 
     def _terms(
-        self, batch: Batch | Tensor, objective: Objective, where: str, feeding: float, curriculum: float | None = None
+        self, batch: AnyBatch, objective: Objective, where: str, feeding: float, curriculum: float | None = None
     ) -> Terms:
         """Terms of a batch that the objective needs, on the device of the model."""
         refuse_table(batch)
-        placed = each(batch if isinstance(batch, Mapping) else {"x": batch}, tensor_of)
+        placed = Batch(batch if isinstance(batch, Mapping) else {"x": batch}).map(tensor_of)
         if not isinstance(self.model, DynamicalVAE):  # which reads in its own precision
             dtype = self.parameters[0].dtype
-            placed = each(placed, lambda v: v.to(dtype) if v.is_floating_point() else v)
+            placed = placed.map(lambda v: v.to(dtype) if v.is_floating_point() else v)
         program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
         program |= {} if curriculum is None else {"curriculum": curriculum}
         if isinstance(objective, Asking) and objective.draws:

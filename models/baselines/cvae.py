@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.views import WHOLE
+from ...data.batch import WHOLE
 from ...distributions import LawSpec, Mixture
 from ...networks import Input, Network, NetworkSpec
 from ...networks.base import perceptron

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ...data.views import WHOLE
+from ...data.batch import WHOLE
 from ...inference.training.options import Training
 from ...inference.training.recipe import Recipe
 from ...motion import Windows

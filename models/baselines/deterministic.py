@@ -18,8 +18,8 @@ from typing import Any, ClassVar, Self
 
 from typing_extensions import override
 
+from ...data.batch import WHOLE
 from ...data.schema import Schema
-from ...data.views import WHOLE
 from ...distributions import FixedNormal, LawSpec
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe

@@ -26,8 +26,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...constants import indices
+from ...data.batch import WHOLE, Batch
 from ...data.schema import SchemaError
-from ...data.views import WHOLE
 from ...inference.training.objectives import Evidence, Objective
 from ...motion import Skeleton
 from ...motion.geometry.parts import places_of
@@ -121,7 +121,7 @@ class DLowModel(ModesModel):
             raise ValueError(f"held are {', '.join(method.held)}, all joints, so that nothing is left to differ")
 
     @override
-    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """The energies of the futures of each window in all modes."""
         if WHOLE_SETS not in data:
             return super().penalties(rollout, data, draws)

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import scipy
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.views import WHOLE
+from ...data.batch import WHOLE, Batch
 from ...inference.training.objectives import Evidence, Objective
 from ...motion.scoring import energies
 from ...options import Amount, Positive, Range
@@ -82,7 +82,7 @@ class DSFModel(ModesModel):
     method: DSF
 
     @override
-    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """The energies of the futures of each window in all modes."""
         found = super().penalties(rollout, data, {})
         if WHOLE_SETS not in data:

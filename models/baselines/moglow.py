@@ -35,9 +35,9 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ...data.batch import WHOLE
 from ...data.schema import Schema
 from ...data.sequences import bridged
-from ...data.views import WHOLE
 from ...distributions import FAMILIES, ConditionalFlow, LawSpec, Product
 from ...distributions.conditional_flow import ConditionalFlowLaw
 from ...distributions.product import ProductLaw
@@ -140,7 +140,7 @@ def start_flow(model: DynamicalVAE, windows: Any) -> None:
     batch, units, law = windows.sample(256, torch.default_generator), model.units[WHOLE], model.generator[WHOLE].law
     if not units.scale.dim():  # those of columns are known
         exact = model.read(batch, precise=True)
-        units.fit(bridged(exact[WHOLE], exact.get("mask", {}).get(WHOLE)))
+        units.fit(bridged(exact[WHOLE], exact.mask()))
     data = model.read(batch)
     x = data[WHOLE]
     run = model.rollout(data)

@@ -33,9 +33,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ...data.sequences import Batch, bridged
+from ...data.batch import WHOLE, Batch
+from ...data.sequences import bridged
 from ...data.units import Units
-from ...data.views import WHOLE
 from ...distributions import Family, LawSpec
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
@@ -134,7 +134,7 @@ class MotionInfilling(TrajectoryMethod):
 def start(model: InfillingModel, train: Windows) -> None:
     """Gives the network mean and spread of 1024 windows, as the model sees them."""
     seen = model.read(train.sample(1024, torch.default_generator))
-    model.generator[WHOLE].network.units.fit(bridged(seen[WHOLE], seen.get("mask", {}).get(WHOLE)))
+    model.generator[WHOLE].network.units.fit(bridged(seen[WHOLE], seen.mask()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +167,7 @@ class Gaps:
         found: str = self.source.fingerprint
         return found
 
-    def _hiding(self, batch: Batch, generator: torch.Generator) -> Batch:
+    def _hiding(self, batch: Mapping[str, Any], generator: torch.Generator) -> Batch:
         count, length, _ = batch[GIVEN].shape
         kind, place = torch.rand(2, count, 1, generator=generator).clamp(min=1e-6)
         noise = torch.randn(count, 1, generator=generator)
@@ -179,7 +179,7 @@ class Gaps:
         order[:, self.source.skeleton.root] = 1.0  # the last one
         rank = order.argsort(1).argsort(1)
         of_joints = torch.where(rank < JOINTS, rank / JOINTS, NEVER).repeat_interleave(3, 1)
-        return {**batch, HIDDEN: torch.where((kind < IN_TIME)[..., None], in_time[..., None], of_joints[:, None])}
+        return Batch(batch) | {HIDDEN: torch.where((kind < IN_TIME)[..., None], in_time[..., None], of_joints[:, None])}
 
 
 class InfillingModel(TrajectoryModel):
@@ -192,16 +192,14 @@ class InfillingModel(TrajectoryModel):
         return True
 
     @override
-    def read(
-        self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False
-    ) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
         """Without the trajectories that are hidden when the curriculum has come so far."""
         if isinstance(batch, Mapping) and HIDDEN in batch:
             whole = batch
 
             def shown() -> Batch:
                 given = torch.where(whole[HIDDEN] <= curriculum, 0.0, whole[GIVEN])
-                return {name: value for name, value in whole.items() if name != HIDDEN} | {GIVEN: given}
+                return Batch({name: value for name, value in whole.items() if name != HIDDEN}) | {GIVEN: given}
 
             batch = once(self, [whole, curriculum], shown)  # by guide and model both
         return super().read(batch, size=size, curriculum=curriculum, precise=precise)

@@ -35,7 +35,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ...data.views import WHOLE
+from ...data.batch import WHOLE, Batch
 from ...distributions import Family
 from ...inference.training.objectives import Evidence
 from ...inference.training.options import Stage, Training
@@ -142,7 +142,7 @@ class MTVAEModel(FutureModel):
     """A model of MT-VAE."""
 
     @override
-    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """Errors of the first velocities, of the guide's draw and of one of the prior, and of how that comes back."""
         found, method = super().penalties(rollout, data, draws), self.method
         assert isinstance(method, MTVAE)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.views import WHOLE
+from ...data.batch import WHOLE
 from ...networks import Input, NetworkSpec
 from ...networks.base import AtOnce
 from ...networks.cells import GRU

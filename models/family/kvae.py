@@ -37,8 +37,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
+from ...data.batch import WHOLE
 from ...data.schema import Schema
-from ...data.views import WHOLE
 from ...distributions.base import LawSpec
 from ...distributions.kalman import LinearGaussianChain, update
 from ...distributions.triangular import InverseCholesky, Triangular, refuse_half

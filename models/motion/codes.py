@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ...data.views import WHOLE
+from ...data.batch import WHOLE
 from ...inference.evaluation.held import on_device_of, reproducibly
 from ...inference.evaluation.metrics import average_pairwise_distance
 from ...inference.training.fit import Callback

@@ -17,8 +17,9 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
+from ...data.batch import WHOLE, Batch
 from ...data.sequences import Source
-from ...data.views import WHOLE, View, Views
+from ...data.views import View, Views
 from ...motion import Bones, Heading, Skeleton, Windows
 from ...motion.geometry.angles import AngleLimits, angle_names, estimate_angle_limits
 from ...motion.geometry.views import LENGTHS
@@ -130,7 +131,7 @@ class EnergyModel(DynamicalVAE):
             self.register_buffer("angle_high", torch.full((len(self.limits),), 1.0))
         self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
 
-    def best(self, samples: Tensor, truth: Tensor, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def best(self, samples: Tensor, truth: Tensor, batch: Batch) -> dict[str, Tensor]:
         """The energies of the best sample, (B,) each; those of weight 0 are left out.
 
         Args:
@@ -174,18 +175,18 @@ class EnergyModel(DynamicalVAE):
         """Windows (..., T, D) turned as the networks see them."""
         return x if self.heading is None else self.heading.face(x)
 
-    def positions(self, values: Mapping[str, Tensor], data: Mapping[str, Any]) -> dict[str, Tensor]:
+    def positions(self, values: Mapping[str, Tensor], data: Batch) -> Batch:
         """Positions (..., B, T, D), turned, from x or all its parts as the networks see them."""
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
-        return self.view.inverse({**values, **lengths})
+        return self.view.inverse(Batch(values) | lengths)
 
-    def _turned(self, others: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
+    def _turned(self, others: Tensor, batch: Batch) -> Tensor:
         """Other futures (B, M, T, D) of the windows of a batch, turned as these were."""
         if self.heading is None:
             return others
-        return self.heading({WHOLE: others.transpose(0, 1)}, batch)[WHOLE].transpose(0, 1)
+        return self.heading(Batch({WHOLE: others.transpose(0, 1)}), batch)[WHOLE].transpose(0, 1)
 
-    def seen(self, x: Tensor, batch: Mapping[str, Any]) -> Tensor:
+    def seen(self, x: Tensor, batch: Batch) -> Tensor:
         """x (B, T, D) of a batch as it was read, NaN where it was not observed."""
-        mask = batch.get("mask", {}).get(self.view.history or WHOLE)
+        mask = batch.mask(self.view.history or WHOLE)
         return x if mask is None else torch.where(mask, x, torch.nan)

@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
+from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
-from ...data.sequences import mask_of
-from ...data.views import WHOLE, Past, Views
+from ...data.views import Past, Views
 from ...distributions import FixedNormal, LawSpec
 from ...inference.training.objectives import Evidence, Objective
 from ...inference.training.options import Stage, Training
@@ -139,28 +139,28 @@ class FutureModel(DynamicalVAE):
         self.method, self.frames, self.skeleton = method, frames, skeleton
 
     @override
-    def read(self, batch: AnyBatch | None, **options: Any) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None, **options: Any) -> Batch:
         """The batch, whose observed frames have no gaps (see `without_gaps`)."""
         if (
             self.skeleton
             and isinstance(batch, Mapping)
             and HISTORY not in batch
-            and (mask := mask_of(batch)) is not None
+            and (mask := Batch(batch).mask()) is not None
         ):
             x, (seen, later) = torch.as_tensor(batch[WHOLE]), mask.tensor_split([self.frames], 1)
             past = without_gaps(self.skeleton, x[:, : self.frames], seen)
             whole = torch.cat([past, x[:, self.frames :]], 1)
-            batch = {**batch, WHOLE: whole, "mask": torch.cat([torch.ones_like(seen), later], 1)}
+            batch = Batch(batch) | {WHOLE: whole, "mask": torch.cat([torch.ones_like(seen), later], 1)}
         return super().read(batch, **options)
 
     @override
-    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """How far the first pose is from the last observed one; and the best of several draws from what happened."""
         if WHOLE not in data or not (self.method.join or draws):
             return {}
         size = rollout.batch // rollout.draws
         made, truth = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (-1, size)), data[WHOLE][:size]
-        if (mask := data.get("mask", {}).get(WHOLE)) is not None:
+        if (mask := data.mask()) is not None:
             truth = torch.where(mask[:size], truth, torch.nan)
         found = {"reconstruction": energies.best_of_many(made, truth)} if draws else {}
         if self.method.join:

@@ -33,8 +33,9 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.sequences import bridged, mask_of
-from ...data.views import WHOLE, History, Parts
+from ...data.batch import WHOLE, Batch
+from ...data.sequences import bridged
+from ...data.views import History, Parts
 from ...distributions import Delta, Directions
 from ...factorization.notation import Factorization
 from ...inference.training.objectives import Evidence, Objective
@@ -223,7 +224,7 @@ class GSPSModel(EnergyModel):
         return {**({"draws": self.draws} if whole else {}), **options}
 
     @override
-    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """Those of whole windows."""
         if not draws:
             return {}
@@ -232,7 +233,7 @@ class GSPSModel(EnergyModel):
         values = {name: value.flatten(0, 1) for name, value in self.positions(parts, data).items()}
         return self.energies(values, truth, data)
 
-    def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Batch) -> dict[str, Tensor]:
         """The energies of futures that were drawn together, (B,) each; those of weight 0 are left out.
 
         Args:
@@ -259,10 +260,10 @@ class GSPSModel(EnergyModel):
         return found
 
     @override
-    def read(self, batch: AnyBatch | None, **options: Any) -> dict[str, Any]:
+    def read(self, batch: AnyBatch | None, **options: Any) -> Batch:
         """The batch, whose observed frames have no gaps (see `without_gaps`)."""
         data = super().read(batch, **options)
-        mask = data.get("mask", {}).get(HISTORY)
+        mask = data.mask(HISTORY)
         if mask is None or mask.all():
             return data
         past = without_gaps(self.skeleton, data[HISTORY][:, : self.frames], mask[:, : self.frames])
@@ -303,7 +304,7 @@ class GSPSModel(EnergyModel):
         Raises:
             ValueError: a batch without a mask, or windows of another length than the networks make.
         """
-        if not isinstance(batch, Mapping) or (mask := mask_of(batch)) is None:
+        if not isinstance(batch, Mapping) or (mask := Batch(batch).mask()) is None:
             return super().impute(batch, samples, **options)  # which says so
         if (length := batch[WHOLE].shape[1]) != self.length:
             raise ValueError(

@@ -43,8 +43,8 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ...constants import indices
+from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
-from ...data.views import WHOLE
 from ...distributions import Directions
 from ...factorization.notation import Factorization
 from ...inference.training.objectives import Evidence, Objective
@@ -315,7 +315,7 @@ class HiTModel(EnergyModel):
         self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
 
     @override
-    def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
+    def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         if not draws or WHOLE not in rollout.values:
             return {}
         if rollout.lengths is not None:

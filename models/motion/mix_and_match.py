@@ -29,8 +29,9 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ...constants import constant
+from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
-from ...data.views import WHOLE, Past, Views
+from ...data.views import Past, Views
 from ...distributions import FixedNormal, LawSpec
 from ...factorization.notation import Factorization
 from ...inference.training.objectives import Evidence
@@ -213,7 +214,7 @@ def _aligned(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
     first = torch.zeros_like(quaternions[..., :start])
     turns = quaternions[..., start:].unflatten(-1, (-1, 4))
     turns = torch.cat([turns[..., :place, :], unturned[..., None, :], turns[..., place + 1 :, :]], -2)
-    found: Tensor = view.inverse({WHOLE: torch.cat([first, turns.flatten(-2)], -1), LENGTHS: lengths})[WHOLE]
+    found: Tensor = view.inverse(Batch({WHOLE: torch.cat([first, turns.flatten(-2)], -1), LENGTHS: lengths}))[WHOLE]
     return found
 
 

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ...data.views import WHOLE
+from ...data.batch import WHOLE, Batch
 from ...inference.training.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
 from ...inference.training.fit import fit
 from ...inference.training.options import Stage, Training
@@ -39,7 +39,6 @@ from ...networks.base import perceptron
 from ...networks.loop import once
 from ...options import Size, flat
 from ...program.batch import CHUNK, AnyBatch, repeat, rows
-from ...program.groups import GROUP
 from ...program.rollout import Rollout
 from ..baselines.cvae import CVAE, SummaryDecoder
 from ..registry import configured
@@ -201,7 +200,7 @@ class ModesModel(FutureModel):
         found: Sampler = self.generator[WHOLE].network.sampler
         return found
 
-    def in_modes(self, data: Mapping[str, Any], modes: Tensor) -> dict[str, Any]:
+    def in_modes(self, data: Batch, modes: Tensor) -> Batch:
         """What was read of B windows in each of these modes, mode by mode.
 
         Args:
@@ -214,19 +213,19 @@ class ModesModel(FutureModel):
         size = len(data[HISTORY])
         places = self._coded(modes.repeat_interleave(size), data[HISTORY])
         group = torch.arange(size, device=places.device).repeat(len(modes))
-        return {**repeat(data, len(modes)), MODE: places, GROUP: group}
+        return Batch(repeat(data, len(modes))) | {MODE: places, "group": group}
 
     def _coded(self, modes: Tensor, like: Tensor) -> Tensor:
         """(B, K), 1 at the mode of each row."""
         return torch.eye(self.modes, dtype=like.dtype, device=like.device).index_select(0, modes.to(like.device))
 
-    def in_sets(self, batch: AnyBatch | None) -> dict[str, Any]:
+    def in_sets(self, batch: AnyBatch | None) -> Batch:
         """A batch of B windows in all modes, as `in_modes` has it, whose futures are to be compared."""
 
-        def compute() -> dict[str, Any]:
+        def compute() -> Batch:
             read = self.read(batch)
             data = self.in_modes(read, torch.arange(self.modes, device=read[HISTORY].device))
-            return {**data, WHOLE_SETS: torch.ones_like(data[GROUP], dtype=torch.bool)}
+            return data | {WHOLE_SETS: torch.ones_like(data.group, dtype=torch.bool)}
 
         return once(self.generator, [batch], compute)
 
@@ -249,7 +248,7 @@ class ModesModel(FutureModel):
         if MODE in (self.inference if guide else self.generative).context and MODE not in data and HISTORY in data:
             history = data[HISTORY]
             drawn = torch.randint(self.modes, history.shape[:1], device=history.device)
-            data = {**data, MODE: self._coded(drawn, history)}
+            data = data | {MODE: self._coded(drawn, history)}
         rollout = super().rollout(data, length, size, guide=guide)
         return replace(rollout, draws=self.modes) if WHOLE_SETS in data else rollout
 
@@ -294,7 +293,7 @@ class ModesModel(FutureModel):
     def _in_sets(
         self,
         make: Callable[[slice, Tensor, int], Mapping[str, Tensor]],
-        data: Mapping[str, Any],
+        data: Batch,
         samples: int,
         chunk: int,
     ) -> dict[str, Tensor]:

@@ -28,8 +28,8 @@ from pyro import poutine
 from torch import Tensor
 from typing_extensions import override
 
+from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
-from ...data.views import WHOLE
 from ...distributions import FixedNormal, LawSpec
 from ...factorization.notation import Factorization
 from ...inference.training.gradnorm import GradNorm
@@ -197,6 +197,6 @@ class MotionLatentModel(DynamicalVAE):
 
     def _moved(self, parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Rotations (B, N, J, 3, 3) and translation (B, N, 3)."""
-        whole = self.view.inverse({name: parts[name] for name in PARTS})[WHOLE]
+        whole = self.view.inverse(Batch({name: parts[name] for name in PARTS}))[WHOLE]
         rotations, place, _ = self.timed.unpack(whole)
         return rotations, place

@@ -23,9 +23,9 @@ from pyro import poutine
 from torch import Tensor
 from typing_extensions import override
 
+from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
-from ...data.sequences import Batch
-from ...data.views import WHOLE, Past, View, Views
+from ...data.views import Past, View, Views
 from ...distributions import FixedNormal, LawSpec
 from ...inference.training.objectives import Evidence
 from ...inference.training.options import Stage, Training
@@ -163,8 +163,8 @@ class Paths(View):
     """Beside the motion, given trajectories; without any in a batch none are."""
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
-        return {GIVEN: torch.zeros_like(data[WHOLE]), **data} if WHOLE in data else dict(data)
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+        return Batch({GIVEN: torch.zeros_like(data[WHOLE]), **data}) if WHOLE in data else data
 
 
 @dataclass(frozen=True)
@@ -178,13 +178,13 @@ class Rest(Paths):
     complement: bool
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         if WHOLE not in data:
-            return dict(data)
+            return data
         seen, x = super().__call__(data, beside), data[WHOLE]
-        if (mask := data.get("mask", {}).get(WHOLE)) is not None:
+        if (mask := data.mask()) is not None:
             x = torch.where(mask, x, 0.0)
-        return {REST: torch.where(seen[GIVEN] == 0, x, 0.0) if self.complement else x, **seen}
+        return Batch({REST: torch.where(seen[GIVEN] == 0, x, 0.0) if self.complement else x, **seen})
 
 
 class TrajectoryModel(DynamicalVAE):
@@ -221,7 +221,7 @@ class TrajectoryModel(DynamicalVAE):
             raise ValueError("a motion starts from a pose: give a batch with s (B, D), or with windows x (B, 1 + T, D)")
         first, length = data[FIRST], options.get("length")
         if GIVEN not in data and length is not None:
-            data[GIVEN] = first.new_zeros(len(first), length, first.shape[-1])
+            data = data | {GIVEN: first.new_zeros(len(first), length, first.shape[-1])}
         return super().model(data, curriculum=curriculum, **options)
 
     @torch.no_grad()
@@ -297,7 +297,7 @@ class TrajectoryModel(DynamicalVAE):
         # Samples that are all the same are one: rows of one product may differ in their last bits.
         return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
-    def _whole(self, data: Mapping[str, Any], horizon: int) -> dict[str, Any]:
+    def _whole(self, data: Batch, horizon: int) -> Batch:
         """The data, and trajectories over all frames that the networks are to make for a horizon.
 
         Raises:
@@ -317,7 +317,7 @@ class TrajectoryModel(DynamicalVAE):
             )
         made = max(horizon, self.frames or horizon)
         rest = given[:, -1:].expand(-1, max(made - given.shape[1], 0), -1)
-        return {**data, GIVEN: torch.cat([given[:, :made], rest], 1)}
+        return data | {GIVEN: torch.cat([given[:, :made], rest], 1)}
 
     def complete(
         self,

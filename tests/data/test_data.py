@@ -7,16 +7,14 @@ import torch
 from typing_extensions import get_protocol_members
 
 import dvae
+from dvae.data.batch import Batch
 from dvae.data.sequences import (
-    BESIDE,
     ArrayWindows,
     Fingerprinted,
     HeldOutWindows,
     InBatches,
     Listed,
     Source,
-    leaves,
-    past_of,
     sequences,
 )
 from dvae.inference.training.objectives import Asking
@@ -39,8 +37,9 @@ def test_asking_what_something_is_reads_nothing_of_it(protocol):
 @pytest.mark.parametrize("named", [False, True])
 def test_a_past_holds_no_frame_of_the_future_but_of_context(named):
     x, mask, context = torch.randn(2, 7, 3), torch.rand(2, 7, 3) < 0.5, torch.randn(2, 7, 1)
-    batch = {"x": x, "mask": {"x": mask} if named else mask, BESIDE: {"turns": x}, "y": context, "w": torch.randn(2, 4)}
-    found, whole = leaves(past_of(batch, 5)), leaves(batch)
+    mask = {"x": mask} if named else mask
+    batch = Batch(x=x, mask=mask, beside={"turns": x}, y=context, w=torch.randn(2, 4))
+    found, whole = batch.past(5).leaves(), batch.leaves()
     assert found.keys() == whole.keys()
     for name, value in found.items():
         assert torch.equal(value, whole[name] if name in ("y", "w") else whole[name][:, :5])

@@ -21,7 +21,7 @@ from dvae.cli.tables import is_table
 from dvae.data import npy
 from dvae.data.blocks import ColumnSummary, blocks, cut, hash_list, hash_values, row_blocks
 from dvae.data.npy import is_mapped, mapped
-from dvae.data.sequences import Sequences, leaves, sequences
+from dvae.data.sequences import Sequences, sequences
 from dvae.data.units import Units
 from dvae.tables import Column, Columns, Cut, Panel, PanelData, Series
 
@@ -43,7 +43,7 @@ def saved(path, values):
 
 
 def assert_same(found, wanted):
-    found, wanted = leaves(found), leaves(wanted)
+    found, wanted = found.leaves(), wanted.leaves()
     assert found.keys() == wanted.keys()
     for name, value in found.items():
         assert value.dtype == wanted[name].dtype

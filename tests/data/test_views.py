@@ -6,8 +6,9 @@ import torch
 
 import dvae
 from dvae import motion
+from dvae.data.batch import Batch
 from dvae.data.sequences import ArrayWindows
-from dvae.data.views import LOG_DET, History, Parts, Past, View, Views
+from dvae.data.views import History, Parts, Past, View, Views
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.models.motion.trajectories import Rest
 from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
@@ -42,7 +43,7 @@ def turn(x, angle, skeleton=WALKER):
 @pytest.fixture(params=VIEWS)
 def view_and_data(request):
     view, size = VIEWS[request.param]
-    return view, {"x": people(B, T, size)}
+    return view, Batch(x=people(B, T, size))
 
 
 def test_the_way_back_is_the_inverse(view_and_data):
@@ -62,16 +63,16 @@ def test_samples_of_the_future_go_back_as_the_past_was_seen(view_and_data):
     """Seen values (S, B, H, D) beside what the view added to the past."""
     view, data = view_and_data
     past, future = data["x"], people(B, 7, data["x"].shape[-1])
-    seen = view({"x": past})
+    seen = view(Batch({"x": past}))
     added = {name: seen[name] for name in view.names if name in seen}
     if isinstance(view, Past) or "s" in seen:  # frames that go on from it are seen as such
-        later = {n: v for n, v in view({"x": torch.cat([past[:, :1], future], 1)}).items() if n != "s"}
+        later = {n: v for n, v in view(Batch({"x": torch.cat([past[:, :1], future], 1)})).items() if n != "s"}
     else:
-        later = view({"x": future}, seen)
+        later = view(Batch({"x": future}), seen)
     made = {
         name: value.expand(2, *value.shape) for name, value in later.items() if name not in ("heading", "h", "y", "r")
     }
-    torch.testing.assert_close(view.inverse({**added, **made})["x"], future.expand(2, *future.shape))
+    torch.testing.assert_close(view.inverse(Batch({**added, **made}))["x"], future.expand(2, *future.shape))
 
 
 def test_views_keep_volume(view_and_data):
@@ -82,7 +83,7 @@ def test_views_keep_volume(view_and_data):
     names = [name for name in view(data) if name not in ("heading", "h", "y", "r")]
 
     def seen(x):
-        found = view({"x": x[None]}, given)
+        found = view(Batch({"x": x[None]}), given)
         return torch.cat([found[name].flatten() for name in names])
 
     if "s" in names and "heading" in view.names:  # which tells the heading; the rest is turned by it
@@ -99,7 +100,7 @@ def test_views_keep_volume(view_and_data):
 def test_every_window_faces_one_way_and_stays_the_same_otherwise(skeleton):
     x = people(B, T, 3 * skeleton.joints)
     for angle in (0.0, 2.5):
-        seen = Heading(skeleton, 2)({"x": turn(x, angle, skeleton)})
+        seen = Heading(skeleton, 2)(Batch({"x": turn(x, angle, skeleton)}))
         torch.testing.assert_close(skeleton.heading(seen["x"].unflatten(-1, (-1, 3))[:, 1]), torch.zeros(B).double())
         torch.testing.assert_close(seen["x"], Heading(skeleton, 2).face(x))
 
@@ -183,7 +184,7 @@ def test_the_nearest_pose_with_hips_and_shoulders_tells_the_heading(frames, name
     x = people(B, T, D)
     mask = without(torch.ones_like(x, dtype=torch.bool), 1, frames, *names)
     hidden = torch.where(mask, x, torch.nan)
-    seen = Heading(WALKER, 3)({"x": hidden, "mask": {"x": mask}})
+    seen = Heading(WALKER, 3)(Batch({"x": hidden, "mask": {"x": mask}}))
     joints = WALKER.with_root(x.unflatten(-1, (-1, 3)))
     expected = WALKER.heading(joints[:, 2])
     pose = WALKER.with_root(hidden.unflatten(-1, (-1, 3)))[1, tells]
@@ -200,10 +201,10 @@ def test_the_nearest_pose_with_hips_and_shoulders_tells_the_heading(frames, name
 def test_a_window_that_tells_no_heading_stays_as_it_is(lacking):
     x = people(B, T, D)
     mask = without(torch.ones_like(x, dtype=torch.bool), 1, slice(lacking), *LEFT)
-    seen = Heading(WALKER, 3)({"x": x, "mask": {"x": mask}})
+    seen = Heading(WALKER, 3)(Batch({"x": x, "mask": {"x": mask}}))
     assert seen["heading"][1] == 0
     assert torch.equal(seen["x"][1][mask[1]], x[1][mask[1]])
-    past = Heading(WALKER, 3)({"x": x[:, :3], "mask": {"x": mask[:, :3]}})
+    past = Heading(WALKER, 3)(Batch({"x": x[:, :3], "mask": {"x": mask[:, :3]}}))
     torch.testing.assert_close(past["heading"], seen["heading"])  # a forecast turns as training did
 
 
@@ -265,7 +266,7 @@ def bones_and_data(request):
 
 def test_directions_of_bones_have_length_one_and_lead_back_to_rigid_people(bones_and_data):
     view, x = bones_and_data
-    seen = view({"x": x})
+    seen = view(Batch({"x": x}))
     whole = seen["x"] if "x" in seen else Parts({"legs": LEGS, "arms": ARMS}).inverse(seen)["x"]
     joints = whole.unflatten(-1, (-1, 3))
     bones = joints if joints.shape[2] < J else WALKER.without_root(joints)
@@ -278,10 +279,10 @@ def test_directions_of_bones_have_length_one_and_lead_back_to_rigid_people(bones
 def test_whatever_is_made_of_them_no_bone_is_stretched(bones_and_data):
     """Any numbers (S, B, H, D) in the place of directions; a root stays where it is made."""
     view, x = bones_and_data
-    seen = view({"x": x})
+    seen = view(Batch({"x": x}))
     made = {name: people(2, B, 7, value.shape[-1]) for name, value in seen.items() if value.dim() == 3}
     added = {name: value for name, value in seen.items() if value.dim() < 3}
-    back = view.inverse({**made, **added})
+    back = view.inverse(Batch({**made, **added}))
     torch.testing.assert_close(lengths_of(back["x"]), lengths_of(x)[:, :1].expand(2, -1, 7, -1))
     if x.shape[-1] == 3 * J:
         torch.testing.assert_close(back["x"][..., :3], made["x"][..., :3])
@@ -292,23 +293,23 @@ def test_whatever_is_made_of_them_no_bone_is_stretched(bones_and_data):
 def test_lengths_are_the_means_over_the_observed_frames_that_are_no_padding():
     x = people(B, 6, D)
     lengths = lengths_of(x)
-    torch.testing.assert_close(Bones(WALKER, 4)({"x": x})["bone_lengths"], lengths[:, :4].mean(1))
+    torch.testing.assert_close(Bones(WALKER, 4)(Batch({"x": x}))["bone_lengths"], lengths[:, :4].mean(1))
     steps = torch.tensor([2, 6, 3])
     expected = torch.stack([lengths[n, : min(4, t)].mean(0) for n, t in enumerate(steps)])
-    torch.testing.assert_close(Bones(WALKER, 4)({"x": x, "lengths": steps})["bone_lengths"], expected)
+    torch.testing.assert_close(Bones(WALKER, 4)(Batch({"x": x, "lengths": steps}))["bone_lengths"], expected)
 
 
 def test_directions_alone_have_no_density_and_need_both_ends():
     x, view = rigid(5, D), Bones(WALKER, 3)
     with pytest.raises(ValueError, match=r"no density of positions .* directions of bones: lengths are taken as given"):
-        view.log_det({"x": x})
+        view.log_det(Batch({"x": x}))
     with pytest.raises(ValueError, match="no density of positions"):
         dvae.SequenceELBO().terms(build(view), x)
     mask = torch.ones_like(x, dtype=torch.bool)
-    assert torch.equal(view({"x": x, "mask": {"x": mask}})["x"], view({"x": x})["x"])
+    assert torch.equal(view(Batch({"x": x, "mask": {"x": mask}}))["x"], view(Batch({"x": x}))["x"])
     mask[1, 2, 5] = False
     with pytest.raises(ValueError, match="window 1 lacks entries of frame 3, but this model sees the directions of"):
-        view({"x": x, "mask": {"x": mask}})
+        view(Batch({"x": x, "mask": {"x": mask}}))
 
 
 def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
@@ -329,11 +330,11 @@ def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
     knee = [i for i in range(D) if i // 3 in (1, 2)]  # of the joints without the root: RKnee, RFoot
     rest = [i for i in range(D) if i not in knee]
     view, x = Bones(WALKER, 4, {"shank": knee, "rest": rest}), rigid(4, D)
-    seen = view({"x": x, "shank": x[..., knee]})
+    seen = view(Batch({"x": x, "shank": x[..., knee]}))
     assert torch.equal(seen["shank"], seen["x"][..., knee])
-    assert torch.equal(view({"rest": x[..., rest]}, seen)["rest"], seen["x"][..., rest])
+    assert torch.equal(view(Batch({"rest": x[..., rest]}), seen)["rest"], seen["x"][..., rest])
     with pytest.raises(ValueError, match="shank alone does not tell that of RKnee, which hangs from RHip"):
-        view({"shank": x[..., knee]}, seen)
+        view(Batch({"shank": x[..., knee]}), seen)
 
 
 # --------------------------------------------------------------------------------------------- views that change volume
@@ -346,7 +347,7 @@ class Scaled(View):
     """Each coordinate of x times a number of its own."""
 
     def __call__(self, data, beside=None):
-        return {**data, "x": data["x"] * FACTORS} if "x" in data and LOG_DET not in data else dict(data)
+        return {**data, "x": data["x"] * FACTORS} if "x" in data and "log_det" not in data else dict(data)
 
     def inverse(self, seen):
         return {**seen, "x": seen["x"] / FACTORS} if "x" in seen else dict(seen)
@@ -359,7 +360,7 @@ class Mixed(Scaled):
     """Frames times a matrix; how much volume changes is known of whole sequences."""
 
     def __call__(self, data, beside=None):
-        return {**data, "x": data["x"] @ MIXING} if "x" in data and LOG_DET not in data else dict(data)
+        return {**data, "x": data["x"] @ MIXING} if "x" in data and "log_det" not in data else dict(data)
 
     def inverse(self, seen):
         return {**seen, "x": seen["x"] @ MIXING.inverse()} if "x" in seen else dict(seen)
@@ -469,12 +470,14 @@ def test_the_oracle_of_a_scaled_model_is_the_density_of_the_data():
 def test_views_in_a_row_add_their_volumes():
     parts = Parts({"legs": [0, 2], "arms": [1]})
     x, beside, counts = incomplete("mask and lengths")
-    view, data = Views(Scaled(), parts), {"x": x, **beside, "mask": {"x": beside["mask"]}}
+    view, data = Views(Scaled(), parts), Batch({"x": x, **beside, "mask": {"x": beside["mask"]}})
     by_entry = torch.where(counts, Scaled().log_det(data), 0.0)
     torch.testing.assert_close(view.log_det(data), by_entry.sum((1, 2)))
     torch.testing.assert_close(view.counted(data), by_entry.sum(2))
     both = Views(Scaled(), Mixed())
-    torch.testing.assert_close(both.log_det({"x": x}), T * (FACTORS.abs().log().sum() + MIXING.logdet()).expand(B))
+    torch.testing.assert_close(
+        both.log_det(Batch({"x": x})), T * (FACTORS.abs().log().sum() + MIXING.logdet()).expand(B)
+    )
     assert not view.keeps_volume
     assert Views(parts, History("h")).keeps_volume
 
@@ -482,7 +485,7 @@ def test_views_in_a_row_add_their_volumes():
 def test_volumes_that_cannot_be_right_are_refused():
     with pytest.raises(ValueError, match="changes the volume of frames that nothing scores"):
         Views(Scaled(), Past("s"))
-    assert Views(Past("s"), Scaled()).log_det({"x": people(B, T, 3)}).shape == (B,)
+    assert Views(Past("s"), Scaled()).log_det(Batch({"x": people(B, T, 3)})).shape == (B,)
 
 
 def test_what_a_scaled_model_makes_goes_back_and_it_is_fitted_by_the_bound_of_the_data():

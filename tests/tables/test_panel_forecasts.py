@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import dvae
-from dvae.data.sequences import past_of
 from dvae.inference.training.checkpoints import CheckpointError
 from dvae.models.registry import methods
 from dvae.runs import directory as runs
@@ -89,7 +88,7 @@ def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_mis
     model.eval()
     assert {"c", "s", "d"} <= {*model.context}
     batch = data.windows("test").all()
-    made = model.forecast(past_of(batch, 5), 3, samples=4, draw_emission=True)["x"]
+    made = model.forecast(batch.past(5), 3, samples=4, draw_emission=True)["x"]
     assert made.shape == (4, len(batch["x"]), 3, 7)
     assert made.isfinite().all()
     assert not made[..., [0, 2, 3, 4, 5]].frac().any()  # counts, a class and a binary
@@ -359,7 +358,7 @@ def test_forecasts_are_what_the_model_draws(data, model):
     test = data.windows("test")
     found, batch = test.forecast(model, 4, seed=3), test.all()
     torch.manual_seed(3)
-    draws = model.forecast(past_of(batch, 5), 3, samples=4, draw_emission=True)["x"]
+    draws = model.forecast(batch.past(5), 3, samples=4, draw_emission=True)["x"]
     np.testing.assert_array_equal(found.draws, draws)
     np.testing.assert_array_equal(np.isnan(found.past), ~batch["mask"][:, :5])
     assert found.keys == [(name, start + 5) for _, name, start in test.keys]

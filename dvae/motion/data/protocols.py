@@ -30,9 +30,10 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from ...data.batch import Batch
 from ...data.blocks import blocks, cut, hash_list, hash_values
 from ...data.schema import Schema, SchemaError
-from ...data.sequences import BESIDE, bridged, tensor_of
+from ...data.sequences import bridged, tensor_of
 from ...data.views import View
 from ...options import Amount, Frames, Range, check, nearest, tuples
 from ..geometry.rotations import continuous, from_matrix, to_matrix
@@ -387,7 +388,7 @@ class Windows:
         """Numbers per frame, D = 3 J, or 3 (J - 1) without the root."""
         return 3 * len(self.joints)
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Any]:
+    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.
 
         Of a set that may lack joints there is a "mask" too, see `all`. The same generator state gives the same windows.
@@ -402,10 +403,10 @@ class Windows:
             x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
         batch = self._batch(x, clips, generator)
         if self._turns is not None:
-            batch[BESIDE] = {TURNS: self._turned(clips, starts, angle if self.protocol.rotate else None)}
+            batch["beside"] = {TURNS: self._turned(clips, starts, angle if self.protocol.rotate else None)}
         return batch
 
-    def all(self, stride: int | None = None) -> dict[str, Any]:
+    def all(self, stride: int | None = None) -> Batch:
         """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32.
 
         Of a set that may lack joints there is a "mask" too, (N, T, D), False where nothing was observed; x is 0 there.
@@ -414,20 +415,20 @@ class Windows:
         """
         return self._listed(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
 
-    def batches(self, batch_size: int) -> Iterator[dict[str, Any]]:
+    def batches(self, batch_size: int) -> Iterator[Batch]:
         """The windows that `all()` lists, so many at a time."""
         clips, starts = self._list(self.stride)
         generator = torch.Generator().manual_seed(0)
         for some in torch.arange(len(clips)).split(batch_size):
             yield self._listed(clips[some], starts[some], generator)
 
-    def _listed(self, clips: Tensor, starts: Tensor, generator: torch.Generator) -> dict[str, Any]:
+    def _listed(self, clips: Tensor, starts: Tensor, generator: torch.Generator) -> Batch:
         x = torch.empty(len(clips), self.length, self.size)
         for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
             x[block] = self._cut(clips[block], starts[block])
         batch = self._batch(x, clips, generator)
         if self._turns is not None:
-            batch[BESIDE] = {TURNS: self._turned(clips, starts)}
+            batch["beside"] = {TURNS: self._turned(clips, starts)}
         return batch
 
     def poses(self) -> Tensor:
@@ -573,10 +574,10 @@ class Windows:
         windows.protocol = protocol
         return windows
 
-    def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> dict[str, Any]:
+    def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> Batch:
         """Windows with what is to go with them."""
         seen, x = x.isfinite(), x.nan_to_num(0.0)
-        batch = {"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}}
+        batch = Batch({"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}})
         if self.missing:
             batch["mask"] = seen
         if self._given is not None:

@@ -38,8 +38,8 @@ import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
-from ...data.sequences import BESIDE, Batch
-from ...data.views import WHOLE, Views
+from ...data.batch import WHOLE, Batch
+from ...data.views import Views
 from ...inference.evaluation.evaluate import evaluate
 from ...inference.evaluation.evaluation import Evaluation
 from ...inference.evaluation.scores import Measure
@@ -138,10 +138,7 @@ class Angles:
     def all(self) -> Batch:
         """The angles {"x": (N, 1 + times, A)}, and what models are given of each window."""
         batch, observed = self._batch, self.windows.protocol.observed
-        past = {**batch, WHOLE: batch[WHOLE][:, :observed]}
-        if BESIDE in past:
-            past[BESIDE] = {name: value[:, :observed] for name, value in past[BESIDE].items()}
-        return {WHOLE: self._angles[..., self.varying], MOTION: past}
+        return Batch({WHOLE: self._angles[..., self.varying], MOTION: batch.past(observed)})
 
     @cached_property
     def varying(self) -> Tensor:
@@ -159,7 +156,7 @@ class Angles:
         frames = [now, *(now + frame for frame in self.protocol.frames)]
         if self.protocol.inverse:
             return torch.cat([self.found(x[:, frames]) for x in self._batch[WHOLE].split(512)])
-        turns = self._batch[BESIDE][TURNS][:, frames].unflatten(-1, (-1, 4))[..., self.joints, :]
+        turns = self._batch.beside[TURNS][:, frames].unflatten(-1, (-1, 4))[..., self.joints, :]
         return self.of(to_matrix(turns, "quaternion"))
 
     def found(self, x: Tensor) -> Tensor:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
 from ...constants import constant, indices
-from ...data.sequences import BESIDE, Batch
-from ...data.views import WHOLE, View
+from ...data.batch import WHOLE, Batch
+from ...data.views import View
 from ...networks.loop import valid_steps
 from . import kinematics
 from .rotations import in_time, size, to_matrix
@@ -52,18 +51,19 @@ class Heading(View):
     names = (HEADING,)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         source = self.pose or WHOLE
-        found = (beside or {}).get(HEADING)
+        found = None if beside is None else beside.get(HEADING)
         if HEADING in data or (source not in data if beside is None else found is None):
-            return dict(data)
-        seen = dict(data)
-        for name in data.get("mask", {}).keys() & {*self.turned} & data.keys():
-            self._check_mask(name, data["mask"][name])
-            seen[name] = torch.where(data["mask"][name], data[name], 0.0)
+            return data
+        seen = Batch(data)
+        for name, mask in data.masks().items():
+            if name in self.turned and name in data:
+                self._check_mask(name, mask)
+                seen[name] = torch.where(mask, data[name], 0.0)
         if found is None:
-            if self.pose is None and "lengths" in data:
-                shortest, needed = data["lengths"].min(), min(self.frames, data[WHOLE].shape[-2])
+            if self.pose is None and data.lengths is not None:
+                shortest, needed = data.lengths.min(), min(self.frames, data[WHOLE].shape[-2])
                 if shortest < needed:
                     raise ValueError(
                         f"this model turns every window by its frame {needed}, but a sequence has {shortest}; leave it "
@@ -73,8 +73,8 @@ class Heading(View):
         return self._turn(seen, -found) | {HEADING: found}
 
     @override
-    def inverse(self, seen: Batch) -> dict[str, Any]:
-        data = dict(seen)
+    def inverse(self, seen: Batch) -> Batch:
+        data = Batch(seen)
         heading = data.pop(HEADING, None)
         return data if heading is None else self._turn(data, heading)
 
@@ -87,9 +87,9 @@ class Heading(View):
         """Windows (..., T, D) turned each by its own heading."""
         return self._rotated(x, -self.of(x), 2)
 
-    def _turn(self, values: Batch, angle: Tensor) -> dict[str, Any]:
+    def _turn(self, values: Batch, angle: Tensor) -> Batch:
         found = {n: self._rotated(values[n], angle, 2 - (n == self.pose)) for n in self.turned if n in values}
-        return {**values, **found}
+        return values | found
 
     def _rotated(self, x: Tensor, angle: Tensor, dims: int) -> Tensor:
         return rotate_about_up(x.unflatten(-1, (-1, 3)), angle[(..., *[None] * dims)], self.skeleton.up).flatten(-2)
@@ -97,7 +97,7 @@ class Heading(View):
     def _observed(self, data: Batch) -> Tensor:
         """Headings (B,) of what was observed of the data."""
         source = self.pose or WHOLE
-        x, seen = data[source], data.get("mask", {}).get(source)
+        x, seen = data[source], data.mask(source)
         return self.of(x if seen is None else torch.where(seen, x, torch.nan))
 
     def _joints(self, poses: Tensor) -> Tensor:
@@ -149,10 +149,10 @@ class Bones(View):
     names = (LENGTHS,)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
         held = {name: places for name, places in self.pieces.items() if name in data}
         if LENGTHS in data or (WHOLE not in data and not held):
-            return dict(data)
+            return data
         self._check_complete(data)
         x = data[WHOLE] if WHOLE in data else self._joined(data, held)
         limbs = self.skeleton.limbs(x)
@@ -160,11 +160,11 @@ class Bones(View):
         found = self._named(data, seen)
         if beside is not None:
             return found
-        return found | {LENGTHS: self._mean(limbs[:, : self.frames].norm(dim=-1), data.get("lengths"))}
+        return found | {LENGTHS: self._mean(limbs[:, : self.frames].norm(dim=-1), data.lengths)}
 
     @override
-    def inverse(self, seen: Batch) -> dict[str, Any]:
-        data = dict(seen)
+    def inverse(self, seen: Batch) -> Batch:
+        data = Batch(seen)
         lengths = data.pop(LENGTHS, None)
         if lengths is None or WHOLE not in data:
             return data
@@ -193,10 +193,10 @@ class Bones(View):
             joints = torch.cat([joints[..., :root, :], own, joints[..., root:, :]], -2)
         return joints.flatten(-2)
 
-    def _named(self, values: Batch, x: Tensor) -> dict[str, Any]:
+    def _named(self, values: Batch, x: Tensor) -> Batch:
         """The values, with this x wherever they hold x or a piece of it."""
         pieces = {name: x[..., list(places)] for name, places in self.pieces.items() if name in values}
-        return {**values, **pieces, **({WHOLE: x} if WHOLE in values else {})}
+        return values | pieces | ({WHOLE: x} if WHOLE in values else {})
 
     def _joined(self, data: Batch, held: Mapping[str, Sequence[int]]) -> Tensor:
         """The whole of pieces, 0 elsewhere; every bone of theirs begins at the root or in one of them."""
@@ -224,7 +224,7 @@ class Bones(View):
         return found
 
     def _check_complete(self, data: Batch) -> None:
-        for name, mask in data.get("mask", {}).items():
+        for name, mask in data.masks().items():
             if name in (WHOLE, *self.pieces) and not mask.all():
                 window, frame, *_ = (~mask).nonzero()[0].tolist()
                 raise ValueError(
@@ -282,8 +282,8 @@ class Rotations(View):
         return 3 * self.root + size(self.form) * len(self.turning)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> dict[str, Any]:
-        seen = dict(data)
+    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+        seen = Batch(data)
         if WHOLE not in data or LENGTHS in data:
             return seen
         x, skeleton = data[WHOLE], self.skeleton
@@ -292,13 +292,13 @@ class Rotations(View):
                 f"x has shape {tuple(x.shape)}; positions of the skeleton {skeleton.name!r} have "
                 f"{3 * (skeleton.joints - (not self.root))} numbers"
             )
-        if WHOLE in data.get("mask", {}):
+        if data.mask() is not None:
             raise ValueError(
                 "a joint that is missing leaves the turns of others open; fit under a protocol whose representation is "
                 "positions, which may be masked"
             )
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
-        turns = data.get(BESIDE, {}).get(TURNS)
+        turns = data.beside.get(TURNS)
         if turns is None:
             matrices = kinematics.inverse(skeleton, positions, constant(self._offsets, x))[..., self.turning, :, :]
             found = in_time(matrices, self.form)
@@ -307,12 +307,12 @@ class Rotations(View):
             found = in_time(turns.index_select(-2, indices(self.turning, turns)).to(x), self.form, "quaternion")
         place = [positions[..., skeleton.root, :]] if self.root else []
         seen[WHOLE] = torch.cat([*place, found.flatten(-2)], -1)
-        seen[LENGTHS] = (beside or {}).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
+        seen[LENGTHS] = (beside or Batch()).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
         return seen
 
     @override
-    def inverse(self, seen: Batch) -> dict[str, Any]:
-        data = dict(seen)
+    def inverse(self, seen: Batch) -> Batch:
+        data = Batch(seen)
         bones = data.pop(LENGTHS, None)
         if WHOLE not in seen:
             return data
@@ -328,4 +328,4 @@ class Rotations(View):
         told = to_matrix(x[..., 3 * self.root :].unflatten(-1, (len(self.turning), -1)), self.form)
         turns = turns.index_copy(-3, indices(self.turning, turns), told)
         positions, _ = kinematics.forward(skeleton.parents, turns, offsets, place)
-        return {**data, WHOLE: (positions if self.root else skeleton.without_root(positions)).flatten(-2)}
+        return data | {WHOLE: (positions if self.root else skeleton.without_root(positions)).flatten(-2)}

@@ -25,8 +25,8 @@ import torch
 from pyro import distributions
 from torch import Tensor, nn
 
+from ...data.batch import Batch
 from ...data.schema import SchemaError
-from ...data.sequences import Batch
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe, Trainable
 from ...networks.cells import GRU
@@ -126,7 +126,7 @@ class ActionClassifierModel(nn.Module):
             ValueError: no classes, frames of another size, or padded sequences or missing entries, of which there are
                 none in windows of motion.
         """
-        if extra := {"lengths", "mask"} & set(batch):
+        if extra := {"lengths", "mask"} & batch.keys():
             raise ValueError(f"a classifier reads whole windows; leave {' and '.join(sorted(extra))} out")
         if CLASS not in batch:
             raise ValueError(f"the batch lacks {CLASS!r}, the class of each window; Windows.classified gives it")

@@ -29,7 +29,8 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from ...data.sequences import Batch, bridged
+from ...data.batch import Batch
+from ...data.sequences import bridged
 from ...distributions import QRFlow, Shape
 from ...inference.training.checkpoints import Run, load_weights
 from ...inference.training.fit import fit
@@ -116,7 +117,7 @@ class VariedPoses:
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draws windows as `Windows.sample` does, turned and with noise: {"x": (B, T, D)}, gaps bridged."""
         drawn = self.windows.sample(batch_size, generator)
-        x = bridged(drawn["x"], drawn.get("mask"))
+        x = bridged(drawn["x"], drawn.mask())
         if self.turned:
             angle = 2 * pi * torch.rand(len(x), 1, 1, generator=generator)
             x = rotate_about_up(x.unflatten(-1, (-1, 3)), angle, self.windows.skeleton.up).flatten(-2)
@@ -150,7 +151,7 @@ class PosePriorModel(nn.Module):
         Raises:
             ValueError: padded sequences or missing entries, of which there are none in windows of motion.
         """
-        if extra := {"lengths", "mask"} & set(batch):
+        if extra := {"lengths", "mask"} & batch.keys():
             raise ValueError(f"a pose prior reads whole poses in every frame; leave {' and '.join(sorted(extra))} out")
         d = self.skeleton.directions(self.facing(batch["x"]))
         with pyro.plate("sequences", d.shape[0], dim=-2), pyro.plate("frames", d.shape[1], dim=-1):

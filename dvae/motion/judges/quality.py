@@ -42,8 +42,8 @@ from pyro import distributions
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ...data.batch import Batch
 from ...data.schema import Schema
-from ...data.sequences import Batch
 from ...data.units import Units
 from ...inference.evaluation.estimates import Crossed, Estimate
 from ...inference.evaluation.held import Held, clip_places, hold, on_device_of, refuse_non_finite, reproducibly
@@ -141,7 +141,7 @@ class RealOrMadeModel(nn.Module):
         Raises:
             ValueError: padded sequences or missing entries, of which there are none in windows of motion.
         """
-        if extra := {"lengths", "mask"} & set(batch):
+        if extra := {"lengths", "mask"} & batch.keys():
             raise ValueError(f"a judge of quality reads whole windows; leave {' and '.join(sorted(extra))} out")
         logits = self.logits(batch["x"])
         with pyro.plate("windows", len(logits)):

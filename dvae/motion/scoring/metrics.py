@@ -14,6 +14,7 @@ mean over joints. Where the last frame of a truth was not observed, the final er
 import torch
 from torch import Tensor
 
+from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, mean_of_known
 from ...inference.evaluation.metrics import (
     Array,
@@ -82,7 +83,7 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
     observed = windows.protocol.observed
     if not threshold > 0:
         raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
-    poses, seen = last_places(windows.all(), observed)
+    poses, seen = last_places(Batch(windows.all()), observed)
     poses = poses.double()
     found: list[Tensor] = []
     for rows in torch.arange(len(poses)).split(512):

@@ -49,7 +49,8 @@ import torch
 from torch import Tensor, nn
 
 from ...constants import indices
-from ...data.sequences import Batch, HeldOutWindows, bridged, gapped, mask_of, mean_of_known
+from ...data.batch import Batch
+from ...data.sequences import HeldOutWindows, bridged, mean_of_known
 from ...inference.evaluation import metrics
 from ...inference.evaluation.held import clip_places, on_device_of, reproducibly
 from ...inference.evaluation.scores import ENERGY, VARIOGRAM, Measure, means_of_those_that_count, paired
@@ -167,7 +168,7 @@ def _multimodal(
     """Errors averaged over the futures of all windows in almost the same pose, and the APDE."""
     threshold = getattr(windows.protocol, "multimodal_threshold", 0.5) if threshold is None else threshold
     truths = multimodal_truths(windows, threshold)
-    futures = body(gapped(windows.all())[:, windows.protocol.observed :])
+    futures = body(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :])
     lonely = sum(len(found) == 1 for found in truths)
     said: dict[str, Any] = {"threshold": threshold, "itself": True, "alone": lonely}
     shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
@@ -243,7 +244,7 @@ def _path_error(windows: Windows | Exchanged) -> Measure:
 
 def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
     """The bones that have a length in every window, as places among `Skeleton.edges`, and a note on the others."""
-    lengths = mean_of_known(windows.skeleton.bone_lengths(windows.positions(gapped(windows.all()))), 1)
+    lengths = mean_of_known(windows.skeleton.bone_lengths(windows.positions(Batch(windows.all()).mask_to_nan())), 1)
     short = (lengths < SHORTEST).any(0)
     note = f"limbs and bone lengths: {int(short.sum())} of {len(short)} bones are shorter than {SHORTEST:g} m; left out"
     return (~short).nonzero()[:, 0].tolist(), note if short.any() else ""
@@ -286,7 +287,7 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
         scores["limb jitter RMS"] = lambda errors: errors.diff(dim=-1).square().mean(-1).sqrt()
 
     def bone_length_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        reference = mean_of_known(lengths(gapped(past)), -1)
+        reference = mean_of_known(lengths(past.mask_to_nan()), -1)
         return mean_of_known((lengths(forecasts) / reference[..., None, None] - 1).abs(), (1, 2, 3))
 
     shared: Any = {"partial": windows.missing, "note": note}
@@ -345,7 +346,7 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return mean_of_known(moved(_where_true(forecasts, truth)), 1)
 
-    real = mean_of_known(moved(gapped(windows.all())[:, windows.protocol.observed :]), -1)
+    real = mean_of_known(moved(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :]), -1)
     what = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
     return Measure(
         "CMD",
@@ -369,10 +370,10 @@ def _jerk(windows: Windows | Exchanged) -> Measure:
         return torch.stack([mean_of_known(each, (0, -1)) for each in changes]) * windows.protocol.fps**3
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        seen = gapped(past)[:, None, start:].expand(-1, forecasts.shape[1], -1, -1)
+        seen = past.mask_to_nan()[:, None, start:].expand(-1, forecasts.shape[1], -1, -1)
         return mean_of_known(jerk(torch.cat([seen, _where_true(forecasts, truth)], 2)), 1)
 
-    real = mean_of_known(jerk(gapped(windows.all())[:, start:]), 0)
+    real = mean_of_known(jerk(Batch(windows.all()).mask_to_nan()[:, start:]), 0)
     note = f"jerk: {real:.1f} m/s³ of real motion"
     return Measure("jerk", function, "m/s³", "", partial=windows.missing, note=note)
 
@@ -392,7 +393,7 @@ def _pose_nll(prior: Any, observed: int) -> Measure:
 
     @torch.no_grad()
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        seen = bridged(past["x"], mask_of(past))[:, None].expand(-1, forecasts.shape[1], -1, -1)
+        seen = bridged(past["x"], past.mask())[:, None].expand(-1, forecasts.shape[1], -1, -1)
         motion = prior.facing(torch.cat([seen, forecasts], 2))[:, :, observed:]
         return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
 

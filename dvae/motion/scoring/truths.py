@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ...data.batch import Batch
 from ...data.sequences import bridged
 from ..data.protocols import Windows
 from ..geometry.views import Heading
@@ -77,7 +78,7 @@ class PseudoTruths:
         self._chains = torch.linalg.inv(self._limbs).round()
 
         listed = windows.all(stride)
-        x = bridged(listed["x"], listed.get("mask"))[:, self._observed - 1 :]
+        x = bridged(listed["x"], listed.mask())[:, self._observed - 1 :]
         self._average = self._lengths(x[:, 0].unflatten(-1, (-1, 3))).mean(0)
         self._last = torch.empty(len(x), len(nodes) * 3)
         self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # so that products and sums run over rows
@@ -188,7 +189,7 @@ class WithPseudoTruths:
         """That of the windows."""
         return self.windows.fingerprint
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Draw windows as `Windows.sample` does, turned to heading zero where `truths.heading` says so.
 
         Returns:
@@ -196,7 +197,7 @@ class WithPseudoTruths:
             missing, whose gaps are bridged before futures are exchanged.
         """
         batch = self.windows.sample(batch_size, generator)
-        x = bridged(batch["x"], batch.get("mask"))
+        x = bridged(batch["x"], batch.mask())
         x = self.truths.turn(x) if self.truths.heading else x
         pseudo, valid = self.truths.of(x, generator)
-        return {**batch, "x": x, "pseudo": pseudo, "valid": valid}
+        return batch | {"x": x, "pseudo": pseudo, "valid": valid}

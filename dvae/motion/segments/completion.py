@@ -37,7 +37,6 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from ...data.sequences import Batch
 from ...inference.bounds.elbo import ImportanceBound
 from ...inference.diagnostics.posteriors import Descent, Posterior, posterior
 from ...options import Positive, check
@@ -103,10 +102,10 @@ class SegmentCompletion:
     model: Any
     deviations: Deviations = Deviations()
     markers: Sequence[int] = tuple(MARKERS.values())
-    known: Batch | None = None
+    known: Mapping[str, Any] | None = None
     aggregate: bool = True
 
-    def __call__(self, seen: Batch) -> dict[str, Tensor]:
+    def __call__(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
         """z from `prior` and beta from N(0, I), and what was seen from what is made of them.
 
         Args:
@@ -138,7 +137,7 @@ class SegmentCompletion:
         return dist.MultivariateNormal(law.mean.mean(0), _shrunk(law.mean, law.variance.mean(0)))
 
     @torch.no_grad()
-    def away(self, seen: Batch, z: Tensor, shape: Tensor) -> dict[str, Tensor]:
+    def away(self, seen: Mapping[str, Any], z: Tensor, shape: Tensor) -> dict[str, Tensor]:
         """How far what was seen is from what is made of z (B, Z) and beta (B, S): mean distances (B,) in metres.
 
         Args:
@@ -150,13 +149,13 @@ class SegmentCompletion:
         made = self._made(z, shape, seen)[1]
         return {name: (each - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, each in made.items()}
 
-    def guide(self, seen: Batch) -> Any:
+    def guide(self, seen: Mapping[str, Any]) -> Any:
         """z of known segments, drawn at random."""
         assert self.known is not None
         chosen = torch.randint(len(self.known["x"]), (len(next(iter(seen.values()))),))
         return self.model.guide({name: value[chosen] for name, value in self.known.items()})
 
-    def renewed(self, seen: Batch, values: Batch) -> dict[str, Any]:
+    def renewed(self, seen: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
         """What was seen, with the vertices that are nearest to points where latents have these values."""
         if POINTS not in seen:
             return dict(seen)
@@ -165,7 +164,7 @@ class SegmentCompletion:
         rotations, places = self.model.timed.poses(met)
         return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
 
-    def _made(self, z: Tensor, shape: Tensor, seen: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    def _made(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """When moments (B, K) are, and where all that was seen at them is made, by name."""
         body = self.model.body
         met, times = self._met(z, shape, seen)
@@ -180,14 +179,14 @@ class SegmentCompletion:
             made[POINTS] = body.some(*pose, which)
         return times, made
 
-    def _met(self, z: Tensor, shape: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
+    def _met(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         """`_met` of what is decoded, of which no more is made than is met."""
         frames, made = seen.get(FRAMES), self.model.decoder(z, shape)
         if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
             return made(frames[0].long()), frames
         return _along(self.model.timed.times(made(None, TIME)), made, seen)
 
-    def read(self, seen: Batch) -> dict[str, Tensor]:
+    def read(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
         """What was seen, checked, in the model's precision and on its device; of surfaces one vertex in `THIN`.
 
         Raises:
@@ -242,7 +241,7 @@ class Completed:
     """
 
     program: SegmentCompletion
-    seen: Batch
+    seen: Mapping[str, Any]
     posterior: Posterior
 
     @property
@@ -278,11 +277,11 @@ class Completed:
 
 def complete(
     model: Any,
-    seen: Batch,
+    seen: Mapping[str, Any],
     *,
     deviations: Deviations | None = None,
     markers: Sequence[int] | None = None,
-    known: Batch | None = None,
+    known: Mapping[str, Any] | None = None,
     aggregate: bool = True,
     descent: Descent | None = None,
     seed: int = 0,
@@ -454,7 +453,7 @@ def _observe(name: str, made: Tensor, seen: Tensor, deviation: float) -> None:
     pyro.factor(name, -away / (2 * deviation**2) - known.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
 
 
-def _met(timed: TimedFrames, x: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
+def _met(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """Frames (B, K, D) at the moments that were seen, of frames (B, N, D), and when these are, (B, K) in seconds.
 
     Moments behind the end are at the end, whose time says by how much too early it comes.
@@ -462,7 +461,7 @@ def _met(timed: TimedFrames, x: Tensor, seen: Batch) -> tuple[Tensor, Tensor]:
     return _along(timed.times(x), lambda frames: x if frames is None else x[:, frames], seen)
 
 
-def _along(decoded: Tensor, made: Callable[[Tensor | None], Tensor], seen: Batch) -> tuple[Tensor, Tensor]:
+def _along(decoded: Tensor, made: Callable[[Tensor | None], Tensor], seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """`_met` of frames at these times (B, N), of which those that lie at moments are made, or all (None)."""
     many = decoded.shape[1]
     times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
-from ...data.sequences import Batch, each
-from ...data.views import WHOLE, Parts
+from ...data.views import Parts
 from ...options import tuples
 from ..bodies import Body, human, shapes_of
 from ..bodies.fitting import MOST, standing
@@ -109,7 +109,7 @@ class Segments:
         motion: MotionSet,
         timed: TimedFrames | None = None,
         body: Body | None = None,
-        seen: Batch | None = None,
+        seen: Mapping[str, Any] | None = None,
         bodies: float = 0.0,
     ):
         self.motion, self.body, self.bodies = motion, body or human(), bodies
@@ -122,20 +122,20 @@ class Segments:
     def __len__(self) -> int:
         return len(self.motion)
 
-    def all(self) -> Batch:
+    def all(self) -> Mapping[str, Any]:
         """All of them: x (B, N, D) and beta (B, S)."""
         return self._batch
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
+    def sample(self, batch_size: int, generator: torch.Generator) -> Mapping[str, Any]:
         """So many different ones in random order; all of them if there are no more."""
         chosen = torch.randperm(len(self), generator=generator)[:batch_size]
-        batch = each(self._batch, lambda value: value[chosen])
+        batch = Batch(self._batch).rows(chosen)
         if not self.bodies:
             return batch
         drawn = self.bodies * torch.randn(batch[SHAPE].shape, generator=generator)
         return self.on(batch, drawn.clamp(-MOST, MOST))
 
-    def on(self, batch: Batch, shape: Tensor) -> Batch:
+    def on(self, batch: Mapping[str, Any], shape: Tensor) -> Mapping[str, Any]:
         """The same turns and times on bodies (B, S), places in lengths of legs."""
         legs = [standing(self.body, shapes).to(shape) for shapes in (batch[SHAPE], shape)]
         x = batch[WHOLE].clone()

@@ -27,8 +27,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ...constants import constant, indices
-from ...data.sequences import Batch
-from ...data.views import WHOLE
+from ...data.batch import WHOLE
 from ...options import Positive, Size, check
 from ..data.clips import Clip, MotionSet
 from ..geometry import kinematics
@@ -179,7 +178,7 @@ class TimedFrames:
         """
         return self._scaled(self._found(motion))
 
-    def back(self, seen: Batch, fps: float | None = None) -> MotionSet:
+    def back(self, seen: Mapping[str, Any], fps: float | None = None) -> MotionSet:
         """Motion of time-stamped frames: what `to` made, or a decoder.
 
         Args:
@@ -305,7 +304,7 @@ class TimedFrames:
         increments = torch.from_numpy(np.diff(at, prepend=0.0) / fps).expand(len(turns), -1)
         return torch.cat([six, place, increments[..., None]], -1)
 
-    def _scaled(self, found: Batch) -> dict[str, Any]:
+    def _scaled(self, found: Mapping[str, Any]) -> dict[str, Any]:
         """What was found in these units, single precision."""
         mean, deviation = self._scaling(found[WHOLE])
         others = mean.new_tensor([self.metres] * 3 + [self.seconds / (self.frames - 1)])

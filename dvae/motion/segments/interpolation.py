@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...data.sequences import Batch
-from ...data.views import WHOLE
+from ...data.batch import WHOLE
 from ...inference.evaluation.held import on_device_of, reproducibly
 from ...inference.evaluation.result import Table, as_they_are, canvas
 from ..bodies import Body
@@ -120,7 +119,7 @@ class Interpolation:
 
 
 @torch.no_grad()
-def interpolate(model: Any, first: Batch, second: Batch, steps: int = 9) -> Interpolation:
+def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any], steps: int = 9) -> Interpolation:
     """Segments on the straight line in z and beta from some to others, all pairs and steps at once.
 
     Args:
@@ -148,7 +147,7 @@ def interpolate(model: Any, first: Batch, second: Batch, steps: int = 9) -> Inte
 
 
 @torch.no_grad()
-def transferred(model: Any, batch: Batch, shape: Tensor) -> Tensor:
+def transferred(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
     """The motion of segments on other bodies: their z, with another beta.
 
     Args:
@@ -171,7 +170,7 @@ def falls(values: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def latent_map(model: Any, batch: Batch, labels: Sequence[str]) -> Figure:
+def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> Figure:
     """A map of the latent space: means of the guide on their first two principal axes, coloured by a label.
 
     Args:

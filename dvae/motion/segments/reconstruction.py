@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from operator import itemgetter
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
@@ -20,8 +19,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.sequences import Batch, each
-from ...data.views import WHOLE
+from ...data.batch import WHOLE, Batch
 from ...inference.bounds.elbo import SequenceELBO, importance_bound
 from ...inference.evaluation.evaluation import ARROWS, Score
 from ...inference.evaluation.held import clip_places, on_device_of, reproducibly
@@ -150,14 +148,14 @@ class PrincipalComponents:
         directions, _ = torch.linalg.qr(away.T @ shares[:, -most:].flip(-1).to(away))
         return cls(mean, directions)
 
-    def __call__(self, batch: Batch) -> Tensor:
+    def __call__(self, batch: Mapping[str, Any]) -> Tensor:
         """x (B, N, D) as the components have it."""
         values = _joined(batch) - self.mean
         near = self.mean + values @ self.directions @ self.directions.T
         return near[:, : -batch[SHAPE].shape[-1]].view_as(batch[WHOLE])
 
 
-def _joined(batch: Batch) -> Tensor:
+def _joined(batch: Mapping[str, Any]) -> Tensor:
     """[chi, beta], (B, N D + S)."""
     return torch.cat([batch[WHOLE].flatten(1), batch[SHAPE]], -1)
 
@@ -202,10 +200,10 @@ def reconstruct_segments(
     linear: dict[tuple[str, int], str] = {}
     with progress_bar(progress) as bar:
 
-        def score(name: str, held: Segments, function: Callable[[Batch], Mapping[str, Tensor]]) -> None:
+        def score(name: str, held: Segments, function: Callable[[Mapping[str, Any]], Mapping[str, Tensor]]) -> None:
             found = []
             for part in bar.track(torch.arange(len(held)).split(batch_size), description=name):
-                found.append(function(each(held.all(), itemgetter(part))))
+                found.append(function(Batch(held.all()).rows(part)))
             rows[name] = {key: torch.cat([one[key].cpu() for one in found]).double().numpy() for key in found[0]}
             if wrong := np.flatnonzero(~np.isfinite(rows[name][ERROR])).tolist():
                 where = "/".join(held.motion.clips[wrong[0]].key)
@@ -245,7 +243,7 @@ def _key(timed: TimedFrames) -> str:
     return json.dumps(SegmentSchema({}, timed=timed).config())
 
 
-def _scores(model: Any, held: Segments, particles: int, batch: Batch) -> dict[str, Tensor]:
+def _scores(model: Any, held: Segments, particles: int, batch: Mapping[str, Any]) -> dict[str, Tensor]:
     """Of a batch, (B,) each."""
     seen = on_device_of(model, batch)
     found = _errors(held, model.decode(model.encode(seen), seen[SHAPE]).cpu(), batch)
@@ -257,12 +255,12 @@ def _scores(model: Any, held: Segments, particles: int, batch: Batch) -> dict[st
     return found
 
 
-def _linear(known: PrincipalComponents, held: Segments, batch: Batch) -> dict[str, Tensor]:
+def _linear(known: PrincipalComponents, held: Segments, batch: Mapping[str, Any]) -> dict[str, Tensor]:
     """Of components."""
     return _errors(held, known(batch), batch)
 
 
-def _errors(held: Segments, x: Tensor, batch: Batch) -> dict[str, Tensor]:
+def _errors(held: Segments, x: Tensor, batch: Mapping[str, Any]) -> dict[str, Tensor]:
     """Of frames (B, N, D): of the surface in millimetres, and of how long it lasts in milliseconds, (B,)."""
     made, theirs = (surfaces_of(held.timed, held.body, frames, batch[SHAPE]) for frames in (x, batch[WHOLE]))
     lasts = (held.timed.lasts(x) - held.timed.lasts(batch[WHOLE])).abs()

@@ -15,9 +15,8 @@ import torch
 from rich.console import Group
 from torch import Tensor
 
+from ...data.batch import WHOLE
 from ...data.npy import Refused
-from ...data.sequences import Batch
-from ...data.views import WHOLE
 from ...inference.diagnostics.posteriors import Descent
 from ...inference.evaluation.result import Table
 from ...options import nearest
@@ -76,7 +75,7 @@ class Recovered:
     drawn: tuple[Tensor, Tensor]
     khat: Tensor
     away: Mapping[str, Tensor]
-    truth: Batch | None = None
+    truth: Mapping[str, Any] | None = None
 
     @property
     def errors(self) -> dict[str, Tensor]:
@@ -148,12 +147,12 @@ class Recovered:
 
 def recover(
     model: Any,
-    seen: Batch,
+    seen: Mapping[str, Any],
     keys: Sequence[tuple[str, str]],
     *,
-    truth: Batch | None = None,
+    truth: Mapping[str, Any] | None = None,
     deviations: Deviations | None = None,
-    known: Batch | None = None,
+    known: Mapping[str, Any] | None = None,
     aggregate: bool = True,
     descent: Descent | None = None,
     seed: int = 0,
@@ -237,7 +236,7 @@ def _check_numbers(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} has {far:g}; expected parameters of shape, which are about as wide as N(0, 1)")
 
 
-def _check_something(seen: Batch) -> None:
+def _check_something(seen: Mapping[str, Any]) -> None:
     """Refuse segments of which nothing was seen."""
     kinds = [seen[name].isfinite().flatten(2).any(-1) for name in (SURFACES, POINTS, SPOTS) if name in seen]
     timed = [seen[name].isfinite() for name in (TIMES, FRAMES) if name in seen]

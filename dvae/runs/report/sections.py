@@ -11,7 +11,6 @@ import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from operator import itemgetter
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -21,7 +20,8 @@ from markupsafe import Markup
 from torch import Tensor
 
 from ... import files
-from ...data.sequences import Batch, HeldOutWindows, each
+from ...data.batch import Batch
+from ...data.sequences import HeldOutWindows
 from ...factorization.graph import audit
 from ...inference.diagnostics.bracket import Bracket
 from ...inference.diagnostics.calibration import Calibration
@@ -110,7 +110,7 @@ class Few:
 
     def all(self) -> Batch:
         """They, one in each row."""
-        return each(self.windows.all(), itemgetter(self.chosen))
+        return Batch(self.windows.all()).rows(self.chosen)
 
 
 # ------------------------------------------------------------------------------------------ what a run directory says

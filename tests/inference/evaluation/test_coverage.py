@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import dvae
+from dvae.data.batch import Batch
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.diagnostics.calibration import envelope
 from dvae.inference.evaluation import metrics
@@ -193,7 +194,7 @@ def test_a_score_by_column_is_that_of_windows_of_the_column_alone(truth, measure
         assert score.mean == pytest.approx(expected.mean, rel=1e-9)
         assert score.standard_error == pytest.approx(expected.standard_error, rel=1e-9)
     (one,) = by_column(measure, {"a": "m"})
-    given = draw(6, 4, 5, 1), draw(6, 5, 1), {"x": draw(6, 2, 1)}, torch.arange(6)
+    given = draw(6, 4, 5, 1), draw(6, 5, 1), Batch(x=draw(6, 2, 1)), torch.arange(6)
     assert torch.equal(one.function(*given), measure.function(*given))
 
 

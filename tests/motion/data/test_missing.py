@@ -16,7 +16,7 @@ from dvae.cli import main
 from dvae.cli.app import COMMANDS, command
 from dvae.cli.console import Missing
 from dvae.cli.help import Expert
-from dvae.data.sequences import bridged, gapped, past_of
+from dvae.data.sequences import bridged
 from dvae.inference.diagnostics.checks import STATISTICS, Statistic
 from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.held import clip_places
@@ -346,8 +346,8 @@ def test_scores_of_bodies_are_of_what_was_observed():
     assert whole.keys == gaps.keys
     past = gaps.protocol.observed
     listed = gaps.all()
-    observed = {name: value[:, :past] for name, value in listed.items()}
-    args = whole.all()["x"][:, None, past:], gapped(listed)[:, past:], observed, torch.arange(len(gaps))
+    observed = listed.past(past)
+    args = whole.all()["x"][:, None, past:], listed.mask_to_nan()[:, past:], observed, torch.arange(len(gaps))
     measures = {measure.name: measure for measure in motion.scores(gaps)}
     assert measures.keys() == {measure.name for measure in motion.scores(whole)}
     errors = [name for name in measures if name.startswith("limb") or name in ("ADE", "FDE", "bone-length error")]
@@ -359,9 +359,9 @@ def test_scores_of_bodies_are_of_what_was_observed():
 
 def test_jerk_is_of_what_was_observed():
     windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
-    observed, x = windows.protocol.observed, gapped(windows.all())
+    observed, x = windows.protocol.observed, windows.all().mask_to_nan()
     (measure,) = (each for each in motion.scores(windows) if each.name == "jerk")
-    past, truth = past_of(windows.all(), observed), x[:, observed:]
+    past, truth = windows.all().past(observed), x[:, observed:]
     forecasts = torch.randn(len(x), 3, *truth.shape[1:])
     found = measure.function(forecasts, truth, past, torch.arange(len(x)))
     anywhere = torch.where(truth[:, None].isnan(), 9.0, forecasts)
@@ -374,7 +374,7 @@ def test_cumulative_motion_is_of_joints_that_were_observed():
     elbow = WALKER.names.index("LElbow") - 1
     some = motion.windows(without(PEOPLE, LElbow=slice(None)), motion.PROTOCOLS["simulated"], "test")
     for windows in (some, motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")):
-        truth = gapped(windows.all())[:, windows.protocol.observed :]
+        truth = windows.all().mask_to_nan()[:, windows.protocol.observed :]
         (measure,) = (each for each in motion.scores(windows) if each.name == "CMD")
         clips, index = clip_places(windows.keys), torch.arange(len(truth))
 
@@ -436,7 +436,10 @@ def test_replicates_have_the_gaps_of_their_windows():
         assert torch.equal(given[real], ~mask[:, first:])
         assert torch.equal(given[made], ~mask[:, first:].expand(19, -1, -1, -1))
     some = {"sum": Statistic(lambda x: torch.where(x.isnan().sum((-2, -1)) > 150, torch.nan, x.nansum((-2, -1))))}
-    told = [int((x.isnan().sum((1, 2)) <= 150).sum()) for x in (gapped(test.all())[:, seam:], gapped(test.all()))]
+    told = [
+        int((x.isnan().sum((1, 2)) <= 150).sum())
+        for x in (test.all().mask_to_nan()[:, seam:], test.all().mask_to_nan())
+    ]
     few = dvae.predictive_checks(model, test, some, samples=19, progress=False)
     assert [check.replicated.shape for check in few.checks.values()] == [(19, count) for count in told]
     whole = dvae.predictive_checks(model, test, motion.statistics(test), samples=19, progress=False)
@@ -725,7 +728,7 @@ def test_a_run_on_whole_motion_forecasts_other_motion_with_gaps(tmp_path, capsys
 
 def test_past_that_is_shown_has_its_gaps():
     batch = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test").all()
-    assert torch.equal(gapped(batch).isnan(), ~batch["mask"])
+    assert torch.equal(batch.mask_to_nan().isnan(), ~batch["mask"])
 
 
 def test_every_command_that_reads_motion_takes_gaps_the_same_way():

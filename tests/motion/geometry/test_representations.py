@@ -11,7 +11,6 @@ from dvae import motion
 from dvae.cli import main
 from dvae.cli.futures import draw_futures
 from dvae.data.schema import SchemaError
-from dvae.data.sequences import leaves, past_of
 from dvae.inference.diagnostics.checks import decode
 from dvae.inference.evaluation.held import clip_places
 from dvae.motion.geometry import kinematics, rotations
@@ -84,7 +83,7 @@ def test_turns_of_windows_are_those_of_their_positions(people_of_two_sizes, opti
         offsets[:, 0, children] = body.bone_lengths(positions).mean(1)[..., None] * directions
         again, _ = kinematics.forward(body.parents, turns, offsets, positions[:, :, body.root])
         torch.testing.assert_close(again, positions, atol=1e-5, rtol=0)
-        assert (leaves(batch)[f"beside/{TURNS}"][:, 1:] * batch["beside"][TURNS][:, :-1]).unflatten(-1, (-1, 4)).sum(
+        assert (batch.leaves()[f"beside/{TURNS}"][:, 1:] * batch["beside"][TURNS][:, :-1]).unflatten(-1, (-1, 4)).sum(
             -1
         ).min() > 0.5
 
@@ -117,7 +116,7 @@ def test_what_is_seen_has_no_jumps(people_of_two_sizes, form, told):
         half = seen[..., 0].clamp(-1, 1).arccos() if form == "quaternion" else seen.norm(dim=-1) / 2
         assert half[:, 0].max() <= torch.pi / 2 + 1e-3
         assert half.max() > torch.pi / 2 + 0.1 or not told  # later ones of twisted joints go beyond
-    past = model.read(past_of(batch, 5))["x"]
+    past = model.read(batch.past(5))["x"]
     torch.testing.assert_close(past, seen[:, :5].flatten(2))
 
 

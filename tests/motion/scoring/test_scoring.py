@@ -9,6 +9,7 @@ import torch
 
 import dvae
 from dvae import motion
+from dvae.data.batch import Batch
 from dvae.inference.evaluation.evaluate import _measures
 from dvae.motion import PROTOCOLS, rotate_about_up
 
@@ -179,7 +180,7 @@ def test_jerk_is_the_third_derivative_and_counts_the_seam(windows):
         """Of a pose of which all joints go along a path (10, 3), m."""
         whole = x[:, :1] + path.repeat(1, x.shape[-1] // 3)
         past, future = whole[:, :4], whole[:, None, 4:].repeat(1, 3, 1, 1)
-        found = measure.function(future, future[:, 0], {"x": past}, index)
+        found = measure.function(future, future[:, 0], Batch(x=past), index)
         torch.testing.assert_close(found, found[:1].expand(len(x)))
         return found[0].item()
 

@@ -1,0 +1,109 @@
+"""A batch: values of variables by name, and what is known of the sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+WHOLE = "x"
+"""Name of the data where a view makes several variables of them."""
+
+
+class Batch(dict[str, Any]):
+    """Sequences, one in each row of every tensor: values (B, T, D) of local variables, (B, D) of static ones, by name.
+
+    A batch is a dictionary, so that users and data loaders can write one. Five names are no variables; read them by
+    the attributes below. Changes keep the type: `batch | {...}`, `rows`, `map`.
+
+    >>> batch = Batch(x=torch.zeros(2, 3, 1), lengths=torch.tensor([3, 2]))
+    >>> batch.lengths.tolist(), batch.mask(), batch.rows(slice(1))["x"].shape
+    ([3, 2], None, torch.Size([1, 3, 1]))
+    """
+
+    reserved: ClassVar[tuple[str, ...]] = ("lengths", "mask", "group", "log_det", "beside")
+    reader: Any = None
+    """What has read the batch (`DynamicalVAE.read`), which takes it as it is; None after a change."""
+
+    @property
+    def lengths(self) -> Any:
+        """Number of valid steps (B,) of right-padded sequences; None where all steps are valid."""
+        return self.get("lengths")
+
+    @property
+    def group(self) -> Any:
+        """Index (B,) of the group of each sequence; None without groups."""
+        return self.get("group")
+
+    @property
+    def log_det(self) -> Any:
+        """Log-determinant of a view that changes volume, (B,) or by step (B, T); None where it is 0."""
+        return self.get("log_det")
+
+    @property
+    def volume(self) -> Any:
+        """`log_det` summed over steps, (B,); None where it is 0."""
+        return self.log_det.sum(-1) if self.log_det is not None and self.log_det.dim() == 2 else self.log_det
+
+    @property
+    def beside(self) -> Mapping[str, Any]:
+        """What some views read beside the data, by name, and no other model."""
+        found: Mapping[str, Any] = self.get("beside", {})
+        return found
+
+    @property
+    def partial(self) -> bool:
+        """Whether some entries may be missing or padding."""
+        return "lengths" in self or "mask" in self
+
+    def masks(self, whole: str = WHOLE) -> dict[str, Any]:
+        """Return the masks by variable.
+
+        Args:
+            whole: name of the variable to which a mask without a name belongs.
+        """
+        mask = self.get("mask", {})
+        return dict(mask) if isinstance(mask, Mapping) else {whole: mask}
+
+    def mask(self, name: str = WHOLE) -> Any:
+        """Return True where a variable was observed, as its values; None where all of it was."""
+        mask = self.get("mask")
+        return mask.get(name) if isinstance(mask, Mapping) else mask
+
+    def mask_to_nan(self) -> Tensor:
+        """Return x (B, T, D), NaN where it was not observed."""
+        x: Tensor = self[WHOLE]
+        mask = self.mask()
+        return x if mask is None else torch.where(mask, x, torch.nan)
+
+    def map(self, change: Callable[[Any], Any]) -> Batch:
+        """Return the batch with every tensor changed."""
+        return Batch({n: Batch(v).map(change) if isinstance(v, Mapping) else change(v) for n, v in self.items()})
+
+    def rows(self, which: Any) -> Batch:
+        """Return some of the sequences, by a slice or an index."""
+        found = self.map(lambda value: value[which])
+        found.reader = self.reader
+        return found
+
+    def past(self, observed: int) -> Batch:
+        """Return the batch as forecasts see it: all context, and the first frames of x, its mask and `beside`."""
+        known = Batch({name: self[name] for name in (WHOLE, "mask", "beside") if name in self})
+        return self | known.map(lambda value: value[:, :observed])
+
+    def leaves(self) -> dict[str, Any]:
+        """Return all tensors by path, such as "mask/x"."""
+        found: dict[str, Any] = {}
+        for name, value in self.items():
+            inner = Batch(value).leaves() if isinstance(value, Mapping) else None
+            found |= {name: value} if inner is None else {f"{name}/{key}": each for key, each in inner.items()}
+        return found
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.reader = None
+        super().__setitem__(name, value)
+
+    def __or__(self, other: Any) -> Batch:  # type: ignore[override]
+        return Batch({**self, **other})
