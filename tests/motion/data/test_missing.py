@@ -130,7 +130,7 @@ def test_turns_are_refused_where_joints_lack():
     found = replace(PEOPLE.with_rotations(), missing=True)
     batch = motion.windows(found, turned, "test").all()
     with pytest.raises(ValueError, match="leaves the turns of others open"):
-        motion.windows(found, turned, "test").schema.view({**batch, "mask": {"x": batch["mask"]}})
+        motion.windows(found, turned, "test").schema.view(batch | {"mask": {"x": batch["mask"]}})
     futures = motion.Forecasts(WALKER, [("a", "b", 0)], *_future_with_gaps())
     assert futures.motion().missing
     with pytest.raises(ValueError, match=r"lacks joints, and bvh has no gaps; fill them first"):

@@ -10,6 +10,7 @@ import dvae
 from dvae import motion
 from dvae.cli import main
 from dvae.cli.futures import draw_futures
+from dvae.data.batch import Batch
 from dvae.data.schema import SchemaError
 from dvae.inference.diagnostics.checks import decode
 from dvae.inference.evaluation.held import clip_places
@@ -109,7 +110,7 @@ def test_forecasts_keep_the_bones_of_the_past(people_of_two_sizes, method, form)
 def test_what_is_seen_has_no_jumps(people_of_two_sizes, form, told):
     data = windows(twisted(people_of_two_sizes), representation=form)
     model, batch = small(data), data.all()
-    batch = batch if told else {"x": batch["x"]}
+    batch = batch if told else Batch(x=batch["x"])
     seen = model.read(batch)["x"].unflatten(-1, (-1, rotations.size(form)))
     assert seen.diff(dim=1).norm(dim=-1).max() < 1  # opposite quaternions are 2 apart, vectors a turn
     if form != "6d":  # half of the angle, of which the first frame's is no more than a quarter turn
