@@ -55,16 +55,6 @@ def test_draws_have_the_mean_and_the_variance_of_the_distribution(name):
     assert z_variance.abs().max() < 5
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_parameters_of_one_step_are_those_of_all_steps(name):
-    law = build(name)
-    features, before = torch.randn(B, T, D, dtype=torch.float64), previous(law, B, T)
-    together = law(features, before)
-    for t in range(T):
-        alone = law(features[:, t], None if before is None else before[:, t], t)
-        torch.testing.assert_close(alone, tuple(p[:, t] for p in together))
-
-
 @pytest.mark.parametrize("name", [name for name in LAWS if "residual" in name or name == "fixed, learned"])
 @pytest.mark.parametrize("share", [1.0, 0.3])
 def test_a_residual_location_keeps_its_share_of_the_previous_value(name, share):

@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 from dvae.factorization.relations import Relation
 from dvae.networks import CosineDecoder, CosineEncoder
 from dvae.networks.base import Input
-from dvae.networks.cosine import Dropout, positions
+from dvae.networks.cosine import Dropout
 
 ALL, LENGTH = Relation.parse("1:T"), 7
 SMALL = {"width": 6, "feedforward": 10, "heads": 2, "layers": 2}
@@ -40,10 +40,6 @@ def encoded(size):
             found[t, i] = math.sin(t / 10000 ** (i / size))
             found[t, i + 1] = math.cos(t / 10000 ** (i / size))
     return torch.from_numpy(found)
-
-
-def test_positions_are_the_published_waves():
-    assert torch.allclose(positions(LENGTH, 6, torch.float64), encoded(6), atol=1e-12)
 
 
 @pytest.mark.parametrize("cosine", [True, False])
