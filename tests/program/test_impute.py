@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import dvae
-from dvae.distributions import FixedNormal
-from dvae.networks import Linear
+from dvae.distributions import Family, FixedNormal
+from dvae.networks import Linear, Recurrent
 
 T = 5
 SEEN = torch.tensor([[1, 1], [0, 0], [1, 0], [0, 0], [0, 1]]).bool()
@@ -98,7 +98,7 @@ def judged(model, sizes, samples, particles):
 def test_draws_given_the_exact_guide_are_of_the_conditional(particles):
     """Of a state-space model whole steps are missing, and single entries. The weights of an exact guide are all one."""
     sizes = {"z": 1, "x": 2}
-    for _ in range(5):
+    for _ in range(3):
         model = built("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})", **sizes)
         exact(model, SEEN, sizes)
         assert judged(model, sizes, 4000, particles).abs().max() < MOST
@@ -118,3 +118,15 @@ def test_particles_make_up_for_what_a_guide_gets_wrong(generative, sizes):
     alone, chosen = ([judged(model, sizes, 200, count).abs().max() for model in models] for count in (1, 500))
     assert max(alone) > MOST
     assert max(chosen) < MOST
+
+
+def test_missing_counts_are_filled_with_counts():
+    pair = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+    model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, Recurrent(4), {"p(x)": Family("Poisson")})
+    x = model.sample(3, 5)["x"]
+    mask = torch.rand_like(x) < 0.5
+    filled = model.impute({"x": x, "mask": mask}, samples=7)["x"]
+    assert not filled.frac().any()
+    assert torch.equal(filled[:, mask], x[mask].expand(7, -1))
+    assert filled[:, ~mask].std(0).max() > 0
+    assert model.impute({"x": x, "mask": mask}, draw=False)["x"].frac().any()

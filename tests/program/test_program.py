@@ -17,7 +17,6 @@ import dvae
 from dvae import DynamicalVAE, SequenceELBO
 from dvae.inference.bounds.particles import Filter
 from dvae.inference.training.fit import Callback
-from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Recurrent
 from dvae.testing import FactorizationContract
 from dvae.turns import alone
@@ -78,15 +77,12 @@ def first(length: int) -> np.ndarray:
     return np.arange(length)[None] < 1
 
 
-class RowMask(FactorizationContract):
+class TestRowMaskOfAttention(FactorizationContract):
     """x_t reads z_1 from everywhere, and z_t the x before it: a loop over a mask of one row."""
-
-    network: Any = None
 
     def build(self, size: int) -> DynamicalVAE:
         equations = "p(z_t | x_{t-1}) p(x_t | x_{t-1}, z_{first})", "q(z_t | z_{<t}, x_{1:T})"
-        sizes = {"z": size, "x": size}
-        return DynamicalVAE(*equations, sizes, {"default": self.network, "q": Attention(8, 2)}, masks={"first": first})
+        return DynamicalVAE(*equations, {"z": size, "x": size}, Attention(8, 2), masks={"first": first})
 
     def test_particles_move_through_the_loop(self) -> None:
         """Each of them is weighed as the programs score it."""
@@ -100,10 +96,6 @@ class RowMask(FactorizationContract):
         guide.compute_log_prob()
         expected = sum(model.log_joint(data, latents).values()) - guide.nodes["z"]["log_prob"]
         torch.testing.assert_close(bound, expected, rtol=0, atol=1e-8)
-
-
-class TestRowMaskOfAttention(RowMask):
-    network = Attention(8, 2)
 
 
 # ------------------------------------------------------------------------------------------------------------ threads
@@ -200,18 +192,6 @@ def test_pyros_svi_trains_every_parameter_and_keeps_models_apart():
     for model, old in zip(models, before, strict=True):
         assert all((a != b).any() for a, b in zip(old, model.parameters(), strict=True))
     assert not torch.equal(next(models[0].parameters()), next(models[1].parameters()))
-
-
-@pytest.mark.parametrize(
-    "name", [n for n, m in dvae.methods().items() if issubclass(m, LatentMethod) and n != "equations"]
-)
-def test_mixed_precision_trains(name):
-    model = dvae.method(name).build({"x": 3})
-    with torch.autocast("cpu", torch.bfloat16):
-        bound = SequenceELBO().terms(model, torch.randn(4, 6, 3), self_feeding=0.5).bound.mean()
-    bound.backward()
-    assert torch.isfinite(bound)
-    assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
 
 
 # ------------------------------------------------------------------------------------------------------------ inputs
