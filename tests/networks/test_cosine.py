@@ -68,16 +68,6 @@ def test_the_decoder_adds_offsets_to_the_first_pose(components):
     assert torch.allclose(net(given, LENGTH), torch.stack(expected, 1), atol=1e-10, rtol=0)
 
 
-@pytest.mark.parametrize("made", [encoder, decoder])
-def test_the_two_forms_are_one_function(made):
-    net, given = made(), values()
-    state, steps = net.start(given, 3, LENGTH), []
-    for t in range(LENGTH):
-        features, state = net.step(state, t, {})
-        steps.append(features)
-    assert torch.allclose(torch.stack(steps, 1), net(given, LENGTH), atol=1e-10, rtol=0)
-
-
 def test_dropout_leaves_out_the_share_that_it_says():
     """Each unit apart, whatever their number, scaled to keep the mean; the same ones in the gradient."""
     torch.manual_seed(0)

@@ -103,15 +103,11 @@ def test_single_precision_holds_from_the_shortest_gaps_to_the_longest(size):
 # ---------------------------------------------------------------------------------------------------- as a network
 
 
-def test_padding_has_no_gap():
-    sde, lengths = network(), torch.tensor([5, 2])
-    d, z = torch.rand(2, 5, 1, dtype=torch.float64) + 0.1, double(2, 5, 3)
-    d[1, 2:], z[1, 2:] = 0, 0
-    features = sde({"z": z, "d": d}, 5, lengths)
-    torch.testing.assert_close(features[1, :2], sde({"z": z[1:, :2], "d": d[1:, :2]}, 2)[0])
-    assert features.isfinite().all()
+def test_steps_without_a_gap_are_refused():
+    d = torch.rand(2, 5, 1, dtype=torch.float64) + 0.1
+    d[1, 2:] = 0
     with pytest.raises(ValueError, match="sequence"):
-        sde({"z": z, "d": d}, 5)
+        network()({"z": double(2, 5, 3), "d": d}, 5)
 
 
 # --------------------------------------------------------------------------------------------------- in the engine
@@ -188,35 +184,3 @@ def test_a_forecast_goes_over_the_gaps_that_it_is_given():
     assert (z[:, :, 6].var(0) - 1).abs().max() < 5 * (2 / 2000) ** 0.5
     with pytest.raises(ValueError, match="expected 7 steps"):
         built.forecast({"x": x, "d": d[:, :5]}, horizon=2)
-
-
-# ----------------------------------------------------------------------------------------------------- of the guide
-
-
-def guide(**options):
-    inputs = [
-        Input("z", 3, Relation.parse("t-1")),
-        Input("x", 2, Relation.parse("1:T")),
-        Input("y", 2, Relation.parse("<=t")),
-        Input("d", 1, Relation.parse("<=t")),
-    ]
-    built = LinearSDEGuide(Recurrent(4, hidden=(5,)), (0.5, 8.0), **options).build(inputs, True, 3).double()
-    with torch.no_grad():
-        built.out.weight.add_(0.2 * torch.randn_like(built.out.weight))
-    return built
-
-
-@pytest.mark.parametrize("given", ["xyd", "x"])
-def test_one_step_at_a_time_is_all_steps_at_once_in_the_guide(given):
-    sde = guide()
-    values = {name: double(4, 6, parent.size) for name, parent in zip("zxyd", sde.inputs, strict=True)}
-    values["d"] = values["d"].exp()
-    expected, rows = sde(values, 6), torch.tensor([2, 2, 0])
-    known = {name: values[name] for name in given}
-    state, moved = sde.start(known, 4, 6), sde.select(sde.start(known, 4, 6), rows)
-    drawn = {name: values[name].unbind(1) for name in values if name not in given}
-    for t in range(6):
-        features, state = sde.step(state, t, drawn)
-        torch.testing.assert_close(features, expected[:, t], rtol=1e-10, atol=1e-10)
-        chosen, moved = sde.step(moved, t, {name: [v[rows] for v in value] for name, value in drawn.items()})
-        torch.testing.assert_close(chosen, features[rows])
