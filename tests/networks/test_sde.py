@@ -184,3 +184,35 @@ def test_a_forecast_goes_over_the_gaps_that_it_is_given():
     assert (z[:, :, 6].var(0) - 1).abs().max() < 5 * (2 / 2000) ** 0.5
     with pytest.raises(ValueError, match="expected 7 steps"):
         built.forecast({"x": x, "d": d[:, :5]}, horizon=2)
+
+
+# ----------------------------------------------------------------------------------------------------- of the guide
+
+
+def guide(**options):
+    inputs = [
+        Input("z", 3, Relation.parse("t-1")),
+        Input("x", 2, Relation.parse("1:T")),
+        Input("y", 2, Relation.parse("<=t")),
+        Input("d", 1, Relation.parse("<=t")),
+    ]
+    built = LinearSDEGuide(Recurrent(4, hidden=(5,)), (0.5, 8.0), **options).build(inputs, True, 3).double()
+    with torch.no_grad():
+        built.out.weight.add_(0.2 * torch.randn_like(built.out.weight))
+    return built
+
+
+@pytest.mark.parametrize("given", ["xyd", "x"])
+def test_one_step_at_a_time_is_all_steps_at_once_in_the_guide(given):
+    sde = guide()
+    values = {name: double(4, 6, parent.size) for name, parent in zip("zxyd", sde.inputs, strict=True)}
+    values["d"] = values["d"].exp()
+    expected, rows = sde(values, 6), torch.tensor([2, 2, 0])
+    known = {name: values[name] for name in given}
+    state, moved = sde.start(known, 4, 6), sde.select(sde.start(known, 4, 6), rows)
+    drawn = {name: values[name].unbind(1) for name in values if name not in given}
+    for t in range(6):
+        features, state = sde.step(state, t, drawn)
+        torch.testing.assert_close(features, expected[:, t], rtol=1e-10, atol=1e-10)
+        chosen, moved = sde.step(moved, t, {name: [v[rows] for v in value] for name, value in drawn.items()})
+        torch.testing.assert_close(chosen, features[rows])

@@ -17,6 +17,7 @@ import dvae
 from dvae import DynamicalVAE, SequenceELBO
 from dvae.inference.bounds.particles import Filter
 from dvae.inference.training.fit import Callback
+from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Recurrent
 from dvae.testing import FactorizationContract
 from dvae.turns import alone
@@ -192,6 +193,18 @@ def test_pyros_svi_trains_every_parameter_and_keeps_models_apart():
     for model, old in zip(models, before, strict=True):
         assert all((a != b).any() for a, b in zip(old, model.parameters(), strict=True))
     assert not torch.equal(next(models[0].parameters()), next(models[1].parameters()))
+
+
+@pytest.mark.parametrize(
+    "name", [n for n, m in dvae.methods().items() if issubclass(m, LatentMethod) and n != "equations"]
+)
+def test_mixed_precision_trains(name):
+    model = dvae.method(name).build({"x": 3})
+    with torch.autocast("cpu", torch.bfloat16):
+        bound = SequenceELBO().terms(model, torch.randn(4, 6, 3), self_feeding=0.5).bound.mean()
+    bound.backward()
+    assert torch.isfinite(bound)
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
 
 
 # ------------------------------------------------------------------------------------------------------------ inputs
