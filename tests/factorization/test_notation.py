@@ -249,6 +249,8 @@ def test_what_cannot_be_drawn_is_refused_with_the_cycle(text, says):
             "the latent z has no factor in the guide; add q(z_t | ...), or name z as observed; a discrete one is "
             "summed out and needs none: sizes={'z': dvae.Discrete(states)}",
         ),
+        ("p(w) p(z_t)", ["x"], None, "expected p(...) for the generative model"),
+        ("q(w) q(z)", ["x"], None, "z has one value per step in the generative model"),
         ("q(w) q(z_t) q(u_t)", ["x"], None, "q(u_t): no latent u in"),
         ("q(w) q(z_t) q(x_t | z_t)", ["x"], None, "q(x_t | z_t): x is observed"),
         ("q(w) q(z_t)", ["y"], None, "observed"),

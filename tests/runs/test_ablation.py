@@ -185,6 +185,7 @@ def test_a_comparison_of_other_models_is_refused(fitted):
         (["srnm"], "did you mean 'srnn'?"),
         (["srnn", "--steps", "3"], "give --out DIR"),
         (["srnn", "--twins", "0"], "--twins is 0"),
+        (["srnn", "--network", "recurent"], "did you mean 'recurrent'?"),
         (["--generative", "p(z_t"], "expected"),
     ],
 )

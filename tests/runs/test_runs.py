@@ -135,6 +135,8 @@ def test_what_is_no_plain_file_is_refused_at_once(run, canary, name, kind):
 
 
 def test_the_directory_that_the_user_names_may_be_a_link(run, tmp_path):
+    with pytest.raises(TypeError, match="a run is a folder that fit wrote; expected its path, got 3"):
+        dvae.load(3)
     (tmp_path / "latest").symlink_to(run)
     assert runs.resume(tmp_path / "latest", steps=5, progress=False).step == 5
 
@@ -181,11 +183,13 @@ def test_a_state_names_no_file_but_those_of_a_checkpoint(run, canary):
     ("keys", "value", "message"),
     [
         (("method", "width"), 20_000, "width is 20000; it must be at least 1 and at most 16384"),
+        (("method", "hidden"), [8] * 100_000, "hidden has 100000 entries; it must have 64 at most"),
         (("method", "hidden"), [8, "8"], r"hidden\[1\] is .*; it must be a whole number"),
         (("method", "residual"), float("nan"), "residual is nan; it must be"),
         (("method", "emission"), "fixd", r"unknown emission .*did you mean .*fixed"),
         (("method", "latent"), 4096, "asks for a model that is larger than its weights|weights of another model"),
         (("training", "devices"), 40, "devices is 40; it must be at least 1 and at most 32"),
+        (("training", "learning_rate"), {"schedule": "Constant", "value": -1}, "learning_rate is -1"),
         (("training", "precision"), "8", "unknown precision '8'"),
         (
             ("training", "learning_rate"),
@@ -302,6 +306,7 @@ MEAN, SQUARE, STEP = (f"optimizer/0/{key}" for key in ("exp_avg", "exp_avg_sq", 
         (damage(MEAN, lambda value: value[:1]), f"'{MEAN}' is not as the optimiser writes it"),
         (damage(MEAN, lambda value: value / 0), f"'{MEAN}' is not"),
         (damage(SQUARE, lambda value: value - 1), f"'{SQUARE}' is not"),
+        (damage(MEAN, lambda value: value.long()), f"'{MEAN}' is not"),
         (damage(STEP, lambda value: -value), f"'{STEP}' is not"),
         (lambda content: content.pop("random/torch"), "random has no torch"),
         (damage("random/torch", lambda value: value[:, :8].clone()), "'random/torch' is no"),

@@ -221,13 +221,13 @@ def test_a_comparison_comes_back_from_json_with_all_that_it_says(fitted, tmp_pat
     assert summary["models"]["dkf"]["khat_above_0.7"] is None  # four particles have no tail
     for damage in (
         lambda own: own["keys"].pop(),
-        lambda own: own["rows"]["dkf"]["bounds"]["ELBO"].insert(0, 1),
+        lambda own: own["rows"]["dkf"]["bounds"]["ELBO"].__setitem__(0, 1),
         lambda own: own["rows"]["dkf"]["bounds"].pop("k-hat"),
     ):
         document = json.loads(result.to_json())
         damage(document["attributes"])
         with pytest.raises(ValueError, match="not written by Comparison"):
-            Comparison.of(document)
+            Comparison.from_json(json.dumps(document))
 
 
 def test_joined_rows_are_those_of_one_comparison(fitted):

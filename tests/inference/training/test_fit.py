@@ -215,6 +215,15 @@ def test_the_gradient_is_clipped_in_norm():
     assert moved.norm().item() == pytest.approx(0.01)
 
 
+def test_ragged_and_masked_data_train():
+    x = TRAIN.clone()
+    x[0, 1, 2], x[1, 3] = math.nan, math.nan
+    mask, lengths = torch.ones_like(x, dtype=torch.bool), torch.full((24,), 4)
+    mask[0, 1, 2], lengths[1] = False, 3
+    result = run(train={"x": x, "mask": mask, "lengths": lengths}, steps=20)
+    assert math.isfinite(result.history[-1]["bound"])
+
+
 def test_a_batch_holds_different_sequences_and_all_of_them_if_there_are_few():
     data = Sequences({"x": torch.arange(6.0)[:, None, None], "lengths": torch.arange(6)})
     for size in (1, 4, 6, 9):
@@ -394,6 +403,8 @@ def test_the_weights_of_another_model_are_refused(finished, tmp_path):
         load_weights(torch.nn.Linear(2, 2), finished)
     with pytest.raises(CheckpointError, match="directory"):
         load_weights(build(), tmp_path / "..")
+    with pytest.raises(CheckpointError, match="safetensors file"):
+        load_weights(build(), tmp_path / "nowhere")
     (tmp_path / "text.safetensors").write_text("weights")
     with pytest.raises(CheckpointError, match="safetensors file"):
         load_weights(build(), tmp_path / "text.safetensors")
