@@ -160,7 +160,7 @@ def test_latents_whose_draws_have_no_gradient_are_refused():
         dvae.DynamicalVAE("p(z_t | c_t) p(x_t | z_t)", None, {"z": 1, "x": 1, "c": 1}, laws={"p(z)": Own(Stuck)})
 
 
-@pytest.mark.parametrize("place", ["px", "qz", "pz"])
+@pytest.mark.parametrize("place", ["px", "qz"])
 def test_events_of_some_coordinates_are_refused(place):
     x = torch.randn(2, 3, 2)
     with pytest.raises(ValueError, match=r"event \(2,\); by its event_dim = 0 it has no event"):
