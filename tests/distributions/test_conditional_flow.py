@@ -1,19 +1,17 @@
-"""The conditional flow is a bijection with the density it says: against Jacobians, integrals, and closed forms."""
+"""The conditional flow is a bijection with the density it says, against Jacobians."""
 
 import sys
 
-import numpy as np
 import pyro.distributions as dist
 import pytest
 import torch
-from scipy import stats
 
 import dvae
 from dvae.distributions import ConditionalFlow, Normal, Product, Shape
 from dvae.networks import Linear, Recurrent
 from dvae.testing import FactorizationContract
 
-SIZES = [(1, 3), (2, 0), (1, 0), (2, 3), (5, 3)]
+SIZES = [(1, 0), (2, 3), (5, 3)]
 
 
 def build(size=3, features=2, steps=2, **options):
@@ -31,24 +29,16 @@ def given(law, features=2, rows=6):
 
 
 @pytest.mark.parametrize(("size", "features"), SIZES)
-def test_its_determinant_is_that_of_the_jacobian(size, features):
-    law = build(size, features)
-    parameters = given(law, features)
-    x = torch.randn(6, size, dtype=torch.float64)
-    _, log_det = law.distribution(parameters).flow.to_noise(x)
-    for i, found in enumerate(log_det):
+def test_its_determinant_is_that_of_the_jacobian_and_draws_are_the_noise_moved_back(size, features):
+    law = build(size, features, steps=4)
+    parameters, noise = given(law, features), torch.randn(6, size, dtype=torch.float64)
+    flow, x = law.distribution(parameters).flow, torch.randn(6, size, dtype=torch.float64)
+    for i, found in enumerate(flow.to_noise(x)[1]):
         one = law.distribution(tuple(p[i] for p in parameters))
         jacobian = torch.autograd.functional.jacobian(lambda v, one=one: one.flow.to_noise(v)[0], x[i])
         torch.testing.assert_close(torch.linalg.slogdet(jacobian).logabsdet, found, rtol=0, atol=1e-10)
         density = dist.Normal(0, 1).log_prob(one.flow.to_noise(x[i])[0]).sum() + found
         torch.testing.assert_close(one.log_prob(x[i]), density)
-
-
-@pytest.mark.parametrize(("size", "features"), SIZES)
-def test_draws_are_the_noise_moved_back(size, features):
-    law = build(size, features, steps=4)
-    parameters, noise = given(law, features), torch.randn(6, size, dtype=torch.float64)
-    flow = law.distribution(parameters).flow
     x = law.draw(parameters, noise)
     torch.testing.assert_close(flow.to_noise(x)[0], noise, rtol=0, atol=1e-10)
     torch.testing.assert_close(flow.from_noise(flow.to_noise(noise)[0]), noise, rtol=0, atol=1e-10)
@@ -56,18 +46,6 @@ def test_draws_are_the_noise_moved_back(size, features):
     x.sum().backward()
     read = [p for p in law.parameters() if p.numel()]
     assert all(p.grad is not None and p.grad.any() for p in read)
-
-
-@torch.no_grad()
-def test_in_one_dimension_it_is_a_density_and_draws_follow_it():
-    law = build(1)
-    one = law.distribution(tuple(p[0] for p in given(law, rows=1)))
-    draws = one.sample((2000,))[:, 0]
-    middle, span = draws.mean(), 12 * draws.std()
-    axis = torch.linspace(middle - span, middle + span, 20_001, dtype=torch.float64)
-    cumulative = torch.cumulative_trapezoid(one.log_prob(axis[:, None]).exp(), axis)
-    assert cumulative[-1].item() == pytest.approx(1, abs=1e-6)
-    assert stats.kstest(draws, lambda at: np.interp(at, axis[1:], cumulative)).pvalue > 1e-3
 
 
 def test_another_unit_changes_its_density_by_the_unit_alone():

@@ -1,17 +1,15 @@
 """Laws with one density for all that a step has: normals with full covariance, and classes."""
 
 import math
-from dataclasses import dataclass
 
 import pyro.distributions as dist
 import pytest
 import torch
 from pyro import poutine
-from torch import nn
 
 import dvae
 from dvae import DynamicalVAE, SequenceELBO, importance_bound, particle_bound
-from dvae.distributions import FixedNormal, Law, Vamp
+from dvae.distributions import Family, FixedNormal, Vamp
 from dvae.inference.bounds.particles import Filter
 from dvae.networks import Recurrent
 
@@ -20,57 +18,13 @@ PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_
 SIZES = {"w": 2, "z": 2, "x": 3}
 
 
-@dataclass(frozen=True)
-class Own:
-    """A law of the user's own, of any class."""
-
-    kind: type
-
-    def build(self, shape):
-        return self.kind(shape)
-
-
-class Full(Law):
-    """A normal with full covariance, the same everywhere."""
-
-    event_dim = 1
-
-    def __init__(self, shape):
-        super().__init__()
-        self.out = nn.Linear(shape.features, shape.size)
-        self.root = nn.Parameter(torch.eye(shape.size) + 0.3 * torch.randn(shape.size, shape.size))
-
-    def forward(self, features, previous=None, t=None):
-        loc = self.out(features)
-        root = self.root.tril(-1) + self.root.diagonal().exp().diag()
-        return loc, root.expand(*loc.shape, -1)
-
-    def distribution(self, parameters):
-        return dist.MultivariateNormal(parameters[0], scale_tril=parameters[1], validate_args=False)
-
-
-class Classes(Law):
-    """One class of so many, as its indicator."""
-
-    support, event_dim, discrete = dist.constraints.one_hot, 1, True
-
-    def __init__(self, shape):
-        super().__init__()
-        self.out = nn.Linear(shape.features, shape.size)
-
-    def forward(self, features, previous=None, t=None):
-        return (self.out(features).softmax(-1),)
-
-    def distribution(self, parameters):
-        return dist.OneHotCategorical(parameters[0], validate_args=False)
-
-
-FULL = {key: Own(Full) for key in ("p(z)", "p(x)", "q(w)", "q(z)")}
+NORMAL = Family("MultivariateNormal")
+FULL = dict.fromkeys(("p(z)", "p(x)", "q(w)", "q(z)"), NORMAL)
 LAWS = {
     "all": FULL,
     "latents": {**FULL, "p(x)": FixedNormal(learned=True)},
-    "guide": {"q": Own(Full)},
-    "classes": {"p(x)": Own(Classes)},
+    "guide": {"q": NORMAL},
+    "classes": {"p(x)": Family("OneHotCategorical")},
     "vamp": {**FULL, "p(w)": Vamp(3, 4)},
 }
 
@@ -105,8 +59,7 @@ def test_a_step_is_missing_as_a_whole_or_not_at_all():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("batch", BATCHES)
-@pytest.mark.parametrize("kind", LAWS)
+@pytest.mark.parametrize(("kind", "batch"), [*zip(LAWS, [*BATCHES, "both"], strict=True)])
 def test_particles_weigh_what_the_program_scores(kind, batch):
     """Without resampling, the particle filter is importance sampling; with it, it runs."""
     model, given = build(kind), data(kind, **BATCHES[batch]())

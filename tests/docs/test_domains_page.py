@@ -1,14 +1,11 @@
 """What makes the page of the domains, on little: it goes on where it was, and its tables are of what is there."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.studies import domains
 from dvae import tables
-from dvae.inference.evaluation.estimates import Crossed
 from dvae.tables import Column, Columns, Panel, Series, reading
 from dvae.tables.protocol import Cut
 
@@ -61,17 +58,3 @@ def test_the_page_of_the_domains_is_of_the_runs_that_are_there(page, tmp_path, c
         assert "3 sequences, 54 steps; 1 seeds" in page.read_text()
         assert page.read_text().count("| dkf |") == 2
         assert ("climatology" in page.read_text()) == there
-
-
-def test_bounds_are_by_step_and_their_errors_over_sequences(page, tmp_path):
-    domains.main(("tiny",), tmp_path, page, "validation", (domains.BASELINE,), (0, 1))
-    folders = [tmp_path / "tiny" / f"{domains.BASELINE}-{seed}" for seed in (0, 1)]
-    found = [json.loads((folder / "validation.json").read_text()) for folder in folders]
-    steps = np.array([15.0, 16.0])
-    assert found[0]["steps"] == steps.tolist()
-    sums = np.array([own["scores"][domains.BOUND] for own in found])
-    expected = Crossed.of(sums / steps, steps).estimate()
-    read = domains.Read.of(domains.BASELINE, folders, "validation")
-    assert read.crossed(domains.BOUND).estimate() == expected
-    assert expected.mean == pytest.approx(sums.sum() / 62)
-    assert read.said(domains.BOUND) == str(expected)

@@ -36,9 +36,8 @@ def test_a_gradient_in_evaluation_is_the_processors(kind, base):
     torch.testing.assert_close([value.cpu() for value in found], list(expected))
 
 
-@pytest.mark.parametrize("precision", [torch.bfloat16])
-def test_an_lstm_under_autocast_computes_in_float32_where_the_processor_needs_it(precision, monkeypatch):
-    layer, x = cells.LSTM(2, 3, batch_first=True), torch.randn(4, 5, 2)
+def test_an_lstm_under_autocast_computes_in_float32_where_the_processor_needs_it(monkeypatch):
+    precision, layer, x = torch.bfloat16, cells.LSTM(2, 3, batch_first=True), torch.randn(4, 5, 2)
     states = tuple(torch.randn(1, 4, 3).to(precision) for _ in range(2))
     monkeypatch.setattr(cells, "_runs_lstm", lambda precision, training: False)
     for given in (None, states):
@@ -50,10 +49,9 @@ def test_an_lstm_under_autocast_computes_in_float32_where_the_processor_needs_it
     assert layer.weight_hh_l0.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("precision", [torch.bfloat16])
 @pytest.mark.parametrize("grad", [True, False])
-def test_recurrent_networks_run_under_autocast_on_any_processor(precision, grad):
-    before = torch.get_rng_state()
+def test_recurrent_networks_run_under_autocast_on_any_processor(grad):
+    precision, before = torch.bfloat16, torch.get_rng_state()
     cells._runs_lstm.cache_clear()
     cells._runs_lstm(precision, grad)
     assert torch.equal(before, torch.get_rng_state())

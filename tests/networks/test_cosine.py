@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 from dvae.factorization.relations import Relation
 from dvae.networks import CosineDecoder, CosineEncoder
 from dvae.networks.base import Input
-from dvae.networks.cosine import Dropout, positions
+from dvae.networks.cosine import Dropout
 
 ALL, LENGTH = Relation.parse("1:T"), 7
 SMALL = {"width": 6, "feedforward": 10, "heads": 2, "layers": 2}
@@ -42,10 +42,6 @@ def encoded(size):
     return torch.from_numpy(found)
 
 
-def test_positions_are_the_published_waves():
-    assert torch.allclose(positions(LENGTH, 6, torch.float64), encoded(6), atol=1e-12)
-
-
 @pytest.mark.parametrize("cosine", [True, False])
 def test_the_encoder_is_the_published_one(cosine):
     net, given = encoder(cosine=cosine), values()
@@ -70,16 +66,6 @@ def test_the_decoder_adds_offsets_to_the_first_pose(components):
         pose = pose + offsets[:, t]
         expected.append(pose)
     assert torch.allclose(net(given, LENGTH), torch.stack(expected, 1), atol=1e-10, rtol=0)
-
-
-@pytest.mark.parametrize("made", [encoder, decoder])
-def test_the_two_forms_are_one_function(made):
-    net, given = made(), values()
-    state, steps = net.start(given, 3, LENGTH), []
-    for t in range(LENGTH):
-        features, state = net.step(state, t, {})
-        steps.append(features)
-    assert torch.allclose(torch.stack(steps, 1), net(given, LENGTH), atol=1e-10, rtol=0)
 
 
 def test_dropout_leaves_out_the_share_that_it_says():

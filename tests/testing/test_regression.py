@@ -56,49 +56,19 @@ def worsen(model, by):
 # ------------------------------------------------------------------------------------------------- error and power
 
 
-def test_a_bound_is_measured_within_its_error(exact):
-    model, x, oracle = exact
-    record = Record.of(measure(model.model, model.guide, x, 150, seed=1), {})
-    bound = oracle.bound(x).detach().numpy()
-    assert (np.abs(record.bound - bound) < 5 * record.error).all()
-    assert abs(record.mean - bound.mean()) < 5 * record.mean_error
-    assert record.mean_error == pytest.approx(math.sqrt((record.error**2).sum()) / len(x), rel=0.2)
-
-
-def test_the_rate_of_false_alarms_is_alpha(exact):
-    model, x, _ = exact
-    n, alpha = 1000, 0.05
-    pairs = zip(repeated(model, x, n, 30, seed=1), repeated(model, x, n, 30, seed=2), strict=True)
-    found = [Change(old, new, alpha) for old, new in pairs]
-    spread = 4 * math.sqrt(alpha * (1 - alpha) / n)
-    assert np.mean([change.worse for change in found]) < alpha + spread
-    assert np.mean([change.better for change in found]) < alpha + spread
-
-
 @pytest.mark.parametrize("particles", [20, 100])
-@pytest.mark.parametrize(
-    "draw",
-    [
-        lambda random, size: random.chisquare(1, size=size) - 1,
-        lambda random, size: np.exp(1.5 * random.normal(size=size)) - math.exp(1.125),
-    ],
-    ids=["chi-squared", "log-normal"],
-)
-def test_false_alarms_are_rare_where_skewed_draws_become_exact(draw, particles):
+def test_false_alarms_are_rare_where_skewed_draws_become_exact(particles):
     """Of one sequence, as where a sampled KL becomes analytic: old draws miss a long lower tail, or upper one."""
     n, alpha = 1000, 0.01
-    old = draw(np.random.default_rng(0), (n, particles))
+    old = np.exp(1.5 * np.random.default_rng(0).normal(size=(n, particles))) - math.exp(1.125)
     exact = Record(np.zeros(1), np.zeros(1), np.zeros(particles), {})
     for sign in (-1, 1):
-        records = [Record(row[:1], row[:1], row, {}) for row in sign * old]
-        for name in ("worse", "better"):
-            alarms = [getattr(Change(record, exact, alpha), name) for record in records]
+        found = [Change(Record(row[:1], row[:1], row, {}), exact, alpha) for row in sign * old]
+        for alarms in ([change.worse for change in found], [change.better for change in found]):
             assert np.mean(alarms) < 2 * alpha + 4 * math.sqrt(alpha / n)
 
 
-@pytest.mark.parametrize(
-    ("particles", "coupling", "noise"), [(4, -1.0, 1e-2), (4, 0.0, 1e2), (100, 0.9, 1e-2), (100, -1.0, 1e2)]
-)
+@pytest.mark.parametrize(("particles", "coupling", "noise"), [(4, -1.0, 1e-2), (4, 0.0, 1e2), (100, 0.9, 1e-2)])
 def test_false_alarms_are_as_rare_however_draws_are_coupled_and_sequences_spread(particles, coupling, noise):
     random = np.random.default_rng(0)
     n, alpha, size = 2000, 0.05, 5
@@ -111,57 +81,6 @@ def test_false_alarms_are_as_rare_however_draws_are_coupled_and_sequences_spread
         for a, b in zip(first, second, strict=True)
     ]
     assert np.mean(alarms) < alpha + 4 * math.sqrt(alpha * (1 - alpha) / n)
-
-
-class Poor:
-    """x_i ~ N(z_i, 1) and z_i ~ N(0, 1), with a guide far from the posterior, so that bounds are nearly normal.
-
-    Its draws may have the opposite sign, and take random numbers besides: in the first draw only, or in all.
-    """
-
-    def __init__(self, sign=1, first=False, every=False, mean=0.0):
-        self.sign, self.first, self.every, self.mean = sign, first, every, mean
-
-    def model(self, x):
-        with pyro.plate("sequences", len(x), dim=-1):
-            pyro.sample("x", dist.Normal(pyro.sample("z", dist.Normal(torch.zeros_like(x), 1.0)), 1.0), obs=x)
-
-    def guide(self, x):
-        if self.every or self.first:
-            torch.randn_like(x)
-            self.first = False
-        affine = torch.distributions.transforms.AffineTransform(self.mean, 0.3 * self.sign)
-        with pyro.plate("sequences", len(x), dim=-1):
-            pyro.sample("z", dist.TransformedDistribution(dist.Normal(torch.zeros_like(x), 1.0), [affine]))
-
-    def records(self, times, particles, seed):
-        """Records of independent measurements: of sequences that are alike but for their draws."""
-        bounds = measure(self.model, self.guide, torch.full((4 * times,), 40.0, dtype=torch.float64), particles, seed)
-        return [Record.of(part, {}) for part in np.split(bounds, times, axis=1)]
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"sign": -1}, {"every": True}, {"sign": -1, "every": True}, {"sign": -1, "first": True}],
-    ids=["opposed", "other numbers", "opposed and other numbers", "opposed and one number more"],
-)
-def test_false_alarms_are_as_rare_when_a_change_takes_other_random_numbers(change):
-    n, alpha = 2000, 0.05
-    pairs = zip(Poor().records(n, 30, seed=1), Poor(**change).records(n, 30, seed=1), strict=True)
-    found = [Change(old, new, alpha) for old, new in pairs]
-    for alarms in ([change.worse for change in found], [change.better for change in found]):
-        assert np.mean(alarms) < alpha + 4 * math.sqrt(alpha * (1 - alpha) / n)
-
-
-def test_one_random_number_more_uncouples_one_draw_only():
-    n, alpha, particles, mean = 2000, 0.05, 30, -0.02
-    old = Poor().records(n, particles, seed=1)
-    same, poor = (Poor(first=True, mean=m).records(n, particles, seed=1) for m in (0.0, mean))
-    for before, after in zip(old, same, strict=True):
-        np.testing.assert_array_equal(after.draws[1:], before.draws[1:])
-        assert after.draws[0] != before.draws[0]
-    # With all draws uncoupled the fall would be half of the error of the difference, and be found in .13 of the cases.
-    assert np.mean([Change(a, b, alpha).worse for a, b in zip(old, poor, strict=True)]) > 0.6
 
 
 def test_the_note_tells_the_fall_that_is_found_nine_times_in_ten(tmp_path, exact):
@@ -205,6 +124,20 @@ def test_coupled_draws_find_a_loss_below_the_error_of_either_bound(tmp_path, exa
     assert abs(change.difference - fall) < 5 * change.error
 
 
+def test_one_random_number_more_uncouples_one_draw_only():
+    x, more = torch.linspace(-1, 2, 6, dtype=torch.float64), []
+    model, guide = normal(0.3, 0.9)
+
+    def other(x):
+        if not more:
+            more.append(torch.randn_like(x))
+        guide(x)
+
+    before, after = (measure(model, each, x, 5, 1) for each in (guide, other))
+    np.testing.assert_array_equal(after[1:], before[1:])
+    assert (after[0] != before[0]).all()
+
+
 def test_rounding_is_no_fall_and_an_exact_bound_needs_no_error():
     def compare(fall):
         old = Record.of(np.full((10, 3), -1000.0), {})
@@ -246,43 +179,19 @@ def test_a_fall_is_told_with_the_worst_sequences(tmp_path, exact):
     with pytest.raises(AssertionError) as caught:
         regression(tmp_path).check(poor.model, poor.guide, x)
     text = str(caught.value)
-    for expected in (
-        "fell significantly",
-        "old  ",
-        "new  ",
-        "difference  -",
-        "standard error",
-        "--update-elbo and commit",
-    ):
-        assert expected in text
+    said = ("fell significantly", "old  ", "new  ", "difference  -", "standard error", "--update-elbo and commit")
+    assert all(part in text for part in said)
     listed = re.findall(r"^ +(\d) +\S+ +\S+ +(-\S+) +\S+$", text, re.MULTILINE)
     assert sorted(int(i) for i, _ in listed) == [0, 1, 2, 3]
     assert [float(d) for _, d in listed] == sorted(float(d) for _, d in listed)
-
-
-def test_an_update_renews_and_a_rise_is_told(tmp_path, exact):
-    model, x, _ = exact
-    poor, notes = worsen(model, 1.0), []
-    regression(tmp_path, notes).check(poor.model, poor.guide, x, particles=20)
-    regression(tmp_path, notes).check(model.model, model.guide, x, particles=20)
-    assert re.match(r"better by \S+ ± .*; run with --update-elbo to keep it", notes[1])
-    regression(tmp_path, notes, update=True).check(model.model, model.guide, x, particles=20)
-    assert notes[2].startswith("renewed, to be committed: ")
-    regression(tmp_path, notes, update=True).check(model.model, model.guide, x, particles=20)
-    regression(tmp_path, notes).check(model.model, model.guide, x, particles=20)
-    assert len(notes) == 3
-    with pytest.raises(AssertionError, match="fell significantly"):
-        regression(tmp_path, notes).check(poor.model, poor.guide, x, particles=20)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda batch: {n: v[:3] for n, v in batch.items()}, r"the shape of lengths was \(4,\), now \(3,\)"),
-        (lambda batch: {**batch, "x": batch["x"].flip(0)}, "x differs in sequence 0, 1, 2, 3"),
         (lambda batch: {**batch, "x": batch["x"] + 1e-3 * torch.eye(4)[2, :, None, None]}, "x differs in sequence 2;"),
         (lambda batch: {"x": batch["x"]}, "it holds lengths, x, now there are x"),
-        (lambda batch: {**batch, "lengths": torch.tensor([3, 3, 3, 2])}, "lengths differs in sequence 3"),
     ],
 )
 def test_other_data_are_refused(tmp_path, exact, change, message):
@@ -303,15 +212,9 @@ def test_small_sequences_are_known_beside_large_ones(tmp_path, exact):
         regression(tmp_path).check(model.model, model.guide, other, particles=5)
 
 
-def test_data_may_differ_in_their_last_digits(tmp_path, exact):
-    model, x, _ = exact
-    regression(tmp_path).check(model.model, model.guide, x)
-    regression(tmp_path).check(model.model, model.guide, x.float())
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("", "JSONDecodeError"), ("[]", "TypeError"), ("{}", "KeyError"), ("<<<<<<< HEAD\n{}", "no record of bounds")],
+    [("[]", "TypeError"), ("{}", "KeyError"), ("<<<<<<< HEAD\n{}", "no record of bounds")],
 )
 def test_a_damaged_record_is_refused_and_can_be_renewed(tmp_path, exact, text, message):
     model, x, _ = exact
@@ -365,24 +268,6 @@ def normal(location, scale, dim=-1):
     return model, guide
 
 
-def test_any_pyro_pair_has_its_bound(tmp_path):
-    x = torch.linspace(-1, 2, 6, dtype=torch.float64)
-    record = Record.of(measure(*normal(0.3, 0.9), x, 300, seed=1), {})
-    posterior, evidence = dist.Normal(x / 2, math.sqrt(0.5)), dist.Normal(torch.zeros_like(x), math.sqrt(2)).log_prob(x)
-    expected = evidence - torch.distributions.kl_divergence(dist.Normal(0.3 * x, 0.9), posterior)
-    assert (np.abs(record.bound - expected.numpy()) < 5 * record.error).all()
-
-
-def test_the_exact_posterior_has_no_monte_carlo_error_and_its_loss_is_seen_at_once(tmp_path):
-    x = torch.linspace(-1, 2, 6, dtype=torch.float64)
-    best = math.sqrt(0.5)
-    regression(tmp_path).check(*normal(0.5, best), x, particles=50)
-    regression(tmp_path).check(*normal(0.5, best), x, particles=50)
-    with pytest.raises(AssertionError, match="fell significantly"):
-        regression(tmp_path).check(*normal(0.5, best * 2), x, particles=50)
-    assert Record.loads((tmp_path / "test_it.json").read_text()).mean_error < 1e-12
-
-
 def test_another_bound_is_held_by_its_own_draws(tmp_path):
     """With particles there is less to lose by a guide that is too wide than the ELBO loses, and it is found as well."""
     model = twin(*PAIR, {"z": 1, "x": 1}, 3)
@@ -418,10 +303,9 @@ def test_bounds_are_one_for_each_sequence_and_finite(tmp_path):
         pytest.raises(ValueError, match="the bound of sequence 1, 4 is not finite"),
     ):
         regression(tmp_path).check(*normal(0.0, 1.0), bad)
+    model, guide = ((lambda batch, f=f: f(batch["x"])) for f in normal(0.5, 1.0))
     with pytest.raises(ValueError, match="note is str; expected tensors"):
-        regression(tmp_path).check(
-            *[lambda batch, f=f: f(batch["x"]) for f in normal(0.5, 1.0)], {"x": x, "note": "hm"}
-        )
+        regression(tmp_path).check(model, guide, {"x": x, "note": "hm"})
     assert not list(tmp_path.iterdir())
 
 

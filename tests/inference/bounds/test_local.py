@@ -14,7 +14,6 @@ DKF = "p(z_t | z_{t-1}) p(x_t | z_t)"
 HIT = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)"
 PAIRS = {
     "mean-field": (DKF, "q(z_t | x_{1:T})"),
-    "backward": (DKF, "q(z_t | z_{t+1}, x_t)"),
     "static first": (HIT, "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
 }
 T = 3
@@ -61,10 +60,7 @@ def test_the_best_guide_of_a_factorization_has_nothing_to_gain_but_its_missing_a
     assert (evidence - oracle.bound(x) - best).min() > 0.02
     own = local_guide(model, x, steps=100, rate=0.5)
     bound, error = elbo(own, x)
-    # a sequence may have better than the guide that is the best for all, where that may not read all of the data
-    assert ((evidence - bound) < best + 4 * error + 0.01).all()
-    if pair != "backward":
-        torch.testing.assert_close((evidence - bound).mean(), best.mean(), rtol=0, atol=float(4 * error.max()) + 0.01)
+    torch.testing.assert_close((evidence - bound).mean(), best.mean(), rtol=0, atol=float(4 * error.max()) + 0.01)
     everything = local_guide(own, x, missing=True, steps=100, rate=0.5)
     bound, error = elbo(everything, x)
     assert ((evidence - bound).abs() < 4 * error + 0.01).all()
@@ -72,11 +68,8 @@ def test_the_best_guide_of_a_factorization_has_nothing_to_gain_but_its_missing_a
 
 def test_without_a_step_it_is_the_guide_and_programs_take_the_sequences_any_number_of_times():
     """A rate of nothing moves nothing: draws and densities are the guide's, of ragged sequences with context too."""
-    model = dvae.DynamicalVAE(
-        "p(w | c) p(z_t | z_{t-1}, w) p(x_t | z_t, c)",
-        "q(w | x_{1:T}) q(z_t | z_{>t}, x_{1:T}, w)",
-        {"w": 2, "z": 3, "x": 2, "c": 1},
-    ).double()
+    pair = "p(w | c) p(z_t | z_{t-1}, w) p(x_t | z_t, c)", "q(w | x_{1:T}) q(z_t | z_{>t}, x_{1:T}, w)"
+    model = dvae.DynamicalVAE(*pair, {"w": 2, "z": 3, "x": 2, "c": 1}).double()
     batch = {"x": torch.randn(3, 5, 2), "c": torch.randn(3, 1), "lengths": torch.tensor([5, 1, 3])}
     local = local_guide(model, batch, steps=1, rate=1e-12, missing=True)
     rows = repeat(model.read(batch), 2)

@@ -41,9 +41,8 @@ def law(model, x):
     whole, past = Oracle(model, T), Oracle(model, SEEN)
     names = (*model.latents, *model.observed)
     steps = [T if model.generative.local(name) else 1 for name in names]
-    blocks = torch.arange(sum(s * model.sizes[n] for n, s in zip(names, steps))).split(
-        [s * model.sizes[n] for n, s in zip(names, steps)]
-    )
+    counts = [s * model.sizes[n] for n, s in zip(names, steps)]
+    blocks = torch.arange(sum(counts)).split(counts)
     known = torch.cat([block[: min(s, SEEN) * model.sizes[n]] for n, s, block in zip(names, steps, blocks)])
     future = blocks[-1][SEEN * model.sizes["x"] :]
     mean, precision = (value.detach() for value in whole._joint())

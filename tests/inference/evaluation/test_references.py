@@ -94,7 +94,6 @@ def test_windows_that_name_their_columns_have_the_references_of_tables(gaps):
     assert list(run(bare, training_windows=known).rows) == ["last value", "nearest neighbours"]
     assert result["last value"] == run(bare)["last value"]
     assert list(run(held).rows) == ["last value", "seasonal"]
-    assert list(run(replace(held, season=None)).rows) == ["last value"]
     assert list(run(replace(held, season=8)).rows) == ["last value"]  # of 7 observed frames
     assert list(run(replace(held, season=8), season=7).rows) == ["last value", "seasonal"]
     assert run(held, references=False).rows == {}

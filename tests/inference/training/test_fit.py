@@ -14,35 +14,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file
 from stopping import At, interrupt
+from walks import HELD_OUT, TRAIN, build, same
 
 from dvae.data.sequences import Sequences
 from dvae.inference.bounds.elbo import SequenceELBO, Terms
 from dvae.inference.training import checkpoints
-from dvae.inference.training.checkpoints import CheckpointError, Run, load_weights, save_weights, weights
+from dvae.inference.training.checkpoints import CheckpointError, Run, load_weights, weights
 from dvae.inference.training.fit import Interrupted, fit
 from dvae.inference.training.objectives import Evidence
 from dvae.inference.training.options import Stage
 from dvae.inference.training.schedules import Piecewise, Ramp, from_config
 from dvae.inference.training.svi import NonFiniteError
 from dvae.inference.training.trackers import InMemory, JSONLines, TensorBoard
-from dvae.networks import Dense
 from dvae.program.model import DynamicalVAE
 
 matplotlib.use("agg")
-
-
-def build(seed=0, latent=2, kind=DynamicalVAE):
-    torch.manual_seed(seed)
-    equations = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"
-    return kind(*equations, {"z": latent, "x": 3}, network=Dense(widths=(8,))).double()
-
-
-def walks(n, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(n, 4, 3, generator=generator, dtype=torch.float64).cumsum(1)
-
-
-TRAIN, HELD_OUT = walks(24), walks(7, seed=1)
 
 
 def run(model=None, train=TRAIN, validation=None, **options):
@@ -60,11 +46,6 @@ def ruin(state):
             parameter.add_(3.0)
 
 
-def same(first, second):
-    assert first.keys() == second.keys()
-    return all(torch.equal(first[name], second[name]) for name in first)
-
-
 # The objective --------------------
 
 
@@ -74,12 +55,9 @@ def terms(frames=(4.0, 2.0), **tables):
     return Terms(**tables, frames=torch.tensor(frames).double())
 
 
-def test_the_unweighted_objective_is_minus_the_bound_per_frame():
-    assert Evidence()(terms(), step=0).item() == pytest.approx(-terms().bound.sum().item() / 6)
-
-
 def test_kl_weights_free_bits_and_energies_enter_the_loss_as_documented():
     energy = terms(energies={"feet": [1.0, 5.0]})
+    assert Evidence()(terms(), step=0).item() == pytest.approx(-terms().bound.sum().item() / 6)
     assert Evidence(kl_weight=0.5)(terms(), 0).item() == pytest.approx((12 + 0.5 * 7.2) / 6)
     assert Evidence(kl_weight={"z": Ramp(0.0, 1.0, 10)})(terms(), 5).item() == pytest.approx((12 + 1.2 + 3) / 6)
     assert Evidence(free_bits=0.5)(terms(), 0).item() == pytest.approx((12 + 6) / 6 + 0.5)
@@ -105,13 +83,8 @@ def test_a_weight_for_an_unknown_term_is_refused(option):
 def test_an_objective_survives_json():
     with pytest.raises(ValueError, match="select"):
         Evidence(select="best")
-    objective = Evidence(
-        {"z": Piecewise(((0, 0.0), (9, 1.0)))},
-        free_bits=0.1,
-        energy_weights={"feet": 2.0},
-        draws={"z": 3},
-        select="loss",
-    )
+    kl_weight, energies = {"z": Piecewise(((0, 0.0), (9, 1.0)))}, {"feet": 2.0}
+    objective = Evidence(kl_weight, free_bits=0.1, energy_weights=energies, draws={"z": 3}, select="loss")
     config = from_config(json.loads(json.dumps(objective.to_config())))
     assert config.pop("objective") == "Evidence"
     assert Evidence(**config) == objective
@@ -249,8 +222,6 @@ def test_ragged_and_masked_data_train():
     mask[0, 1, 2], lengths[1] = False, 3
     result = run(train={"x": x, "mask": mask, "lengths": lengths}, steps=20)
     assert math.isfinite(result.history[-1]["bound"])
-    by_name = run(train={"x": x, "mask": {"x": mask}, "lengths": lengths}, steps=20)
-    assert by_name.history == result.history
 
 
 def test_a_batch_holds_different_sequences_and_all_of_them_if_there_are_few():
@@ -392,8 +363,10 @@ def test_a_run_is_neither_overwritten_nor_resumed_by_accident(finished):
         run(out=finished, resume=True, optimizer="sgd")
 
 
-@pytest.mark.parametrize("name", ["best.safetensors", "last.safetensors", "last.state.safetensors"])
-@pytest.mark.parametrize("damage", ["flipped", "truncated", "missing"])
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [("best.safetensors", "flipped"), ("last.safetensors", "truncated"), ("last.state.safetensors", "missing")],
+)
 def test_damaged_files_are_refused_by_name(finished, name, damage):
     path = finished / name
     content = bytearray(path.read_bytes())
@@ -411,7 +384,6 @@ def test_damaged_files_are_refused_by_name(finished, name, damage):
     ("state", "message"),
     [
         ([], "object"),
-        ({"fingerprints": 3}, "fingerprints"),
         ({"fingerprints": {"last.safetensors": None}}, "fingerprints"),
     ],
 )
@@ -421,16 +393,6 @@ def test_a_state_that_verifies_nothing_is_refused(finished, state, message):
         with pytest.raises(CheckpointError, match=message):
             load_weights(build(), path)
     with pytest.raises(CheckpointError, match=r"state\.json is damaged"):
-        run(out=finished, steps=10, resume=True)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"), [({"step": "five"}, "missing"), ({"status": None, "waited": 1.5}, "missing")]
-)
-def test_a_state_of_wrong_types_is_refused(finished, change, message):
-    state = json.loads((finished / "state.json").read_text()) | change
-    (finished / "state.json").write_text(json.dumps(state))
-    with pytest.raises(CheckpointError, match=message):
         run(out=finished, steps=10, resume=True)
 
 
@@ -449,13 +411,6 @@ def test_the_weights_of_another_model_are_refused(finished, tmp_path):
     (finished / "state.json").write_text("{")
     with pytest.raises(CheckpointError, match="damaged"):
         load_weights(build(), finished)
-
-
-def test_weights_in_a_file_of_their_own_come_back(tmp_path):
-    first, second = build(0), build(1)
-    save_weights(first, tmp_path / "new" / "weights.safetensors")
-    load_weights(second, tmp_path / "new" / "weights.safetensors")
-    assert same(weights(first), weights(second))
 
 
 def test_an_optimiser_state_is_never_unpickled(finished):

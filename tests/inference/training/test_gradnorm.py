@@ -1,7 +1,6 @@
 """Weights that adapt: they balance what the paper says, belong to one run, and are as they were when it goes on."""
 
 import math
-import signal
 
 import pytest
 import torch
@@ -9,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save
 from stopping import At, interrupt
+from walks import TRAIN, build
 
 import dvae
 from dvae.inference.training.checkpoints import OPTIMISER, CheckpointError, Run
@@ -17,10 +17,7 @@ from dvae.inference.training.gradnorm import GradNorm
 from dvae.inference.training.objectives import Evidence
 from dvae.inference.training.options import Stage
 from dvae.inference.training.schedules import Ramp
-from dvae.networks import Dense
 from dvae.program.model import DynamicalVAE
-
-RATE = 0.1
 
 
 def alone(value):
@@ -30,9 +27,8 @@ def alone(value):
 
 def energies(**values):
     """Terms of two frames, each energy as given."""
-    return dvae.Terms(
-        {}, {}, {name: value.reshape(1) for name, value in values.items()}, torch.full((1,), 2.0).double()
-    )
+    tables = {name: value.reshape(1) for name, value in values.items()}
+    return dvae.Terms({}, {}, tables, torch.full((1,), 2.0).double())
 
 
 class Linear(torch.nn.Module):
@@ -68,7 +64,7 @@ def run(model=None, **options):
     defaults = {"batch_size": 8, "log_every": 1, "validate_every": 20, "progress": False, "learning_rate": 0.02}
     if "stages" not in options:
         defaults |= {"steps": 30, "objective": BALANCED}
-    return fit(model or build(), TRAIN, **(defaults | options))
+    return fit(model or build(kind=Scaled), TRAIN, **(defaults | options))
 
 
 class Scaled(DynamicalVAE):
@@ -80,14 +76,7 @@ class Scaled(DynamicalVAE):
         return {"small": small, "large": 100 * small, "other": ((means[:, 1:] - means[:, :-1]) ** 2).sum((1, 2))}
 
 
-def build(seed=0):
-    torch.manual_seed(seed)
-    equations = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"
-    return Scaled(*equations, {"z": 2, "x": 3}, network=Dense(widths=(8,))).double()
-
-
-TRAIN = torch.randn(24, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).cumsum(1)
-BALANCED = GradNorm(("small", "large"), "generator.x.", asymmetry=0.0, learning_rate=RATE)
+BALANCED = GradNorm(("small", "large"), "generator.x.", asymmetry=0.0, learning_rate=0.1)
 MIXED = GradNorm(("x", "other", "large"), "generator.x.", Evidence(kl_weight=Ramp(0.0, 0.1, 4)), asymmetry=0.0)
 
 
@@ -96,16 +85,6 @@ def weighing(result, name):
 
 
 # The weights --------------------
-
-
-def test_gradients_of_two_scales_come_to_one_norm_and_stay_there():
-    """Two norms come nearer by twice the rate in a step, in their logarithms, and cross by no more."""
-    result = run(steps=40)
-    gaps = [math.log(100 * b / a) for a, b in zip(weighing(result, "small"), weighing(result, "large"), strict=True)]
-    reached = math.ceil(math.log(100) / (2 * RATE))
-    assert gaps[:reached] == pytest.approx([math.log(100) - 2 * RATE * step for step in range(reached)])
-    assert max(map(abs, gaps[reached:])) <= 2 * RATE + 1e-9
-    assert len(gaps) > reached + 10
 
 
 @pytest.mark.parametrize("asymmetry", [0.0, 1.5])
@@ -165,15 +144,8 @@ def test_the_loss_is_the_weighted_tasks_and_the_other_terms_as_evidence_has_them
     assert weighing(result, "x")[-1] != 1.0
 
 
-def test_with_a_rate_of_0_it_is_the_evidence():
-    still = run(objective=GradNorm(("small", "large"), "generator", learning_rate=0.0)).history
-    for row, other in zip(still, run(objective=Evidence()).history, strict=True):
-        assert row["loss"] == pytest.approx(other["loss"], rel=1e-9)
-        assert (row["weight/small"], row["weight/large"]) == (1.0, 1.0)
-
-
 def test_validation_losses_have_weights_of_1_and_can_be_compared():
-    objective = GradNorm(("small", "large"), "generator.x.", Evidence(select="loss"), learning_rate=RATE)
+    objective = GradNorm(("small", "large"), "generator.x.", Evidence(select="loss"), learning_rate=0.1)
     result = run(objective=objective, validation=TRAIN, steps=40)
     for row in result.history:
         if "validation/loss" in row:
@@ -195,18 +167,12 @@ def whole(tmp_path_factory):
     return run(stages=STAGED, out=place).history, load_file(place / "last.safetensors")
 
 
-def terminal(state):
-    signal.raise_signal(signal.SIGINT)
-
-
-@pytest.mark.parametrize(("action", "stop"), [(terminal, 13), *((interrupt, step) for step in (9, 17, 25))])
-def test_an_interrupted_run_has_its_weights_back_bit_for_bit(tmp_path, whole, action, stop):
+@pytest.mark.parametrize("stop", [9, 13])
+def test_an_interrupted_run_has_its_weights_back_bit_for_bit(tmp_path, whole, stop):
     with pytest.raises(Interrupted):
-        run(stages=STAGED, out=tmp_path, callbacks=[At(stop, action)])
-    resumed, last = (
-        run(build(seed=9), stages=STAGED, out=tmp_path, resume=True),
-        load_file(tmp_path / "last.safetensors"),
-    )
+        run(stages=STAGED, out=tmp_path, callbacks=[At(stop, interrupt)])
+    resumed = run(build(9, kind=Scaled), stages=STAGED, out=tmp_path, resume=True)
+    last = load_file(tmp_path / "last.safetensors")
     assert resumed.history == whole[0]
     assert all(torch.equal(value, last[name]) for name, value in whole[1].items())
 
@@ -227,7 +193,7 @@ def test_every_stage_begins_with_weights_of_1():
 def test_a_model_without_the_shared_layer_is_refused_before_its_stage_comes():
     lost = GradNorm(("small", "large"), "decoder.last")
     with pytest.raises(ValueError, match="starts with"):
-        dvae.SVI(build(), stages=[Stage(5), Stage(5, lost)])
+        dvae.SVI(build(kind=Scaled), stages=[Stage(5), Stage(5, lost)])
 
 
 def test_a_task_that_does_not_go_through_the_shared_parameters_is_refused():
@@ -238,31 +204,18 @@ def test_a_task_that_does_not_go_through_the_shared_parameters_is_refused():
         balance.measure(terms)
 
 
-def written(path, change):
-    """The checkpoint of a run in which the objective's state was changed, signed as its author would."""
-    run(steps=5, objective=BALANCED, out=path)
-    content = Run(path).optimiser_state()
-    own = {
-        name.removeprefix("objective/"): content.pop(name) for name in list(content) if name.startswith("objective/")
-    }
-    content |= {f"objective/{name}": value for name, value in change(own).items()}
-    Run(path).commit(Run(path).state, {OPTIMISER: save(content)})
-
-
-def one(value):
-    return torch.tensor(value, dtype=torch.float64)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda state: {}, "objective"),
-        (lambda state: state | {"weight/huge": one(1.0)}, "objective"),
-        (lambda state: state | {"first/large": one(math.nan)}, "objective writes"),
-        (lambda state: state | {"weight/small": one(3.0)}, "positive numbers"),
+        ({"weight/huge": 1.0}, "objective"),
+        ({"first/large": math.nan}, "objective writes"),
+        ({"weight/small": 3.0}, "positive numbers"),
     ],
 )
 def test_a_state_that_no_run_writes_is_refused_in_a_sentence(tmp_path, change, message):
-    written(tmp_path, change)
+    """Signed as its author would."""
+    run(steps=5, objective=BALANCED, out=tmp_path)
+    changed = {f"objective/{name}": torch.tensor(value, dtype=torch.float64) for name, value in change.items()}
+    Run(tmp_path).commit(Run(tmp_path).state, {OPTIMISER: save(Run(tmp_path).optimiser_state() | changed)})
     with pytest.raises(CheckpointError, match=message):
-        run(build(seed=9), steps=10, objective=BALANCED, out=tmp_path, resume=True)
+        run(build(9, kind=Scaled), steps=10, objective=BALANCED, out=tmp_path, resume=True)

@@ -69,10 +69,6 @@ def test_json_round_trip(value):
     assert from_config(json.loads(json.dumps(to_config(value)))) == value
 
 
-def test_a_config_names_the_schedule():
-    assert to_config(Ramp(0.0, 1.0, 5)) == {"schedule": "Ramp", "start": 0.0, "end": 1.0, "steps": 5, "delay": 0}
-
-
 def test_numbers_are_constant_schedules_and_other_things_are_refused():
     assert schedule(0.5)(10**9) == 0.5
     assert schedule(Ramp(0.0, 1.0, 5)) == Ramp(0.0, 1.0, 5)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from walks import HELD_OUT, TRAIN, build, same
 
 import dvae
 from dvae.data.sequences import Sequences
@@ -10,23 +11,10 @@ from dvae.inference.training.objectives import Evidence
 from dvae.inference.training.options import Stage
 from dvae.inference.training.resuming import restore, store
 from dvae.inference.training.schedules import Piecewise, Ramp
-from dvae.networks import Dense
 
 STEPS = 24
 
 
-def build(seed=0):
-    torch.manual_seed(seed)
-    equations = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"
-    return dvae.DynamicalVAE(*equations, {"z": 2, "x": 3}, network=Dense(widths=(8,))).double()
-
-
-def walks(n, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(n, 4, 3, generator=generator, dtype=torch.float64).cumsum(1)
-
-
-TRAIN, HELD_OUT = walks(24), walks(7, seed=1)
 SHARED = {"batch_size": 8, "log_every": 1, "validate_every": 6, "learning_rate": 0.02, "progress": False}
 WARM_UP = Evidence(kl_weight=Ramp(0.0, 1.0, 10), free_bits=0.1)
 RUNS = {
@@ -56,36 +44,21 @@ def by_hand(loop, until=STEPS):
     return rows
 
 
-def same(first, second):
-    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
-
-
 @pytest.mark.parametrize("options", RUNS.values(), ids=RUNS)
-def test_steps_by_hand_repeat_a_fit_bit_for_bit(options):
-    fitted, mine = build(), build()
+def test_steps_by_hand_repeat_a_fit_and_go_on_from_a_checkpoint_bit_for_bit(tmp_path, options):
+    fitted = build()
     result = dvae.fit(fitted, TRAIN, HELD_OUT, **SHARED, **options)
-    loop = dvae.SVI(mine, **SHARED, **options)
-    loop.init()
-    assert by_hand(loop) == result.history
-    assert (loop.state.best_step, loop.state.best_bound) == (result.best_step, result.best_bound)
-    assert same(loop.state.best, weights(fitted))
-
-
-@pytest.mark.parametrize("options", RUNS.values(), ids=RUNS)
-def test_a_run_goes_on_by_hand_from_its_checkpoint(tmp_path, options):
-    whole = dvae.SVI(build(), **SHARED, **options)
-    whole.init()
-    rows = by_hand(whole)
-    first = dvae.SVI(build(), **SHARED, **options)
-    first.init()
-    before = by_hand(first, until=15)
-    store(first, Run(tmp_path))
-    second = dvae.SVI(build(seed=9), **SHARED, **options)
-    second.init()
-    restore(second, Run(tmp_path))
-    assert before + by_hand(second) == rows
-    assert same(weights(second.model), weights(whole.model))
-    assert same(second.state.best, whole.state.best)
+    whole, resumed = (dvae.SVI(build(seed), **SHARED, **options) for seed in (0, 9))
+    for loop in (whole, resumed):
+        loop.init()
+    before = by_hand(whole, until=15)
+    store(whole, Run(tmp_path))
+    restore(resumed, Run(tmp_path))
+    for loop in (whole, resumed):
+        assert before + by_hand(loop) == result.history
+        assert (loop.state.best_step, loop.state.best_bound) == (result.best_step, result.best_bound)
+        assert same(loop.state.best, weights(fitted))
+    assert same(weights(resumed.model), weights(whole.model))
 
 
 def test_the_callers_random_state_is_left_alone():

@@ -30,13 +30,6 @@ class TestMoGlow(FactorizationContract):
         return small(frame_dropout=0.5).build({"x": size})
 
 
-def test_every_bound_is_the_likelihood():
-    model = small().build({"x": 3}).eval()
-    likelihood = model.log_joint(X, {})["x"]
-    torch.testing.assert_close(dvae.SequenceELBO().terms(model, X).bound, likelihood)
-    torch.testing.assert_close(dvae.importance_bound(model, X, particles=5).bound, likelihood)
-
-
 def test_where_a_frame_is_missing_the_model_reads_its_own_and_a_joint_alone_cannot_be():
     model, mask = small().build({"x": 3}).eval(), torch.ones_like(X, dtype=torch.bool)
     mask[:, 3] = False

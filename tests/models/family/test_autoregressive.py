@@ -1,6 +1,5 @@
 """The model without latents: its bound is its likelihood, whatever the bound."""
 
-import pytest
 import torch
 
 import dvae
@@ -35,11 +34,3 @@ def test_every_bound_is_the_likelihood():
     torch.testing.assert_close(weighted.bound, likelihood)
     assert not weighted.khat.any()
     torch.testing.assert_close(dvae.particle_bound(model, X, particles=3).bound, likelihood, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("guide", ["", None])
-def test_a_model_without_a_method_is_the_same(guide):
-    model = dvae.DynamicalVAE("p(x_t | x_{<t})", guide, {"x": 2})
-    assert model.latents == ()
-    likelihood = model.eval().log_joint(X, {})["x"]
-    torch.testing.assert_close(dvae.SequenceELBO().terms(model, X).bound, likelihood)
