@@ -106,33 +106,12 @@ def test_vertices_go_with_few_joints_near_them():
 # --------------------------------------------------------------------------------------------------------- skinning
 
 
-def test_no_turns_and_no_shape_are_the_template():
-    unturned = torch.eye(3).double().expand(1, T, PERSON.joints, 3, 3)
-    vertices, joints = PERSON(torch.zeros(1, 8).double(), unturned, torch.zeros(1, T, 3).double())
-    torch.testing.assert_close(vertices, PERSON.template.expand(1, T, -1, 3))
-    torch.testing.assert_close(joints, (PERSON.regressor @ PERSON.template).expand(1, T, -1, 3))
-    torch.testing.assert_close(joints[..., 0, :], torch.zeros(1, T, 3).double())  # the pelvis
-
-
 def test_joints_are_those_of_forward_kinematics():
     shape, turns, translation = poses()
     pivots = PERSON.at_rest(shape)[1]
     offsets = pivots - pivots[:, [max(parent, 0) for parent in PERSON.parents]]
     expected, _ = kinematics.forward(PERSON.parents, turns, offsets[:, None], pivots[:, None, 0] + translation)
     torch.testing.assert_close(PERSON(shape, turns, translation)[1], expected)
-
-
-def test_what_goes_with_one_joint_moves_rigidly_with_it():
-    """Every vertex keeps its place as seen from its joint, and so its distances to all that go with the same one."""
-    bones = torch.arange(len(PERSON.template)) % PERSON.joints
-    weights = torch.nn.functional.one_hot(bones, PERSON.joints).double()
-    body = Body(PERSON.names, PERSON.parents, PERSON.template, PERSON.shapes, PERSON.regressor, weights, PERSON.faces)
-    shape, turns, translation = poses()
-    resting, pivots = body.at_rest(shape)
-    vertices, joints = body(shape, turns, translation)
-    world = kinematics.forward(body.parents, turns, torch.zeros(22, 3).double(), translation)[1]
-    seen = (world[:, :, bones].mT @ (vertices - joints[:, :, bones])[..., None]).squeeze(-1)
-    torch.testing.assert_close(seen, (resting - pivots[:, bones])[:, None].expand_as(seen))
 
 
 def test_a_surface_is_the_weighted_sum_of_rigid_ones():
@@ -148,30 +127,11 @@ def test_a_surface_is_the_weighted_sum_of_rigid_ones():
     torch.testing.assert_close(vertices, expected)
 
 
-def test_turning_the_root_turns_everything_about_it():
-    shape, turns, translation = poses()
-    turn = rotations.to_matrix(torch.tensor([0.3, -1.2, 0.8], dtype=torch.float64), "vector")
-    vertices, joints = PERSON(shape, turns, translation)
-    turns[:, :, 0] = turn @ turns[:, :, 0]
-    root = joints[:, :, :1]
-    torch.testing.assert_close(PERSON(shape, turns, translation)[0], (vertices - root) @ turn.T + root)
-
-
 def test_whoever_walks_far_keeps_the_same_surface():
     """But for rounding places so far away, 2^-24 of them each time; weights that add up to 1 - 1e-7 stretch nobody."""
     body, (shape, turns, translation) = human(), (tensor.float() for tensor in poses())
     near, far = (body(shape, turns, translation + move)[0] for move in (0, 1024))
     torch.testing.assert_close(far - 1024, near, atol=3 * 1024 / 2**24, rtol=0)
-
-
-def test_a_batch_is_one_by_one():
-    shape, turns, translation = poses()
-    together = PERSON(shape, turns, translation)
-    for b in range(B):
-        for t in range(T):
-            alone = PERSON(shape[b], turns[b, t : t + 1], translation[b, t : t + 1])
-            for one, many in zip(alone, together, strict=True):
-                torch.testing.assert_close(one[0], many[b, t])
 
 
 def test_gradients_are_right():
@@ -284,17 +244,12 @@ def changed(name, change):
     ("change", "message"),
     [
         (lambda members: members.pop("weights"), "it lacks weights"),
-        (changed("v_template", lambda a: a[:-1]), "shapedirs holds"),
         (changed("v_template", lambda a: a + np.float32(np.nan)), "v_template holds numbers that are NaN"),
         (changed("shapedirs", lambda a: 1e30 * a), "beyond 1000"),
         (changed("shapedirs", lambda a: a[..., :2]), "2 parameters of shape, not 8"),
-        (changed("shapedirs", lambda a: a[..., 0]), "expected numbers"),
-        (changed("f", lambda a: a + 1), "hangs on what is not there"),
         (changed("f", lambda a: a - 1), "hangs on what is not there"),
-        (changed("f", lambda a: a[:0]), "f holds"),
         (changed("f", lambda a: a.astype(float)), "expected whole numbers"),
         (changed("weights", lambda a: 2 * a), "do not add up to 1"),
-        (changed("J_regressor", lambda a: 0 * a), "do not add up to 1"),
         (changed("J_regressor", lambda a: np.array({"sparse": 1})), "pickled objects"),
         (changed("kintree_table", lambda a: a[:, ::-1]), "its tree is not SMPL's"),
         (changed("kintree_table", lambda a: a[:, :5]), "expected whole numbers"),
@@ -309,27 +264,15 @@ def test_files_that_are_no_body_are_refused_in_a_sentence(tmp_path, change, mess
     assert "wrong.npz" in str(error.value)
 
 
-def test_an_array_larger_than_any_body_is_refused_before_it_is_read(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("limit", "most", "message"),
+    [("LARGEST", 100, "of a body at most 100"), ("MOST_VERTICES", 1000, "1,486 vertices, of a body at most 1,000")],
+)
+def test_a_file_larger_than_any_body_is_refused(tmp_path, monkeypatch, limit, most, message):
     write_body(tmp_path / "body.npz", human())
-    monkeypatch.setattr("dvae.motion.bodies.smplx.LARGEST", 100)
-    monkeypatch.setattr("dvae.motion.files.archive.Member.array", lambda self: pytest.fail("it was read"))
-    with pytest.raises(ValueError, match="of a body at most 100"):
+    monkeypatch.setattr(f"dvae.motion.bodies.smplx.{limit}", most)
+    with pytest.raises(ValueError, match=message):
         read_body(tmp_path / "body.npz")
-
-
-def test_a_body_of_too_many_vertices_is_refused(tmp_path, monkeypatch):
-    write_body(tmp_path / "body.npz", human())
-    monkeypatch.setattr("dvae.motion.bodies.smplx.MOST_VERTICES", 1000)
-    with pytest.raises(ValueError, match="1,486 vertices, of a body at most 1,000"):
-        read_body(tmp_path / "body.npz")
-
-
-def test_no_file_is_no_body(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_body(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("SMPL")
-    with pytest.raises(ValueError, match="damaged"):
-        read_body(tmp_path / "text.npz")
 
 
 def test_the_squared_error_is_that_of_vertices_though_none_is_made():

@@ -1,11 +1,10 @@
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
 
-from dvae.motion import PROTOCOLS, WALKER, simulate, windows
+from dvae.motion import WALKER, simulate
 from dvae.motion.data.simulator import ACTIVITIES
-from dvae.motion.drawing.plot import futures, pose
+from dvae.motion.drawing.plot import futures
 
 FEET = [WALKER.names.index(name) for name in ("LFoot", "RFoot")]
 
@@ -43,14 +42,7 @@ def test_feet_stay_on_the_floor_and_do_not_slide(positions):
     assert np.median(np.take_along_axis(speed, standing, axis=2)) < 0.1
 
 
-def test_nobody_jumps(positions):
-    acceleration = np.linalg.norm(np.diff(positions, 2, axis=1), axis=-1) * WALKER.fps**2
-    assert acceleration.max() < 120
-
-
-def test_heads_are_above_and_walkers_move_where_they_face(people, positions):
-    head = WALKER.names.index("Head")
-    assert (positions[:, :, head, 1] > positions[:, :, FEET, 1].max(axis=2) + 0.5).all()
+def test_walkers_move_where_they_face(people, positions):
     walking = np.stack([clip.truth["weights"][:, ACTIVITIES.index("walk")] for clip in people])[:, 1:] > 0.99
     heading = np.stack([clip.truth["heading"] for clip in people])[:, 1:]
     velocity = np.diff(positions[:, :, 0], axis=1) * WALKER.fps
@@ -58,13 +50,6 @@ def test_heads_are_above_and_walkers_move_where_they_face(people, positions):
     assert 0.5 < forward[walking].mean() < 2.0
     sideways = velocity[..., 0] * np.cos(heading) - velocity[..., 2] * np.sin(heading)
     assert np.abs(sideways[walking]).mean() < 0.3 * forward[walking].mean()
-
-
-def test_the_true_heading_is_the_skeletons(people):
-    standing = [c for c in people if c.labels["activity"] == "stand"]
-    for clip in standing:
-        measured = WALKER.heading(torch.from_numpy(clip.positions[0])).item()
-        assert np.cos(measured - clip.truth["heading"][0]) > np.cos(0.25)
 
 
 def test_wavers_raise_the_hand_that_the_truth_names(people, positions):
@@ -94,33 +79,12 @@ def test_labels_and_truth_tell_the_same_story(people):
         assert 1.2 < float(clip.labels["height_m"]) < 2.3
 
 
-def test_the_same_pose_has_many_futures():
-    cut = windows(simulate(150, 150, seed=1), PROTOCOLS["simulated"], "train").all()["x"]
-    last, future = cut[:, 14], cut[:, 15:]
-    gap = torch.cdist(last, last)
-    near = gap.topk(6, largest=False).indices[:, 1:]
-    later = torch.linalg.vector_norm(future[near][:, :, -1] - future[:, None, -1], dim=-1)
-    now = gap.gather(1, near)
-    assert later.median() > 2 * now.median()
-
-
-def test_one_frame_more_than_none_and_what_cannot_be_simulated():
-    assert simulate(1, 2).clips[0].positions.shape == (2, 17, 3)
+def test_what_cannot_be_simulated():
     with pytest.raises(ValueError, match="cannot simulate 0 clips"):
         simulate(0)
 
 
 class TestFigures:
-    @pytest.fixture(autouse=True)
-    def close(self):
-        yield
-        plt.close("all")
-
-    def test_a_pose_has_one_line_per_bone(self, positions):
-        ax = plt.figure().subplots()
-        pose(ax, positions[0, :4], WALKER)
-        assert len(ax.collections[0].get_segments()) == 4 * 16
-
     @pytest.mark.parametrize(("K", "past_frames", "H"), [(1, 1, 1), (5, 15, 60)])
     def test_futures_draw_past_samples_and_truth(self, positions, K, past_frames, H):
         past, future = positions[:K, :past_frames], positions[:K, past_frames : past_frames + H]
@@ -128,6 +92,8 @@ class TestFigures:
         ax.figure.canvas.draw()
         shown = min(2, past_frames) + 2 * min(4, H)
         assert len(ax.collections) == shown
+        key = [text.get_text() for text in ax.get_legend().get_texts()]
+        assert key == ["observed", "what happened", f"{K} sample{'s' * (K > 1)}"]
         assert ax.get_xticklabels()[-1].get_text() == f"+{H / 30:.1f} s"
 
     def test_given_paths_are_crosses_where_the_joints_should_be(self, positions):
@@ -142,7 +108,3 @@ class TestFigures:
         assert np.isnan(ax.lines[2].get_xydata()).all()
         with pytest.raises(ValueError, match=r"expected a path \(60, 3\) of LWrist"):
             futures(WALKER, positions[1, :5], samples, paths={"LWrist": path[:9]})
-
-    def test_shapes_that_do_not_fit_are_explained(self, positions):
-        with pytest.raises(ValueError, match=r"expected observed \(O, J, 3\)"):
-            futures(WALKER, positions[0, :5], positions[0, 5:9])
