@@ -60,16 +60,6 @@ def test_bones_are_kept_where_the_path_leaves_the_choice():
     assert torch.allclose(corrections, torch.zeros(()).double())
 
 
-def test_a_bone_without_length_is_free():
-    drawn = torch.zeros(1, 6, dtype=torch.float64)
-    known = torch.tensor([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0]], dtype=torch.float64)
-    paths = torch.full((1, 6), 0.3, dtype=torch.float64)
-    one, bones = torch.ones(6, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    found = bend(lambda z: z[:, None], drawn, one, paths, known, POINT, bones)[0][0, 0]
-    assert torch.allclose(found[3:], paths[0, 3:])
-    assert torch.allclose(found[:3], torch.zeros(3, dtype=torch.float64), atol=1e-6)
-
-
 def test_corrections_come_and_go():
     """A decoder that nothing moves: around a known frame the correction is a bump, and 0 in the first pose."""
     known = torch.zeros(30, 6, dtype=torch.float64)
