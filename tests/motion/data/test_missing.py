@@ -17,8 +17,8 @@ from dvae.cli import main
 from dvae.cli.app import COMMANDS, command
 from dvae.cli.console import Missing
 from dvae.cli.help import Expert
-from dvae.data.sequences import bridged, gapped, past_of
-from dvae.inference.diagnostics.checks import STATISTICS, Statistic
+from dvae.data.sequences import gapped, past_of
+from dvae.inference.diagnostics.checks import STATISTICS
 from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.held import clip_places
 from dvae.inference.evaluation.references import distances, last_value
@@ -70,15 +70,6 @@ def test_missing_joints_are_refused_unless_they_are_allowed():
     with pytest.raises(ValueError, match=r"has NaN or infinite positions.*missing=True \(--missing\) keeps the clip"):
         MotionSet(clips, WALKER)
     assert MotionSet(clips, WALKER, missing=True).fingerprint() == GAPS.fingerprint()
-
-
-def test_what_lacks_a_coordinate_lacks_the_joint():
-    positions = PEOPLE.clips[0].positions.copy()
-    positions[4, 3, 1] = np.nan
-    (clip,) = MotionSet([Clip("a", "b", positions)], WALKER, missing=True)
-    assert np.isnan(clip.positions[4, 3]).all()
-    assert np.isnan(clip.positions).sum() == 3
-    assert np.isnan(positions).sum() == 1
 
 
 @pytest.mark.parametrize(
@@ -156,12 +147,6 @@ def test_bursts_have_their_share_and_length(share, length):
     assert abs(hidden.mean() - share) < 5 * (1 - share) * length / cycle * (2 / count) ** 0.5
 
 
-@pytest.mark.parametrize(("share", "length"), [(1.0, 4.0), (-0.1, 4.0), (0.2, 0.5), (0.9, 2.0)])
-def test_bursts_that_cannot_be_are_refused(share, length):
-    with pytest.raises(ValueError, match="expected a share from 0 to below 1 and bursts of"):
-        motion.occlude(PEOPLE, share, length)
-
-
 # -------------------------------------------------------------------------------------------------------------- windows
 
 
@@ -180,15 +165,6 @@ def test_windows_say_what_was_observed_and_hide_the_rest(name):
     drawn = motion.windows(GAPS, protocol, "train").sample(5, torch.Generator().manual_seed(0))
     assert drawn["x"].isfinite().all()
     assert drawn["mask"].shape == drawn["x"].shape
-
-
-def test_paths_start_where_the_root_is_first_seen():
-    some = without(PEOPLE, Pelvis=slice(0, 1), LWrist=slice(1, 2))
-    windows = motion.windows(some, motion.Protocol("p", 2, 60, 30, 90, 90, root="relative"), "train")
-    x = windows.positions(windows.all()["x"])
-    assert torch.equal(x[:, 1, WALKER.root], torch.zeros(len(x), 3))
-    world = torch.stack([torch.from_numpy(clip.positions) for clip in windows.clips])
-    torch.testing.assert_close(x[:, 2], world[:, 2] - world[:, 1, [WALKER.root]])
 
 
 @pytest.mark.parametrize("unseen", [15, 10])  # frames of each clip in which no left side is, all of the past or not
@@ -216,18 +192,6 @@ def test_listed_windows_have_something_before_and_after_the_present():
 
 
 # ----------------------------------------------------------------------------------------- references, scores, energies
-
-
-def test_gaps_are_bridged_by_straight_lines():
-    x = torch.randn(3, 12, 4).cumsum(1)
-    mask = torch.rand(3, 12, 4) < 0.6
-    mask[0, :, 0] = False
-    found = bridged(torch.where(mask, x, torch.nan), mask)
-    for n in range(3):
-        for d in range(4):
-            seen = np.flatnonzero(mask[n, :, d])
-            line = np.interp(range(12), seen, x[n, seen, d]) if len(seen) else np.zeros(12)
-            np.testing.assert_allclose(found[n, :, d], line, atol=1e-5)
 
 
 def test_zero_velocity_stays_where_joints_were_last():
@@ -343,24 +307,6 @@ def test_statistics_are_of_what_was_observed():
     kept = [n for n, (_, child) in enumerate(WALKER.edges) if child != toe + 1]
     torch.testing.assert_close(found["bone length"], lengths[..., kept].mean((1, 2)))
     assert all(value.isfinite().all() for value in found.values())
-
-
-def test_replicates_have_the_gaps_of_their_windows():
-    """Statistics see the same gaps in a window and in all that is compared with it."""
-    data, method = small("vae")
-    torch.manual_seed(0)
-    model, test, given = method.build(data.schema), data.windows("test"), []
-
-    def speed(x):
-        given.append(x.isnan())
-        return x.diff(dim=-2).square().nanmean((-2, -1))
-
-    checks = dvae.predictive_checks(model, test, {"speed": Statistic(speed)}, samples=19, progress=False)
-    mask, seam = test.all()["mask"], data.protocol.observed - 2
-    for real, made, first in ((0, 1, seam), (2, 3, 0)):
-        assert torch.equal(given[real], ~mask[:, first:])
-        assert torch.equal(given[made], ~mask[:, first:].expand(19, -1, -1, -1))
-    assert all(np.isfinite(check.wasserstein) for check in checks.checks.values())
 
 
 def test_what_needs_whole_bodies_says_what_to_do():
@@ -481,20 +427,6 @@ def still_gsps():
     return model, x[:, :1].expand_as(x).clone()
 
 
-def test_gsps_reads_a_joint_that_was_never_seen_as_its_parent():
-    model, x = still_gsps()
-    past, elbow, wrist = x[:, : model.frames], *(3 * (WALKER.find(name) - 1) for name in ("LElbow", "LWrist"))
-    mask, bent = torch.ones_like(past).bool(), past.clone()
-    mask[..., wrist : wrist + 3] = False
-    bent[..., wrist : wrist + 3] = past[..., elbow : elbow + 3]
-    futures = []
-    for given in ({"x": past, "mask": mask}, {"x": bent}, {"x": past}):
-        torch.manual_seed(1)
-        futures.append(model.forecast(given, 5, 2)["x"])
-    torch.testing.assert_close(*futures[:2])
-    assert not torch.allclose(*futures[1:])
-
-
 def test_gsps_fills_gaps_by_what_comes_near_to_all_that_was_seen():
     """Of many motions of the model, that of which all but some frames of a joint was seen, if for a drift in time."""
     model, x = still_gsps()
@@ -510,12 +442,6 @@ def test_gsps_fills_gaps_by_what_comes_near_to_all_that_was_seen():
         torch.testing.assert_close(filled, true)
     with pytest.raises(ValueError, match="gsps fills gaps in windows of 18 frames, not 12"):
         model.impute({name: value[:, :12] for name, value in batch.items()})
-
-
-def test_what_is_whole_has_no_gap_to_fill():
-    model = dvae.method("vae", latent=2).build({"x": 4})
-    with pytest.raises(ValueError, match="nothing is missing in this batch; give a 'mask'"):
-        model.impute(torch.randn(2, 3, 4))
 
 
 # ------------------------------------------------------------------------------------------------------- what is shown
@@ -614,20 +540,6 @@ def test_gaps_are_filled_in_the_motion_itself(fitted, tmp_path, capsys):
     ):
         assert main([*impute, *arguments]) == 2
         assert message in capsys.readouterr().err
-
-
-def test_files_with_gaps_are_looked_at_played_and_converted(gaps, tmp_path, capsys):
-    out = str(tmp_path / "half.npz")
-    for arguments in (
-        ["data", "info"],
-        ["animate", "--out", str(tmp_path / "a.html")],
-        ["data", "convert", "--out", out],
-    ):
-        assert main([*arguments, gaps]) == 1
-        assert "--missing" in capsys.readouterr().err
-        assert main([*arguments, gaps, "--missing", *(["--fps", "15"] if "convert" in arguments else [])]) == 0
-    for clip in motion.read_motion(out, missing=True):
-        np.testing.assert_allclose(clip.positions, GAPS[clip.key].positions[::2], atol=1e-6)
 
 
 def test_a_run_is_scored_and_shown_on_other_motion_with_gaps(gaps, tmp_path, capsys):

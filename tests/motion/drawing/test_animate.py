@@ -81,14 +81,6 @@ def test_frames_are_left_out_but_not_the_present_nor_the_speed(bodies):
     assert scene_of(fast, *bodies)["milliseconds"] == pytest.approx(40)
 
 
-def test_a_motion_is_played_alone_and_a_truth_may_end_early(clips, bodies):
-    alone = scene_of(clips.skeleton, clips.clips[0].positions, every=1)
-    assert (alone["observed"], alone["frames"], len(alone["people"])) == (1, NOW + HORIZON, 1)
-    observed, samples, truth = bodies
-    scene = scene_of(WALKER, observed, samples, truth[:2], every=1)
-    assert [person["frames"] for person in scene["people"]] == [2, *[HORIZON] * 3]
-
-
 def test_what_does_not_fit_is_refused(bodies):
     observed, samples, truth = bodies
     for wrong in ((observed[..., :2], samples, truth), (observed, samples[:, :3], truth), (observed[:1],)):

@@ -154,19 +154,6 @@ def test_what_is_written_has_the_layout_that_animation_programs_import(tmp_path)
     assert [len(line.split()) for line in lines[motion + 3 :]] == [18, 18]
 
 
-def test_ends_without_a_length_are_no_joints(tmp_path):
-    (tmp_path / "a.bvh").write_text(SMALL.replace("OFFSET 0 -5 0", "OFFSET 0 -0.0 0"))
-    read = read_bvh(tmp_path / "a.bvh")
-    assert (read.names, read.parents) == (["hip", "a knee", "arm", "armEnd"], [-1, 0, 0, 2])
-    np.testing.assert_allclose(read.positions[0], [[0, 0, 0], [0, -10, 0], [3, 0, 0], [4, 0, 0]])
-
-
-def test_names_that_repeat_are_not_written(tmp_path):
-    with pytest.raises(ValueError, match=r"a\.bvh: 'knee' is the name of 2 joints"):
-        write_bvh(tmp_path / "a.bvh", ["hip", "knee", "knee"], [-1, 0, 0], np.ones((3, 3)), None, None, 30)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -8,26 +8,6 @@ from dvae.motion import read_motion
 from dvae.motion.files.markers import read_c3d, tree
 
 
-def test_markers_are_what_ezc3d_writes(tmp_path):
-    ezc3d = pytest.importorskip("ezc3d", reason="ezc3d is not installed")
-    random, names = np.random.default_rng(0), ["HEAD", "HIP", "LFOOT", "*1", "RFOOT"]
-    rest = np.array([[0, 0, 1700.0], [0, 0, 900], [100, 0, 10], [0, 0, 0], [-100, 0, 10]])
-    places = rest + random.normal(0, 5, (7, 5, 3))
-    file = ezc3d.c3d()
-    file["parameters"]["POINT"]["RATE"]["value"] = [250.0]
-    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
-    file["parameters"]["POINT"]["LABELS"]["value"] = names
-    points = np.ones((4, 5, 7))
-    points[:3] = places.transpose(2, 1, 0)
-    file["data"]["points"] = points
-    file.write(str(tmp_path / "a.c3d"))
-    read = read_c3d(tmp_path / "a.c3d")
-    assert (sorted(read.names), read.fps, read.metres) == (sorted({*names} - {"*1"}), 250, 0.001)
-    expected = places[:, [names.index(name) for name in read.names]]
-    np.testing.assert_allclose(read.positions, expected, atol=1e-3)  # single precision
-    assert read_motion(tmp_path / "a.c3d").skeleton.up == "z"
-
-
 def test_markers_that_were_not_seen_are_gaps(tmp_path):
     names, places = ["HEAD", "HIP", "LFT", "RFT"], standing(7)[..., :3]
     unseen = np.zeros((7, 4), bool)

@@ -138,15 +138,6 @@ def test_an_archive_with_the_skeleton_of_another_is_refused(three, tmp_path):
         read_motion(tmp_path / "a.npz")
 
 
-def test_labels_of_other_clips_in_a_folder_are_kept(three, tmp_path):
-    for clip, mood in zip(three, ("sad", "glad", ""), strict=True):
-        write_motion(tmp_path / "all", MotionSet([replace(clip, labels={"mood": mood})], WALKER), "csv")
-    assert [clip.labels["mood"] for clip in read_motion(tmp_path / "all").clips] == ["", "sad", "glad"]
-    (tmp_path / "all" / "labels.csv").write_text("clip,mood\nperson_0001,wild\n")
-    with pytest.raises(ValueError, match=r"labels\.csv: other clips .* column named split"):
-        write_motion(tmp_path / "all", MotionSet([replace(three.clips[0], labels={"mood": "sad"})], WALKER), "csv")
-
-
 def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, three, tmp_path, capsys):
     shutil.copytree(recordings, tmp_path / "in")
     stranger = tmp_path / "in" / "train" / "stranger.bvh"
@@ -170,15 +161,6 @@ def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, 
     ]
     for wrong in (["convert", told[2]], ["info", *told[2:]], ["get", "cmu2", *told[3:5]], [*told[1:], "--url", "x"]):
         assert main(["data", *wrong]) == 2
-
-
-def test_who_is_simulated_is_put_onto_what_is_asked_for(tmp_path):
-    told = ["data", "convert", "simulated", "--out", str(tmp_path / "a.npz"), "--onto", "human36m"]
-    assert main(told) == 0
-    read, walker = read_motion(tmp_path / "a.npz"), simulate()
-    assert (read.skeleton.name, read.skeleton.up) == ("human36m", "z")
-    np.testing.assert_allclose(read.clips[0].positions[..., 2], walker.clips[0].positions[..., 1], atol=1e-6)
-    assert main([*told, "--metres", "0.01"]) == 2
 
 
 def test_forecasts_are_bvh_where_the_clip_is_if_the_protocol_keeps_the_root(tmp_path, capsys):

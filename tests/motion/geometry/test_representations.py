@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -131,20 +130,6 @@ def test_the_past_does_not_see_turns_of_its_future(people_of_two_sizes):
     assert (found[2] - found[0]).abs().max() > 1e-3
 
 
-def test_a_model_of_turns_is_fitted_and_scored_in_metres(people_of_two_sizes):
-    protocol = replace(PROTOCOL, representation="6d")
-    train, test = (motion.windows(people_of_two_sizes, protocol, split) for split in ("train", "test"))
-    method = dvae.method("vae", latent=2, warm_up=2)
-    model = method.build(train)
-    result = dvae.fit(model, method.train(train, None, steps=3), batch_size=2, log_every=1, progress=False)
-    assert all(np.isfinite(row["loss"]) for row in result.history if "loss" in row)
-    table = dvae.evaluate(model, test, scores=motion.scores, samples=3, training_windows=train, progress=False)
-    positions = motion.windows(people_of_two_sizes, PROTOCOL, "test")
-    plain = dvae.evaluate(small(positions), positions, scores=motion.scores, samples=3, progress=False)
-    assert table["zero velocity"]["ADE"].mean == pytest.approx(plain["zero velocity"]["ADE"].mean)  # in the same metres
-    assert table["model"]["bone-length error"].mean < 0.02  # of the simulator's own, which breathe
-
-
 def test_a_run_of_turns_keeps_its_rest_pose_and_draws_what_is_scored(people_of_two_sizes, tmp_path):
     motion.save(tmp_path / "people.npz", twisted(people_of_two_sizes))  # no inverse kinematics finds such turns
     data = motion.MotionData.open(tmp_path / "people.npz", replace(PROTOCOL, representation="6d"))
@@ -163,17 +148,6 @@ def test_a_run_of_turns_keeps_its_rest_pose_and_draws_what_is_scored(people_of_t
     scored = dvae.evaluate(loaded.model, test, scores=motion.scores, samples=3, seed=0, progress=False).rows["model"]
     means = [found[places == clip].mean() for places in [clip_places(test.keys)] for clip in places.unique()]
     torch.testing.assert_close(torch.stack(means), torch.tensor(scored.clip_means["ADE"]).to(found))
-
-
-def test_data_of_other_turns_have_another_fingerprint_where_they_are_read(people_of_two_sizes):
-    people = people_of_two_sizes.with_rotations()
-    longer = replace(people.skeleton, rest=tuple(1.1 * place for place in people.skeleton.rest))
-    sets = [people_of_two_sizes, people, twisted(people), motion.MotionSet(people.clips, longer)]
-    assert len({each.fingerprint() for each in sets}) == 4
-    assert len({windows(each).fingerprint for each in sets}) == 1  # of positions
-    assert len({windows(each, representation="6d").fingerprint for each in sets}) == 4
-    at_rest = replace(people_of_two_sizes, skeleton=people.skeleton)
-    assert at_rest.fingerprint() == people_of_two_sizes.fingerprint()  # nothing is turned
 
 
 def test_what_has_no_turns_is_refused(people_of_two_sizes):
@@ -198,13 +172,3 @@ def test_bounds_of_turns_do_not_compare_with_those_of_positions(people_of_two_si
     table = dvae.evaluate(models, positions, samples=2, references=False, progress=False)
     assert any("bounds of turns: densities of turns of joints (6d)" in note for note in table.notes)
     assert not any("bounds of positions" in note for note in table.notes)
-
-
-def test_replicates_and_traversals_of_a_model_of_turns_are_positions(people_of_two_sizes):
-    data = windows(people_of_two_sizes, representation="6d")
-    model = small(data, "dkf")
-    checks = dvae.predictive_checks(model, data, motion.statistics(data), samples=19, progress=False)
-    assert checks.table()
-    found = dvae.traverse(model, data.all(), "z", [0], steps=3, draws=4)
-    lengths = data.skeleton.bone_lengths(data.positions(found.frames))
-    torch.testing.assert_close(lengths, lengths[:, :, :, :1].expand_as(lengths), atol=1e-5, rtol=0)

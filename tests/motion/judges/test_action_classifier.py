@@ -240,20 +240,6 @@ def test_scores_of_reference_rows_by_hand(fitted):
     assert against_real.mean == -result["zero velocity"]["FID way"].mean
 
 
-def test_differences_of_the_distance_are_paired_over_clips():
-    test, train, model = windows("test"), windows("train"), classifier()
-    result = evaluate(test, {"way": model}, training_windows=train, samples=5)
-    paired = result.difference("zero velocity", "nearest neighbours", "FID way")
-    x, places = test.all()["x"].double(), torch.arange(10).repeat_interleave(3)
-    neighbours = nearest_neighbours(x[:, :4], train.all()["x"].double(), 5).movedim(0, 1)
-    still = x[:, None, 3:4].expand(-1, -1, 6, -1)
-    real, first, second = (model.features(each) for each in (x[:, 4:], still, neighbours))
-    value, without = (a - b for a, b in zip(brute_force(real, first, places), brute_force(real, second, places)))
-    assert paired.mean == pytest.approx(value, rel=1e-6)
-    jackknife = math.sqrt(9 / 10 * ((without - without.mean()) ** 2).sum())
-    assert paired.standard_error == pytest.approx(jackknife, rel=1e-6)
-
-
 def test_classes_that_it_does_not_know_count_for_fid_alone_and_the_record_says_so(fitted):
     clips = people()
     made = [replace(c, labels={"way": "sideways"}) if c.split == "test" and n % 3 else c for n, c in enumerate(clips)]

@@ -102,16 +102,6 @@ def test_training_poses_are_turned_and_get_noise(train):
     assert torch.polar(torch.ones(200), angles).mean().abs() < 3 / 200**0.5  # in all directions
 
 
-def test_with_a_fixed_heading_it_does_not_mind_which_way_people_face(train):
-    x = train.all()["x"][:5].double()
-    angle = torch.linspace(0, 6, 5, dtype=torch.float64)[:, None, None]
-    turned = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), angle, "y").flatten(-2)
-    for heading in (False, True):
-        prior = PosePrior(heading=heading).build(train).double()
-        plain, other = (dvae.SequenceELBO().terms(prior, {"x": each}).bound for each in (x, turned))
-        assert torch.allclose(plain, other, rtol=0, atol=1e-8) == heading
-
-
 def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path, capsys):
     loaded = dvae.load(run)
     assert isinstance(loaded.model, PosePriorModel)
@@ -125,12 +115,6 @@ def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path, capsys):
     assert "dvae evaluate RUN --pose-prior" in capsys.readouterr().out
     rows = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
     assert max(row["step"] for row in rows) == 12
-
-
-@pytest.mark.parametrize("command", ["evaluate", "compare"])
-def test_it_forecasts_nothing(command, run, capsys):
-    assert main([command, str(run)]) == 1
-    assert "is a fitted pose-prior, which forecasts nothing" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(

@@ -97,25 +97,6 @@ def test_scores_of_limbs_are_their_definitions(windows, futures):
     assert scores(windows, futures, batch_size=2) == pytest.approx(found, rel=1e-5)
 
 
-def test_bones_without_length_are_in_no_score_of_limbs(windows, futures):
-    """A joint at the place of another one, as the ends of some files' bones are, changes nothing."""
-    body = windows.skeleton
-    elbow = body.find("RElbow")
-    skeleton = replace(body, names=(*body.names, "RTwist"), parents=(*body.parents, elbow))
-    clips = [
-        motion.Clip(*clip.key, np.concatenate([clip.positions, clip.positions[:, [elbow]]], 1))
-        for clip in windows.clips
-    ]
-    more = motion.windows(motion.MotionSet(clips, skeleton), PROTOCOL, "test")
-    twisted = torch.cat([futures, torch.randn(*futures.shape[:-1], 3)], -1)
-    names = (*LIMBS, "bone-length error")
-    found, expected = scores(more, twisted), scores(windows, futures)
-    assert [found[name] for name in names] == pytest.approx([expected[name] for name in names], rel=1e-5)
-    notes = {measure.name: measure.note for measure in motion.scores(more)}
-    assert all("1 of 17 bones are shorter than 1e-06 m" in notes[name] for name in names)
-    assert not any("bones" in measure.note for measure in motion.scores(windows))
-
-
 def test_what_does_not_count(windows, futures):
     """Where bodies face; and steps, of one predicted frame, which has none."""
     turned = rotate_about_up(futures.unflatten(-1, (-1, 3)), torch.tensor(1.0), windows.skeleton.up).flatten(-2)

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from dvae import motion
-from dvae.data.sequences import Source
-from dvae.motion import PROTOCOLS, PseudoTruths, WithPseudoTruths, rotate_about_up
+from dvae.motion import PROTOCOLS, PseudoTruths, rotate_about_up
 
 OBSERVED, STRIDE, NEAR, APART = 4, 7, 0.8, 0.15
 SMALL = replace(PROTOCOLS["simulated"], observed=OBSERVED, predicted=8)
@@ -146,20 +145,6 @@ def test_limbs_without_length_make_no_nan(people):
     pseudo, valid = PseudoTruths(windows, NEAR, APART, stride=STRIDE).of(drawn(windows), generator())
     assert valid.any()
     assert torch.isfinite(pseudo).all()
-
-
-@pytest.mark.parametrize("heading", [False, True])
-def test_batches_are_those_of_the_windows_and_what_belongs_to_them(windows, heading):
-    truths = PseudoTruths(windows, NEAR, APART, stride=STRIDE, heading=heading)
-    source = WithPseudoTruths(windows, truths)
-    assert isinstance(source, Source)
-    assert source.fingerprint == windows.fingerprint
-    ours, theirs = generator(), generator()
-    for _ in range(3):
-        batch, x = source.sample(5, ours), windows.sample(5, theirs)["x"]
-        assert torch.equal(batch["x"], truths.turn(x) if heading else x)
-        assert batch["pseudo"].shape == (5, truths.most, *x.shape[1:])
-        assert batch["valid"].shape == (5, truths.most)
 
 
 def test_what_has_no_future_or_heading_is_refused(people, windows, truths):

@@ -299,14 +299,3 @@ def test_markers_are_where_their_names_say():
         if side:
             assert (vertices[vertex] - joints[body.names.index(f"{side}_{joint}")]).norm() < 0.1
     assert len(set(bodies.MARKERS.values())) == 16
-
-
-def test_some_vertices_are_those_of_the_surface():
-    body = bodies.human().double()
-    shape, places = torch.randn(2, 8).double(), torch.randn(2, 5, 3).double()
-    turned = motion.geometry.rotations.to_matrix(torch.randn(2, 5, 22, 3).double(), "vector")
-    whole = body(shape, turned, places)[0]
-    which = torch.randint(len(body.template), (2, 5, 7))
-    expected = whole.gather(-2, which[..., None].expand(-1, -1, -1, 3))
-    torch.testing.assert_close(body.some(shape, turned, places, which), expected)
-    torch.testing.assert_close(body.some(shape, turned, places, which[0, 0]), whole[..., which[0, 0], :])
