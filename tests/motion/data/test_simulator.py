@@ -75,16 +75,3 @@ class TestFigures:
         key = [text.get_text() for text in ax.get_legend().get_texts()]
         assert key == ["observed", "what happened", f"{K} sample{'s' * (K > 1)}"]
         assert ax.get_xticklabels()[-1].get_text() == f"+{H / 30:.1f} s"
-
-    def test_given_paths_are_crosses_where_the_joints_should_be(self, positions):
-        samples = positions[:2, 5:65] + np.array([[[[0.0, 0.0, 0.0]]], [[[0.5, 0.0, 0.0]]]])
-        wrist, path = WALKER.names.index("LWrist"), samples[1, :, WALKER.names.index("LWrist")].copy()
-        path[-1] = np.nan
-        ax = futures(WALKER, positions[1, :5], samples, frames=3, paths={"left_wrist": path})
-        bone = next(b for b, (_, child) in enumerate(WALKER.edges) if child == wrist)
-        for drawn, line in zip(ax.collections[2:4], ax.lines[:2], strict=True):
-            followed = drawn.get_segments()[len(WALKER.edges) + bone]  # of the second sample
-            np.testing.assert_allclose(line.get_xydata()[0], followed[1])
-        assert np.isnan(ax.lines[2].get_xydata()).all()
-        with pytest.raises(ValueError, match=r"expected a path \(60, 3\) of LWrist"):
-            futures(WALKER, positions[1, :5], samples, paths={"LWrist": path[:9]})

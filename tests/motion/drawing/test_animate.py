@@ -151,20 +151,6 @@ def test_strange_forecast_files_are_refused(forecasts, tmp_path, capsys, change,
     assert not page.exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--out page.png", "end its name in .html"),
-        ("--out page.html --window -1", "--window is -1; it must be at least 0"),
-        ("--out page.html --figure page.xyz", "the end of the name is the format"),
-    ],
-)
-def test_wrong_arguments_exit_with_2_before_any_work(capsys, tmp_path, monkeypatch, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    assert message in " ".join(failure(capsys, "simulated", *arguments.split(), code=2).replace("│", " ").split())
-    assert not list(tmp_path.iterdir())
-
-
 def failure(capsys, *arguments, code=1):
     assert main(["animate", *map(str, arguments)]) == code
     error = capsys.readouterr().err

@@ -6,13 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import dvae
 from dvae.cli import main
 from dvae.motion import (
     HUMAN36M,
-    PROTOCOLS,
     WALKER,
-    MotionData,
     MotionSet,
     Skeleton,
     read_motion,
@@ -101,19 +98,6 @@ def test_labels_go_with_the_clips(format, three, tmp_path):
         assert read["train", "person_0001"].labels["mood"] == "wild"
 
 
-@pytest.mark.parametrize("format", ["bvh", "amass"])
-def test_everybody_keeps_their_own_body(format, three, tmp_path):
-    """Bones of several people differ by centimetres; inverse kinematics is within one."""
-    write_motion(tmp_path / "many", three, format)
-    for clip in three.clips[:2]:
-        path = tmp_path / "many" / clip.split / f"{clip.name}{'.bvh' if format == 'bvh' else '.npz'}"
-        read = read_motion(path, onto=WALKER).clips[0].positions
-        (alone,) = write_motion(tmp_path / f"a{path.suffix}", MotionSet([clip], WALKER), format)
-        np.testing.assert_array_equal(read, read_motion(alone, onto=WALKER).clips[0].positions)
-        if format == "bvh":
-            assert np.linalg.norm(read - clip.positions, axis=-1).max() < 0.01
-
-
 @pytest.mark.parametrize("older", [False, True], ids=["own files", "files of the folder"])
 def test_archives_of_one_folder_keep_their_skeletons_and_labels(older, three, tmp_path):
     save(tmp_path / "a.npz", MotionSet([replace(clip, labels={"mood": "glad"}) for clip in three], WALKER))
@@ -161,28 +145,6 @@ def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, 
     ]
     for wrong in (["convert", told[2]], ["info", *told[2:]], ["get", "cmu2", *told[3:5]], [*told[1:], "--url", "x"]):
         assert main(["data", *wrong]) == 2
-
-
-def test_forecasts_are_bvh_where_the_clip_is_if_the_protocol_keeps_the_root(tmp_path, capsys):
-    people = simulate(clips=6, frames=80, seed=1)
-    save(tmp_path / "people.npz", people)
-    protocol = replace(PROTOCOLS["simulated-trajectories"], observed=3, predicted=5, test_stride=40)
-    data = MotionData.open(tmp_path / "people.npz", protocol)
-    training = dvae.Training(steps=1, batch_size=2, progress=False)
-    dvae.fit(dvae.method("vae", latent=2, warm_up=1), data, out=tmp_path / "run", **vars(training))
-    one = ["--samples", "1"]
-    assert main(["forecast", str(tmp_path / "run"), "--out", str(tmp_path / "all"), *one]) == 0
-    assert "removes" not in capsys.readouterr().err
-    assert main(["forecast", str(tmp_path / "run"), "--out", str(tmp_path / "one.bvh"), *one]) == 0
-    written = [*(tmp_path / "all").rglob("*.bvh"), tmp_path / "one.bvh"]
-    roots = [read_motion(path, onto=WALKER, metres=0.01).clips[0].positions[:3, WALKER.root] for path in written]
-    true = {
-        f"{clip}-{start}-0": people[split, clip].positions[start : start + 3, WALKER.root]
-        for split, clip, start in data.windows("test").keys
-    }
-    for path, root in zip(written[:-1], roots, strict=False):
-        np.testing.assert_allclose(root, true[path.stem], atol=1e-4)
-    assert any(np.allclose(roots[-1], each, atol=1e-4) for each in true.values())
 
 
 def test_forecasts_of_a_run_are_bvh(run, tmp_path, capsys):

@@ -24,17 +24,6 @@ def written(data):
     return json.dumps(replace(data, warped=True).schema.config())
 
 
-def test_frames_of_a_segment_are_made_once(monkeypatch):
-    made, seen = [], motion.TimedFrames._seen
-    monkeypatch.setattr(motion.TimedFrames, "_seen", lambda *given: made.append(len(given[1])) or seen(*given))
-    data = SegmentData("simulated", PEOPLE, scaling="deviation")
-    train, validation = data.windows("train"), data.windows("validation")
-    assert data.schema == train.schema
-    assert data.windows("train").all() is train.all()
-    assert sum(made) == len(train) + len(validation)
-    assert torch.equal(train.timed.to(train.motion)["x"], train.all()["x"])
-
-
 def test_splits_are_by_take_and_leave_nothing_out_and_segments_have_names(data):
     windows = {split: data.windows(split) for split in ("train", "validation", "test")}
     found = {split: {clip.labels["source"] for clip in each.motion} for split, each in windows.items()}
