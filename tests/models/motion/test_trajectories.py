@@ -121,19 +121,6 @@ def test_every_joint_is_given_over_a_whole_window_or_not_at_all(windows):
     assert not torch.equal(shown[0], shown[1])
 
 
-def test_hidden_entries_are_unknown_to_the_guide(windows):
-    model, x = build(windows), windows.sample(2, torch.Generator().manual_seed(0))["x"].double()
-    mask = torch.ones_like(x, dtype=torch.bool)
-    mask[:, 5:, 3:9] = False
-    path = torch.zeros_like(x)
-    path[..., 6:12] = x[..., 6:12]  # of a joint that is hidden, and of another one
-    both = model.read({"x": x, "y": path, "mask": mask})
-    assert torch.equal(both["r"], torch.where((path == 0) & mask, x, 0.0)[:, 1:])
-    found = model.read({"x": x, "mask": mask})
-    assert (found["r"][:, 4:, 3:9] == 0).all()
-    assert torch.equal(found["mask"]["x"], mask[:, 1:])
-
-
 # -------------------------------------------------------------------------------------------------------- forecasts
 
 

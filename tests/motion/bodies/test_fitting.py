@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion import Clip, MotionSet, Skeleton, TimedFrames, gait_cycles, read_motion, simulate
+from dvae.motion import Clip, MotionSet, Skeleton, read_motion, simulate
 from dvae.motion.bodies import SHAPE, Body, betas, fitted, fitting, human, retargeted, shapes_of
 from dvae.motion.files.reading import chosen
 from dvae.motion.geometry import rotations
 from dvae.motion.naming import sides
 from dvae.motion.scoring.matching import parts
-from dvae.motion.segments.frames import OFFSETS
 
 PERSON = human()
 OWN = parts(PERSON.names)
@@ -153,21 +152,6 @@ def test_it_does_not_matter_which_axis_is_up(walkers, on_body):
 
 
 # ------------------------------------------------------------------------------------------------- the way it travels
-
-
-def test_frames_and_cycles_bring_back_joints_and_shapes(on_body):
-    shape = shapes_of(on_body, PERSON)
-    torch.testing.assert_close(joints_of(on_body, shape), positions(on_body), atol=5e-6, rtol=0)
-    view = TimedFrames.of(on_body)
-    seen = view.to(on_body)
-    torch.testing.assert_close(PERSON.shape_of(seen[OFFSETS].double()), shape, atol=1e-5, rtol=0)
-    again = view.back(seen)
-    torch.testing.assert_close(shapes_of(again, PERSON), shape, atol=1e-5, rtol=0)
-    assert (positions(again) - positions(on_body)).norm(dim=-1).max() < 2e-3
-    cycles = gait_cycles(on_body)
-    names = [clip.name for clip in on_body]
-    expected = shape[[names.index(clip.labels["source"]) for clip in cycles]]
-    torch.testing.assert_close(shapes_of(cycles, PERSON), expected, atol=1e-5, rtol=0)
 
 
 # -------------------------------------------------------------------------------------------------------- retargeting

@@ -18,7 +18,6 @@ from dvae.cli.app import COMMANDS, command
 from dvae.cli.console import Missing
 from dvae.cli.help import Expert
 from dvae.data.sequences import gapped, past_of
-from dvae.inference.diagnostics.checks import STATISTICS
 from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.held import clip_places
 from dvae.inference.evaluation.references import distances, last_value
@@ -275,24 +274,6 @@ def test_what_is_forecast_in_gaps_changes_no_score_and_the_truth_errs_in_nothing
     for name in ("ADE", "FDE", "bone-length error", *(name for name in measures if name.startswith("limb"))):
         within = 0.1 if "angle" in name else 1e-4
         assert measures[name].function(real, truth, past, index).abs().max() < within, name
-
-
-def test_statistics_are_of_what_was_observed():
-    """A coordinate that was never observed might as well not be there; of bodies, a bone or the last frames."""
-    x = torch.randn(3, 20, 4).cumsum(1).double()
-    gaps = x.clone()
-    gaps[..., 2] = torch.nan
-    for statistic in STATISTICS.values():
-        torch.testing.assert_close(statistic.function(gaps), statistic.function(x[..., [0, 1, 3]]))
-    windows = motion.windows(PEOPLE, motion.PROTOCOLS["simulated"], "test")
-    x = windows.all()["x"]
-    gaps, toe = x.clone(), WALKER.names.index("Head") - 1  # an end, so that one bone goes with it
-    gaps[:, 60:], gaps[..., 3 * toe : 3 * toe + 3] = torch.nan, torch.nan
-    found = {name: statistic.function(gaps) for name, statistic in motion.statistics(windows).items()}
-    lengths = WALKER.bone_lengths(windows.positions(x[:, :60]))
-    kept = [n for n, (_, child) in enumerate(WALKER.edges) if child != toe + 1]
-    torch.testing.assert_close(found["bone length"], lengths[..., kept].mean((1, 2)))
-    assert all(value.isfinite().all() for value in found.values())
 
 
 def test_what_needs_whole_bodies_says_what_to_do():

@@ -51,19 +51,6 @@ def test_wavers_raise_the_hand_that_the_truth_names(people, positions):
         assert ((above[frames] > 0) == raised).mean() > 0.95
 
 
-def test_labels_and_truth_tell_the_same_story(people):
-    for clip in people:
-        activity = clip.truth["activity"]
-        said = np.full(len(activity), -1)
-        for switch in clip.labels["switches"].split():
-            name, frame = switch.split("@")
-            said[int(frame) :] = ACTIVITIES.index(name)
-        np.testing.assert_array_equal(said, activity)
-        assert clip.labels["activity"] == ACTIVITIES[activity[0]]
-        np.testing.assert_allclose(clip.truth["weights"].sum(1), 1)
-        assert 1.2 < float(clip.labels["height_m"]) < 2.3
-
-
 class TestFigures:
     @pytest.mark.parametrize(("K", "past_frames", "H"), [(1, 1, 1), (5, 15, 60)])
     def test_futures_draw_past_samples_and_truth(self, positions, K, past_frames, H):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvae.motion.files.amc import read_amc, read_asf, read_expmap
+from dvae.motion.files.amc import read_amc, read_expmap
 
 LEGS = [f"{side}{bone}" for side in "lr" for bone in ("femur", "tibia", "foot", "toes")]
 ARMS = [f"{side}{bone}" for side in "lr" for bone in ("humerus", "radius", "hand")]
@@ -99,18 +99,6 @@ def test_what_is_damaged_is_refused_with_its_place(file, old, new, message, tmp_
     with pytest.raises(ValueError, match=message) as error:
         read_amc(tmp_path / "a.amc")
     assert str(tmp_path / f"a.{file}") in str(error.value)
-
-
-def test_a_chain_of_many_bones_is_no_matter(tmp_path):
-    bone = "begin\nname b{}\ndirection 0 1 0\nlength 1\nend\n"
-    chain = "".join(f"{'b' + str(i - 1) if i else 'root'} b{i}\n" for i in range(499))
-    text = ":bonedata\n" + "".join(bone.format(i) for i in range(499)) + ":hierarchy\nbegin\n" + chain
-    (tmp_path / "a.asf").write_text(text)
-    (tmp_path / "a.amc").write_text("1\nroot 0 0 0 0 0 0\n")
-    assert read_amc(tmp_path / "a.amc").positions[0, -1].tolist() == [0, 499, 0]
-    (tmp_path / "a.asf").write_text(text + "b498 c0\n")
-    with pytest.raises(ValueError, match="'c0', which is no bone"):
-        read_asf(tmp_path / "a.asf")
 
 
 def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):

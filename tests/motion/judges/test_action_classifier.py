@@ -91,20 +91,6 @@ def run(file, tmp_path_factory):
 # The classifier
 
 
-def test_windows_come_with_the_class_of_their_clip():
-    test = windows("test")
-    classes = test.classified("c", "way", ("down", "up"))
-    batch = classes.all()
-    assert [("down", "up")[c] for c in batch["c"].tolist()] == test.labels("way")
-    assert torch.equal(batch["x"], test.all()["x"])
-    drawn = classes.sample(50, torch.Generator().manual_seed(2))
-    up = test.positions(drawn["x"])[:, 0, test.skeleton.names.index("Head"), 1] > 0
-    assert torch.equal(drawn["c"], up.long())
-    assert torch.equal(drawn["x"], test.sample(50, torch.Generator().manual_seed(2))["x"])
-    assert classes.fingerprint not in (test.fingerprint, test.classified("c", "way", ("up", "down")).fingerprint)
-    assert "c" not in test.all()
-
-
 def test_its_bound_is_the_log_likelihood_of_the_class_from_the_predicted_frames():
     test, model = windows("test"), classifier()
     batch = ActionClassifier(**SMALL, classes=model.classes).train(test).batches.all()

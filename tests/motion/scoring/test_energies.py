@@ -84,13 +84,6 @@ class TestEveryEnergy:
         assert gradient(energy(samples, **given), samples).any()
 
     @every_energy
-    def test_moves_with_the_sequences(self, energy):
-        samples, order = normal(S, B, T, D), torch.tensor([2, 0, 1])
-        values = energy(samples, **SEQUENCES)
-        permuted = energy(samples[:, order], **{name: x[order] for name, x in SEQUENCES.items()})
-        torch.testing.assert_close(permuted, values[order])
-
-    @every_energy
     def test_limbs_without_length_give_no_nan(self, energy):
         samples = torch.zeros(S, B, T, D, dtype=torch.float64)
         samples[:, 0] = normal(T, D)

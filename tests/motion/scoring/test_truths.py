@@ -116,24 +116,6 @@ def test_the_past_is_the_windows_own_and_the_rest_is_zero(windows, truths):
     assert (valid.int().diff(dim=1) <= 0).all()  # real ones first
 
 
-def test_a_future_keeps_its_distance_from_the_windows_own(windows):
-    x = windows.all(STRIDE)["x"][:20]
-    for minimum, own in ((0.0, True), (1e-3, False)):
-        pseudo, valid = PseudoTruths(windows, NEAR, minimum, most=60, stride=STRIDE).of(x, generator())
-        distances = (pseudo - x[:, None])[:, :, OBSERVED:].unflatten(-1, (-1, 3)).norm(dim=-1).mean((2, 3))
-        assert ((distances < 1e-3) & valid).any(1).tolist() == [own] * 20
-
-
-def test_the_draw_follows_the_generator_and_leaves_it_alone(windows, truths):
-    x, own = drawn(windows, 40), generator(3)
-    state = own.get_state()
-    first, again, other = truths.of(x, own), truths.of(x, own), truths.of(x, generator(4))
-    assert torch.equal(own.get_state(), state)
-    assert all(map(torch.equal, first, again))
-    assert torch.equal(first[1], other[1])  # another draw, as many
-    assert not torch.equal(first[0], other[0])
-
-
 def test_limbs_without_length_make_no_nan(people):
     clips = []
     for clip in people:

@@ -59,22 +59,6 @@ def test_segments_together_are_seen_as_each_alone(people, warped):
     torch.testing.assert_close(resting_offsets(some).float(), together[OFFSETS], atol=0, rtol=0)
 
 
-def test_units_are_those_of_the_segments(people):
-    view = TimedFrames.of(people)
-    x = view.to(people)["x"]
-    place = x[..., view.parts["place"]]
-    assert (place[:, 0] == 0).all()
-    torch.testing.assert_close(place.abs().max(), torch.tensor(1.0))
-    torch.testing.assert_close(x[:, 1:, -1], torch.ones(len(people), 99))
-    still = replace(people, clips=[replace(people.clips[0], rotations=np.tile([1.0, 0, 0, 0], (91, 17, 1)))])
-    faced = people.skeleton.heading(torch.from_numpy(still.clips[0].positions[0]).double())
-    turns = view.to(still)["x"][0, :, view.parts["turns"]].unflatten(-1, (-1, 6))
-    root = view.turning.index(people.skeleton.root)
-    others = [place for place in range(turns.shape[1]) if place != root]
-    torch.testing.assert_close(turns[:, others], torch.zeros(100, len(others), 6), atol=1e-6, rtol=0)
-    assert (turns[:, root].abs().max() > 1e-3) == (abs(float(faced)) > 1e-3)
-
-
 def test_the_heading_alone_is_taken_from_the_first_frame(people):
     view = TimedFrames.of(people)
     seen = view.to(people)
