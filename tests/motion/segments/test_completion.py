@@ -98,7 +98,7 @@ def test_moments_are_met_in_decoded_time(model):
 )
 def test_what_the_decoder_made_is_found_again(model, kind, options):
     """A mode is no less probable than the truth; of points, which do not tell how they belong, it is as near."""
-    z, shape, x = made(model, 3)
+    z, shape, x = made(model, 2)
     seen = glimpsed(model, x, shape, kind, **options)
     found = complete(model, seen, descent=THOROUGH)
     if kind == "points":

@@ -131,8 +131,8 @@ def test_what_cannot_be_cut_is_refused():
 
 def test_two_sources_get_one_tree_and_rest_poses_of_their_own(real):
     bandai, cmu = real("bandai/bandai2.npz"), real("cmu/cmu8.npz")
-    bandai = MotionSet([clip for clip in bandai if clip.labels["content"] == "walk"][::10], bandai.skeleton, "bandai")
-    cmu = MotionSet([clip for clip in cmu if clip.labels["content"] == "walking"], cmu.skeleton, "cmu")
+    bandai = MotionSet([clip for clip in bandai if clip.labels["content"] == "walk"][::40], bandai.skeleton, "bandai")
+    cmu = MotionSet([clip for clip in cmu if clip.labels["content"] == "walking"][::4], cmu.skeleton, "cmu")
     first, second = alike(bandai, cmu)
     assert (first.skeleton.names, first.skeleton.parents) == (second.skeleton.names, second.skeleton.parents)
     assert first.skeleton.rest != second.skeleton.rest
