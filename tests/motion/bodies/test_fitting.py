@@ -151,9 +151,6 @@ def test_it_does_not_matter_which_axis_is_up(walkers, on_body):
     torch.testing.assert_close(positions(again), positions(on_body), atol=1e-5, rtol=0)
 
 
-# ------------------------------------------------------------------------------------------------- the way it travels
-
-
 # -------------------------------------------------------------------------------------------------------- retargeting
 
 

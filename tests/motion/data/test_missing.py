@@ -18,6 +18,7 @@ from dvae.cli.app import COMMANDS, command
 from dvae.cli.console import Missing
 from dvae.cli.help import Expert
 from dvae.data.sequences import gapped, past_of
+from dvae.inference.diagnostics.checks import STATISTICS
 from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.held import clip_places
 from dvae.inference.evaluation.references import distances, last_value
@@ -276,6 +277,24 @@ def test_what_is_forecast_in_gaps_changes_no_score_and_the_truth_errs_in_nothing
         assert measures[name].function(real, truth, past, index).abs().max() < within, name
 
 
+def test_statistics_are_of_what_was_observed():
+    """A coordinate that was never observed might as well not be there; of bodies, a bone or the last frames."""
+    x = torch.randn(3, 20, 4).cumsum(1).double()
+    gaps = x.clone()
+    gaps[..., 2] = torch.nan
+    for statistic in STATISTICS.values():
+        torch.testing.assert_close(statistic.function(gaps), statistic.function(x[..., [0, 1, 3]]))
+    windows = motion.windows(PEOPLE, motion.PROTOCOLS["simulated"], "test")
+    x, head = windows.all()["x"], WALKER.find("Head")  # an end, so that one bone goes with it
+    gaps = x.clone()
+    gaps[:, 60:], gaps[..., 3 * head - 3 : 3 * head] = torch.nan, torch.nan
+    found = {name: statistic.function(gaps) for name, statistic in motion.statistics(windows).items()}
+    kept = [n for n, (_, child) in enumerate(WALKER.edges) if child != head]
+    lengths = WALKER.bone_lengths(windows.positions(x[:, :60]))[..., kept]
+    torch.testing.assert_close(found["bone length"], lengths.mean((1, 2)))
+    assert all(value.isfinite().all() for value in found.values())
+
+
 def test_what_needs_whole_bodies_says_what_to_do():
     windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
     with pytest.raises(ValueError, match=r"features of whole futures, but these windows lack joints.*dvae impute"):
@@ -461,7 +480,7 @@ def fitted(gaps, tmp_path_factory):
     return run
 
 
-def test_commands_forecast_show_and_fill_motion_with_gaps(fitted, tmp_path, capsys):
+def test_commands_forecast_show_and_fill_motion_with_gaps(fitted, tmp_path):
     assert json.loads(Path(fitted, "config.json").read_text())["data"]["missing"] is True
     futures, page, filled = (str(tmp_path / name) for name in ("f.npz", "r.html", "i.npz"))
     assert main(["forecast", fitted, "--out", futures, "--samples", "2"]) == 0

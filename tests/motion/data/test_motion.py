@@ -367,6 +367,13 @@ class TestWindows:
         ):
             with pytest.raises(ValueError, match=message):
                 windows(motion(), protocol, split, length)
+        for change, message in (
+            ({"observed": 0}, "observed is 0"),
+            ({"heading": True, "rotate": True}, "choose one"),
+            ({"sampling": "uniform"}, "unknown sampling 'uniform'; known: clip, length, subject"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                replace(TINY, **change)
         with pytest.raises(ValueError, match="stride is -1"):
             windows(motion(), TINY, "test").all(-1)
 

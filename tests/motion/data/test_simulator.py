@@ -62,3 +62,13 @@ class TestFigures:
         key = [text.get_text() for text in ax.get_legend().get_texts()]
         assert key == ["observed", "what happened", f"{K} sample{'s' * (K > 1)}"]
         assert ax.get_xticklabels()[-1].get_text() == f"+{H / 30:.1f} s"
+
+    def test_given_paths_are_crosses_where_the_joints_should_be(self, positions):
+        samples, wrist = positions[:1, 5:65], WALKER.find("LWrist")
+        path = samples[0, :, wrist].copy()
+        ax = futures(WALKER, positions[1, :5], samples, frames=3, paths={"left_wrist": path})
+        bone = next(b for b, (_, child) in enumerate(WALKER.edges) if child == wrist)
+        for drawn, line in zip(ax.collections[2:4], ax.lines[:2], strict=True):
+            np.testing.assert_allclose(line.get_xydata()[0], drawn.get_segments()[bone][1])
+        with pytest.raises(ValueError, match=r"expected a path \(60, 3\) of LWrist"):
+            futures(WALKER, positions[1, :5], samples, paths={"LWrist": path[:9]})

@@ -311,6 +311,16 @@ def test_recordings_that_nobody_divided_are(people):
         alone.divided(1)
 
 
+def test_one_recording_of_ones_own_has_windows_of_every_split(tmp_path):
+    people = simulate(1, 500)
+    write_motion(tmp_path / "own.bvh", MotionSet([replace(people.clips[0], split="all")], people.skeleton))
+    opened = MotionData.open(tmp_path / "own.bvh")
+    assert (opened.protocol.observed, opened.protocol.predicted, opened.protocol.fps) == (15, 60, 30)
+    assert all(len(opened.windows(split)) for split in ("train", "validation", "test"))
+    again = MotionData.reopened(opened.recorded(), opened.schema)
+    assert (again.protocol, again.fingerprint) == (opened.protocol, opened.fingerprint)
+
+
 @pytest.mark.parametrize("representation", ["positions", "6d"])
 def test_other_data_are_put_onto_the_skeleton_of_a_run(representation, tmp_path):
     protocol = replace(PROTOCOLS["simulated"], representation=representation)
