@@ -83,6 +83,11 @@ class TestSkeleton:
         with pytest.raises(ValueError, match=message):
             Skeleton(**fields)
 
+    def test_a_file_that_is_no_skeleton_is_an_error(self, tmp_path):
+        (tmp_path / "s.json").write_text('{"joints": 3}')
+        with pytest.raises(ValueError, match="expected JSON with joint_names and parents"):
+            Skeleton.from_json(tmp_path / "s.json")
+
 
 def damaged(change):
     positions = people((10,))[0].positions.astype(np.float32)
@@ -179,6 +184,19 @@ class TestArchive:
             read_motion(path, skeleton=WALKER)
         assert not (tmp_path / "pwned").exists()
 
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            (pickle.dumps([1, 2]), "no dictionary of dictionaries"),
+            (pickle.dumps({"train": {}}), "no clips"),
+            (pickle.dumps({"a": 1})[:-3], "damaged pickle"),
+            (b"\x80\x04\x8e" + (2**60).to_bytes(8, "little"), "damaged pickle"),
+        ],
+    )
+    def test_other_contents_are_explained(self, tmp_path, content, message):
+        with pytest.raises(ValueError, match=message):
+            read_motion(archive(tmp_path / "a.npz", content), skeleton=WALKER)
+
     def test_a_pickle_outside_positions_3d_is_refused_unread(self, tmp_path):
         path = archive(tmp_path / "a.npz", pickle.dumps(Evil()), name="train/walk")
         with pytest.raises(ValueError, match="train/walk: holds pickled objects"):
@@ -228,6 +246,22 @@ class TestPlain:
         rest = np.repeat(people()[0].positions[:1].astype(np.float32), frames, 0)
         save(tmp_path / "a.npz", MotionSet([Clip("train", "rest", rest)], WALKER))
         assert read_motion(tmp_path / "a.npz").clips[0].positions.shape == rest.shape
+
+    def test_the_known_archives_need_no_skeleton(self, tmp_path):
+        random = np.random.default_rng(0)
+        wide, narrow = (random.uniform(-0.8, 0.8, (9, joints, 3)).astype(np.float32) for joints in (32, 15))
+        for name, nested in (
+            ("h36m", {"S1": {"Walking": wide}, "S11": {"Eating 1": wide}}),
+            ("humaneva", {"Train/S1": {"Jog 1": narrow}, "Validate/S3": {"Box 1": narrow}}),
+            ("stranger", {"S1": {"Walking": narrow}}),
+        ):
+            np.savez(tmp_path / f"{name}.npz", positions_3d=np.array(nested, dtype=object))
+        human36m, humaneva = read_motion(tmp_path / "h36m.npz"), read_motion(tmp_path / "humaneva.npz")
+        assert (human36m.skeleton, humaneva.skeleton) == (HUMAN36M, HUMANEVA)
+        np.testing.assert_array_equal(human36m.clips[0].positions, wide[:, list(HUMAN36M_KEPT)])
+        np.testing.assert_array_equal(humaneva.clips[1].positions, narrow)
+        with pytest.raises(ValueError, match=r"skeleton\.json into its folder"):
+            read_motion(tmp_path / "stranger.npz")
 
     def test_labels_are_found_by_split_and_clip(self, tmp_path):
         save(tmp_path / "a.npz", motion())
