@@ -60,16 +60,6 @@ def test_bones_are_kept_where_the_path_leaves_the_choice():
     assert torch.allclose(corrections, torch.zeros(()).double())
 
 
-def test_a_bone_without_length_is_free():
-    drawn = torch.zeros(1, 6, dtype=torch.float64)
-    known = torch.tensor([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0]], dtype=torch.float64)
-    paths = torch.full((1, 6), 0.3, dtype=torch.float64)
-    one, bones = torch.ones(6, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    found = bend(lambda z: z[:, None], drawn, one, paths, known, POINT, bones)[0][0, 0]
-    assert torch.allclose(found[3:], paths[0, 3:])
-    assert torch.allclose(found[:3], torch.zeros(3, dtype=torch.float64), atol=1e-6)
-
-
 def test_corrections_come_and_go():
     """A decoder that nothing moves: around a known frame the correction is a bump, and 0 in the first pose."""
     known = torch.zeros(30, 6, dtype=torch.float64)
@@ -85,18 +75,3 @@ def test_corrections_come_and_go():
     assert (tip.diff()[14:] < 0).all()
     assert tip.diff().abs().max() < 0.05
     assert tip[0] < 0.005
-
-
-def test_motions_are_bent_one_by_one():
-    """What becomes of one does not depend on the others."""
-    torch.manual_seed(0)
-    weight, drawn, paths = double(24, 3), double(3, 3), double(4, 6)
-    known = torch.zeros(4, 6, dtype=torch.float64)
-    known[:, :3] = 1
-    one, bones = torch.ones(3, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
-
-    def bent(z):
-        return bend(lambda z: (z @ weight.T).unflatten(-1, (4, 6)), z, one, paths, known, POINT, bones, steps=5)[0]
-
-    # In one product of three rows or of one, sums may round otherwise; five steps hardly spread that.
-    torch.testing.assert_close(bent(drawn)[1:2], bent(drawn[1:2]), rtol=0, atol=1e-9)

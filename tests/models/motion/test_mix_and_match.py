@@ -60,16 +60,15 @@ def past(windows, rows=4):
 # -------------------------------------------------------------------------------------------------- the drawn indices
 
 
-@pytest.mark.parametrize(("share", "size", "chosen"), [(0, 7, 0), (0.3, 10, 3), (0.5, 7, 4)])
+@pytest.mark.parametrize(("share", "size", "chosen"), [(0, 7, 0), (0.3, 10, 3)])
 def test_a_subset_has_its_share_of_indices_all_alike_often(share, size, chosen):
-    torch.manual_seed(0)
     law = Subset(share).distribution(size)
     drawn = law.sample((4000,))
     assert (drawn.sum(-1) == chosen).all()
     np.testing.assert_allclose(drawn.mean(0), chosen / size, atol=0.04)
     different = np.unique(drawn.numpy(), axis=0)
     np.testing.assert_allclose(law.log_prob(drawn).exp() * len(different), 1, rtol=1e-5)
-    assert law.log_prob(1 - drawn[0]) == -torch.inf or 2 * chosen == size
+    assert law.log_prob(1 - drawn[0]) == -torch.inf
 
 
 def test_model_and_guide_share_one_set_of_indices_which_costs_nothing(windows):
@@ -138,7 +137,7 @@ def test_the_loss_is_of_quaternions_and_positions_and_the_annealed_kl(windows):
         torch.testing.assert_close(objective(terms, step), expected, rtol=1e-5, atol=0.02 * float(kl))
 
 
-@pytest.mark.parametrize("noise", ["mix", "add", "step"])
+@pytest.mark.parametrize("noise", ["mix", "add"])
 def test_every_way_is_trained_by_the_shared_loop_and_scored_in_metres(windows, noise):
     method = small(noise=noise)
     model = method.build(windows["train"])

@@ -199,9 +199,7 @@ def started(windows, run, **options):
     "change",
     [
         {"method": {"method": "cvae", "latent": 10**9}},
-        {"method": {"method": "nothing"}},
         {"method": [1, 2]},
-        {"schema": 3},
         {"schema": {"kind": "poses", "skeleton": {"names": ["a"]}, "protocol": {}, "length": None}},
     ],
 )

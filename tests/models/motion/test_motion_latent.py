@@ -1,6 +1,5 @@
 """The latent space of 4D motion: its two guides, its two phases, and what it makes of bodies."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -68,19 +67,3 @@ def test_training_has_two_phases_of_adaptive_weights(segments, tmp_path):
         assert not weights or sum(weights) == pytest.approx(len(weights))
     last = max((row for row in result.history if "weight/surface" in row), key=lambda row: row["step"])
     assert last["weight/surface"] != 1
-
-
-def test_segments_are_a_source_whose_frames_go_back_to_motion(segments):
-    batch = segments.all()
-    assert batch["x"].shape[1:] == (100, segments.timed.size)
-    drawn = segments.sample(3, torch.Generator().manual_seed(0))
-    assert {name: len(value) for name, value in drawn.items()} == {"x": 3, SHAPE: 3}
-    again = segments.back(batch["x"])
-    for clip, other in zip(segments.motion, again, strict=True):
-        frames = min(clip.frames, other.frames)
-        assert clip.frames - frames <= 1
-        assert np.abs(clip.positions[:frames] - other.positions[:frames]).max() < 2e-3
-    surface = made(segments).vertices(batch["x"], batch[SHAPE])
-    joints = segments.body.regressor @ segments.body.at_rest(batch[SHAPE])[0]
-    assert surface.shape == (len(segments), 100, 1486, 3)
-    assert joints.shape == (len(segments), 22, 3)

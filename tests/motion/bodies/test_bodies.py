@@ -36,10 +36,6 @@ def parts(body):
         part = spread
 
 
-def height(vertices):
-    return vertices[..., 1].amax(-1) - vertices[..., 1].amin(-1)
-
-
 # ------------------------------------------------------------------------------------------------------- the person
 
 
@@ -52,26 +48,6 @@ def test_every_part_of_the_person_is_closed_whoever_it_is():
         assert {(end, start) for start, end in found} == set(found)
         corners = torch.cartesian_prod(*[torch.tensor([-3.0, 3.0], dtype=torch.float64)] * len(SHAPE))
         assert (enclosed_volume(PERSON.at_rest(corners)[0], faces) > 0).all()
-
-
-def test_the_person_is_low_polygon_and_of_human_size():
-    vertices, joints = PERSON.at_rest(torch.zeros(8).double())
-    assert 500 <= len(vertices) <= 1500
-    assert PERSON.faces.unique().tolist() == list(range(len(vertices)))
-    assert 1.6 < height(vertices) < 1.8
-    assert 0.05 < enclosed_volume(vertices, PERSON.faces) < 0.08  # cubic metres of 50 to 80 kg
-    mirror = [PERSON.names.index(name.translate(str.maketrans("LR", "RL"))) for name in PERSON.names]
-    torch.testing.assert_close(joints[mirror] * torch.tensor([-1.0, 1, 1]).double(), joints)
-
-
-@pytest.mark.parametrize("name", SHAPE)
-def test_volume_and_height_grow_with_their_parameters(name):
-    shapes = torch.zeros(13, len(SHAPE), dtype=torch.float64)
-    shapes[:, SHAPE.index(name)] = torch.linspace(-3, 3, 13)
-    vertices = PERSON.at_rest(shapes)[0]
-    assert (enclosed_volume(vertices, PERSON.faces).diff() > 0).all()
-    if name in ("size", "legs", "torso", "head"):
-        assert (height(vertices).diff() > 0).all()
 
 
 @pytest.mark.parametrize(
@@ -91,27 +67,7 @@ def test_a_length_is_changed_by_its_parameter_and_by_size_alone(name, ends):
     assert {SHAPE[k] for k in moved.nonzero()} == {"size", name}
 
 
-def test_vertices_go_with_few_joints_near_them():
-    weights = PERSON.weights
-    torch.testing.assert_close(weights.sum(1), torch.ones(len(weights)).double(), atol=1e-6, rtol=0)
-    assert (weights >= 0).all()
-    assert (weights > 0).sum(1).max() <= 4
-    for side, other in (("L_", "R_"), ("R_", "L_")):
-        arm = weights[:, PERSON.names.index(f"{side}Elbow")] > 0
-        others = [joint for joint, name in enumerate(PERSON.names) if name.startswith(other)]
-        assert arm.any()
-        assert not weights[arm][:, others].any()
-
-
 # --------------------------------------------------------------------------------------------------------- skinning
-
-
-def test_no_turns_and_no_shape_are_the_template():
-    unturned = torch.eye(3).double().expand(1, T, PERSON.joints, 3, 3)
-    vertices, joints = PERSON(torch.zeros(1, 8).double(), unturned, torch.zeros(1, T, 3).double())
-    torch.testing.assert_close(vertices, PERSON.template.expand(1, T, -1, 3))
-    torch.testing.assert_close(joints, (PERSON.regressor @ PERSON.template).expand(1, T, -1, 3))
-    torch.testing.assert_close(joints[..., 0, :], torch.zeros(1, T, 3).double())  # the pelvis
 
 
 def test_joints_are_those_of_forward_kinematics():
@@ -120,19 +76,6 @@ def test_joints_are_those_of_forward_kinematics():
     offsets = pivots - pivots[:, [max(parent, 0) for parent in PERSON.parents]]
     expected, _ = kinematics.forward(PERSON.parents, turns, offsets[:, None], pivots[:, None, 0] + translation)
     torch.testing.assert_close(PERSON(shape, turns, translation)[1], expected)
-
-
-def test_what_goes_with_one_joint_moves_rigidly_with_it():
-    """Every vertex keeps its place as seen from its joint, and so its distances to all that go with the same one."""
-    bones = torch.arange(len(PERSON.template)) % PERSON.joints
-    weights = torch.nn.functional.one_hot(bones, PERSON.joints).double()
-    body = Body(PERSON.names, PERSON.parents, PERSON.template, PERSON.shapes, PERSON.regressor, weights, PERSON.faces)
-    shape, turns, translation = poses()
-    resting, pivots = body.at_rest(shape)
-    vertices, joints = body(shape, turns, translation)
-    world = kinematics.forward(body.parents, turns, torch.zeros(22, 3).double(), translation)[1]
-    seen = (world[:, :, bones].mT @ (vertices - joints[:, :, bones])[..., None]).squeeze(-1)
-    torch.testing.assert_close(seen, (resting - pivots[:, bones])[:, None].expand_as(seen))
 
 
 def test_a_surface_is_the_weighted_sum_of_rigid_ones():
@@ -148,30 +91,11 @@ def test_a_surface_is_the_weighted_sum_of_rigid_ones():
     torch.testing.assert_close(vertices, expected)
 
 
-def test_turning_the_root_turns_everything_about_it():
-    shape, turns, translation = poses()
-    turn = rotations.to_matrix(torch.tensor([0.3, -1.2, 0.8], dtype=torch.float64), "vector")
-    vertices, joints = PERSON(shape, turns, translation)
-    turns[:, :, 0] = turn @ turns[:, :, 0]
-    root = joints[:, :, :1]
-    torch.testing.assert_close(PERSON(shape, turns, translation)[0], (vertices - root) @ turn.T + root)
-
-
 def test_whoever_walks_far_keeps_the_same_surface():
     """But for rounding places so far away, 2^-24 of them each time; weights that add up to 1 - 1e-7 stretch nobody."""
     body, (shape, turns, translation) = human(), (tensor.float() for tensor in poses())
     near, far = (body(shape, turns, translation + move)[0] for move in (0, 1024))
     torch.testing.assert_close(far - 1024, near, atol=3 * 1024 / 2**24, rtol=0)
-
-
-def test_a_batch_is_one_by_one():
-    shape, turns, translation = poses()
-    together = PERSON(shape, turns, translation)
-    for b in range(B):
-        for t in range(T):
-            alone = PERSON(shape[b], turns[b, t : t + 1], translation[b, t : t + 1])
-            for one, many in zip(alone, together, strict=True):
-                torch.testing.assert_close(one[0], many[b, t])
 
 
 def test_gradients_are_right():
@@ -284,17 +208,12 @@ def changed(name, change):
     ("change", "message"),
     [
         (lambda members: members.pop("weights"), "it lacks weights"),
-        (changed("v_template", lambda a: a[:-1]), "shapedirs holds"),
         (changed("v_template", lambda a: a + np.float32(np.nan)), "v_template holds numbers that are NaN"),
         (changed("shapedirs", lambda a: 1e30 * a), "beyond 1000"),
         (changed("shapedirs", lambda a: a[..., :2]), "2 parameters of shape, not 8"),
-        (changed("shapedirs", lambda a: a[..., 0]), "expected numbers"),
-        (changed("f", lambda a: a + 1), "hangs on what is not there"),
         (changed("f", lambda a: a - 1), "hangs on what is not there"),
-        (changed("f", lambda a: a[:0]), "f holds"),
         (changed("f", lambda a: a.astype(float)), "expected whole numbers"),
         (changed("weights", lambda a: 2 * a), "do not add up to 1"),
-        (changed("J_regressor", lambda a: 0 * a), "do not add up to 1"),
         (changed("J_regressor", lambda a: np.array({"sparse": 1})), "pickled objects"),
         (changed("kintree_table", lambda a: a[:, ::-1]), "its tree is not SMPL's"),
         (changed("kintree_table", lambda a: a[:, :5]), "expected whole numbers"),
@@ -309,27 +228,15 @@ def test_files_that_are_no_body_are_refused_in_a_sentence(tmp_path, change, mess
     assert "wrong.npz" in str(error.value)
 
 
-def test_an_array_larger_than_any_body_is_refused_before_it_is_read(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("limit", "most", "message"),
+    [("LARGEST", 100, "of a body at most 100"), ("MOST_VERTICES", 1000, "1,486 vertices, of a body at most 1,000")],
+)
+def test_a_file_larger_than_any_body_is_refused(tmp_path, monkeypatch, limit, most, message):
     write_body(tmp_path / "body.npz", human())
-    monkeypatch.setattr("dvae.motion.bodies.smplx.LARGEST", 100)
-    monkeypatch.setattr("dvae.motion.files.archive.Member.array", lambda self: pytest.fail("it was read"))
-    with pytest.raises(ValueError, match="of a body at most 100"):
+    monkeypatch.setattr(f"dvae.motion.bodies.smplx.{limit}", most)
+    with pytest.raises(ValueError, match=message):
         read_body(tmp_path / "body.npz")
-
-
-def test_a_body_of_too_many_vertices_is_refused(tmp_path, monkeypatch):
-    write_body(tmp_path / "body.npz", human())
-    monkeypatch.setattr("dvae.motion.bodies.smplx.MOST_VERTICES", 1000)
-    with pytest.raises(ValueError, match="1,486 vertices, of a body at most 1,000"):
-        read_body(tmp_path / "body.npz")
-
-
-def test_no_file_is_no_body(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_body(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("SMPL")
-    with pytest.raises(ValueError, match="damaged"):
-        read_body(tmp_path / "text.npz")
 
 
 def test_the_squared_error_is_that_of_vertices_though_none_is_made():

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from dvae.motion import Clip, MotionSet, Skeleton, TimedFrames, gait_cycles, read_motion, simulate
+from dvae.motion import Clip, MotionSet, Skeleton, read_motion, simulate
 from dvae.motion.bodies import SHAPE, Body, betas, fitted, fitting, human, retargeted, shapes_of
+from dvae.motion.files.reading import chosen
 from dvae.motion.geometry import rotations
 from dvae.motion.naming import sides
 from dvae.motion.scoring.matching import parts
-from dvae.motion.segments.frames import OFFSETS
 
 PERSON = human()
 OWN = parts(PERSON.names)
@@ -70,7 +70,7 @@ def recorded(real):
 
     def read(file):
         motion = real(file)
-        some = replace(motion, clips=motion.clips[:: -(-len(motion) // 20)])
+        some = replace(motion, clips=motion.clips[:: -(-len(motion) // 8)])
         return some, fitted(some, PERSON)
 
     return read
@@ -87,30 +87,6 @@ def test_offsets_tell_the_shape(dtype):
     torch.testing.assert_close(found, expected, atol=3e-5 if dtype == torch.float32 else 1e-9, rtol=0)
 
 
-def test_offsets_are_those_of_joints_at_rest():
-    expected = shapes(4).float()
-    joints = PERSON.at_rest(expected)[1]
-    above = [max(parent, 0) for parent in PERSON.parents]
-    torch.testing.assert_close(PERSON.offsets(expected), joints - joints[:, above])
-
-
-def test_what_joints_do_not_tell_is_nothing():
-    stout = torch.eye(len(SHAPE))[SHAPE.index("girth")]
-    torch.testing.assert_close(PERSON.shape_of(PERSON.offsets(stout)), torch.zeros(8), atol=1e-5, rtol=0)
-
-
-def test_one_body_has_one_shape_and_others_have_others(walkers):
-    cut = [
-        replace(part, name=f"{clip.name}-{n}")
-        for clip in walkers
-        for n, part in enumerate((clip.between(0, 50), clip.between(50, 91)))
-    ]
-    found = shapes_of(fitted(replace(walkers, clips=cut), PERSON), PERSON)
-    torch.testing.assert_close(found[::2], found[1::2], atol=1e-4, rtol=0)
-    assert torch.pdist(found[::2]).min() > 0.1
-    assert found.abs().max() < 3 + 1e-4
-
-
 def test_clips_together_are_put_onto_the_body_as_each_alone(walkers, monkeypatch):
     cut = [replace(part, name=f"{clip.name}-{n}") for clip in walkers for n, part in enumerate((clip, clip))]
     shape = shapes(6).repeat_interleave(torch.tensor([1, 3, 2, 2, 3, 1]), dim=0)
@@ -120,17 +96,6 @@ def test_clips_together_are_put_onto_the_body_as_each_alone(walkers, monkeypatch
         (alone,) = fitted(replace(walkers, clips=[clip]), PERSON, own)
         np.testing.assert_allclose(found.positions, alone.positions, atol=1e-6)
         np.testing.assert_allclose(found.rotations, alone.rotations, atol=1e-6)
-
-
-def test_a_body_is_fitted_to_the_lengths_of_bones():
-    """People of the body itself: their limbs are as long, within what a parameter of 2 costs."""
-    shape = shapes(10)
-    still = rotations.to_matrix(0.2 * torch.randn(10, 5, 22, 3), "vector")
-    made = moved(shape, still)
-    found = fitted(replace(made, clips=[replace(clip, rotations=None) for clip in made]), PERSON)
-    for start, end in LIMBS:
-        lengths = [(places(motion, end) - places(motion, start)).norm(dim=-1) for motion in (made, found)]
-        torch.testing.assert_close(*lengths, atol=0.015, rtol=0)
 
 
 # ------------------------------------------------------------------------------------------------------------- turns
@@ -154,16 +119,7 @@ def test_the_person_in_motion_is_found_where_the_spine_does_not_bend():
     torch.testing.assert_close(shapes_of(found, PERSON), shape, atol=1e-5, rtol=0)
 
 
-def test_the_spine_shares_a_turn():
-    """Bent by the same at each of its joints, it is found but for the neck being no straight way from the waist."""
-    shape, vectors = torch.zeros(1, 8), torch.zeros(1, 5, 22, 3)
-    vectors[:, :, [3, 6, 9]] = torch.linspace(0, 0.15, 5)[:, None, None] * torch.tensor([0.6, 0.8, 0.0])
-    motion = moved(shape, rotations.to_matrix(vectors, "vector"))
-    found = fitted(motion, PERSON, shape)
-    assert (positions(found) - positions(motion)).norm(dim=-1).max() < 0.03
-
-
-@pytest.mark.parametrize("file", ["bandai/bandai2.npz", "cmu/cmu8.npz", "simulated"])
+@pytest.mark.parametrize("file", ["bandai/bandai2.npz", "simulated"])
 def test_limbs_point_where_they_did_and_trunks_face_there(recorded, walkers, on_body, file):
     motion, found = (walkers, on_body) if file == "simulated" else recorded(file)
     for start, end in LIMBS:
@@ -172,16 +128,9 @@ def test_limbs_point_where_they_did_and_trunks_face_there(recorded, walkers, on_
         left, right = f"l {part}", f"r {part}"
         cosine = (bone(found, left, right) * bone(motion, left, right)).sum(-1)
         assert cosine.min() > np.cos(0.3)
-    hips, shoulders = (
-        [places(each, f"l {part}") + places(each, f"r {part}") for each in (motion, found)]
-        for part in ("hip", "shoulder")
-    )
-    torch.testing.assert_close(*hips, atol=2e-5, rtol=0)
-    trunks = [high - low for low, high in zip(hips, shoulders, strict=True)]
-    assert torch.cosine_similarity(*trunks, dim=-1).min() > np.cos(0.12)
 
 
-@pytest.mark.parametrize("file", ["bandai/bandai2.npz", "cmu/cmu8.npz", "simulated"])
+@pytest.mark.parametrize("file", ["cmu/cmu8.npz", "simulated"])
 def test_nothing_is_twisted(recorded, on_body, file):
     """Seen from the thigh, knees bend backwards, and seen from the upper arm, elbows forwards, within 45 degrees."""
     found = on_body if file == "simulated" else recorded(file)[1]
@@ -195,40 +144,6 @@ def test_nothing_is_twisted(recorded, on_body, file):
             assert (along / vectors.norm(dim=-1))[bent].min() > 0.7
 
 
-@pytest.mark.parametrize("file", ["bandai/bandai2.npz", "cmu/cmu8.npz"])
-def test_feet_that_stand_are_flat(recorded, file):
-    motion, found = recorded(file)
-    slopes = []
-    for clip, source in zip(found, motion, strict=True):
-        there = parts(motion.skeleton.names)
-        ends = [source.positions[:, there[f"l {part}"]] for part in ("ankle", "toe")]
-        speeds = [30 * np.linalg.norm(np.diff(end, axis=0), axis=-1) for end in ends]
-        still = np.maximum(*speeds) < 0.15
-        foot = (clip.positions[:, OWN["l toe"]] - clip.positions[:, OWN["l ankle"]])[1:][still]
-        slopes.append(np.arctan2(foot[:, 1], np.linalg.norm(foot[:, [0, 2]], axis=-1)))
-    joints = PERSON.at_rest(torch.zeros(8))[1]
-    rest = joints[OWN["l toe"]] - joints[OWN["l ankle"]]
-    assert abs(np.median(np.concatenate(slopes)) - float(torch.atan2(rest[1], rest[[0, 2]].norm()))) < 0.05
-
-
-def test_clavicles_that_begin_in_the_middle_tell_no_girdle(walkers, on_body):
-    """As in Acclaim's skeletons: bones from the chest to the shoulders, both from one place."""
-    tree = walkers.skeleton
-    names, parents = [*tree.names, "LClavicle", "RClavicle"], [*tree.parents, *[tree.find("Thorax")] * 2]
-    for side in "LR":
-        parents[names.index(f"{side}Shoulder")] = names.index(f"{side}Clavicle")
-    clips = [replace(clip, positions=clip.positions[:, [*range(17), *parents[17:]]]) for clip in walkers]
-    again = fitted(MotionSet(clips, Skeleton(names, parents, *sides(names))), PERSON)
-    torch.testing.assert_close(positions(again), positions(on_body), atol=1e-5, rtol=0)
-
-
-def test_what_is_on_the_body_stays(on_body):
-    again = fitted(on_body, PERSON)
-    torch.testing.assert_close(positions(again), positions(on_body), atol=1e-5, rtol=0)
-    for clip, other in zip(again, on_body, strict=True):
-        np.testing.assert_allclose(clip.rotations, other.rotations, atol=1e-6)
-
-
 def test_it_does_not_matter_which_axis_is_up(walkers, on_body):
     stood = [replace(clip, positions=clip.positions[..., [0, 2, 1]] * np.float32([1, -1, 1])) for clip in walkers]
     again = fitted(MotionSet(stood, replace(walkers.skeleton, up="z")), PERSON)
@@ -236,32 +151,7 @@ def test_it_does_not_matter_which_axis_is_up(walkers, on_body):
     torch.testing.assert_close(positions(again), positions(on_body), atol=1e-5, rtol=0)
 
 
-# ------------------------------------------------------------------------------------------------- the way it travels
-
-
-def test_frames_and_cycles_bring_back_joints_and_shapes(on_body):
-    shape = shapes_of(on_body, PERSON)
-    torch.testing.assert_close(joints_of(on_body, shape), positions(on_body), atol=5e-6, rtol=0)
-    view = TimedFrames.of(on_body)
-    seen = view.to(on_body)
-    torch.testing.assert_close(PERSON.shape_of(seen[OFFSETS].double()), shape, atol=1e-5, rtol=0)
-    again = view.back(seen)
-    torch.testing.assert_close(shapes_of(again, PERSON), shape, atol=1e-5, rtol=0)
-    torch.testing.assert_close(joints_of(again, shapes_of(again, PERSON)), positions(again), atol=5e-6, rtol=0)
-    assert (positions(again) - positions(on_body)).norm(dim=-1).max() < 2e-3
-    cycles = gait_cycles(on_body)
-    names = [clip.name for clip in on_body]
-    expected = shape[[names.index(clip.labels["source"]) for clip in cycles]]
-    torch.testing.assert_close(shapes_of(cycles, PERSON), expected, atol=1e-5, rtol=0)
-    torch.testing.assert_close(joints_of(cycles, expected), positions(cycles), atol=5e-6, rtol=0)
-
-
 # -------------------------------------------------------------------------------------------------------- retargeting
-
-
-def test_the_same_bodies_move_the_same(on_body):
-    again = retargeted(on_body, PERSON, shapes_of(on_body, PERSON))
-    torch.testing.assert_close(positions(again), positions(on_body), atol=1e-5, rtol=0)
 
 
 def test_other_bodies_make_the_same_turns_at_the_same_speed_in_legs(on_body):
@@ -277,20 +167,18 @@ def test_other_bodies_make_the_same_turns_at_the_same_speed_in_legs(on_body):
         np.testing.assert_allclose(clip.rotations, source.rotations, atol=1e-6)
         speeds = [np.diff(each.positions[:, 0], axis=0) / length for each, length in ((clip, leg), (source, before))]
         np.testing.assert_allclose(*speeds, atol=1e-5)
-        feet = [each.positions[:, [7, 8]].min(1)[:, 1] / length for each, length in ((clip, leg), (source, before))]
-        np.testing.assert_allclose(*feet, atol=0.03)  # in lengths of legs: shares of thigh and shin differ little
 
 
 def test_whoever_stands_stays_on_the_floor():
-    shape, other = shapes(20), shapes(20, 2)
-    unturned = torch.eye(3).expand(20, 3, 22, 3, 3)
+    shape, other = shapes(6), shapes(6, 2)
+    unturned = torch.eye(3).expand(6, 3, 22, 3, 3)
     low = -PERSON.at_rest(shape.float())[0][..., 1].amin(-1)
-    rise = torch.stack([torch.zeros(20), low, torch.zeros(20)], -1)[:, None].expand(20, 3, 3)
+    rise = torch.stack([torch.zeros(6), low, torch.zeros(6)], -1)[:, None].expand(6, 3, 3)
     standing = fitted(moved(shape, unturned, rise), PERSON, shape)
     made = retargeted(standing, PERSON, other)
     places = torch.from_numpy(np.stack([clip.positions[:, 0] for clip in made]))
     soles = PERSON(other.float(), unturned, places)[0][..., 1].amin(-1)
-    torch.testing.assert_close(soles, torch.zeros(20, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(soles, torch.zeros(6, 3), atol=1e-5, rtol=0)
 
 
 # -------------------------------------------------------------------------------------------------------------- AMASS
@@ -307,7 +195,6 @@ def test_files_of_amass_bring_turns_and_betas(tmp_path):
         np.savez(tmp_path / f"{n}.npz", poses=poses, trans=trans, gender=np.array("female"), **beside)
     motion = read_motion(tmp_path)
     torch.testing.assert_close(betas(motion), shape)
-    torch.testing.assert_close(betas(motion, 10)[:, 8:], torch.ones(2, 2).double())
     found = fitted(motion, PERSON, betas(motion))
     torch.testing.assert_close(shapes_of(found, PERSON), shape, atol=1e-5, rtol=0)
     exact, lying = deepcopy(PERSON).double(), torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()  # z to y
@@ -318,17 +205,12 @@ def test_files_of_amass_bring_turns_and_betas(tmp_path):
     assert fitted(motion, PERSON).skeleton.names == PERSON.names
 
 
-def test_betas_that_files_do_not_have_are_missed(walkers):
-    with pytest.raises(ValueError, match="has no betas, expected 8"):
-        betas(walkers)
-
-
 # ------------------------------------------------------------------------------------------------------ what is refused
 
 
 def test_what_cannot_be_put_onto_a_body_is_refused(walkers, on_body):
-    from dvae.motion.files.reading import chosen
-
+    with pytest.raises(ValueError, match="has no betas, expected 8"):
+        betas(walkers)
     armless = chosen(walkers, [name for name in walkers.skeleton.names if "Wrist" not in name])
     with pytest.raises(ValueError, match="has no l wrist, r wrist"):
         fitted(armless, PERSON)
@@ -339,13 +221,8 @@ def test_what_cannot_be_put_onto_a_body_is_refused(walkers, on_body):
         fitted(gaps, PERSON)
     with pytest.raises(ValueError, match=r"expected \(8,\) or \(6, 8\)"):
         retargeted(on_body, PERSON, torch.zeros(5, 8))
-    for function in (shapes_of, lambda *given: retargeted(*given, torch.zeros(8))):
-        with pytest.raises(ValueError, match="fitted puts it there"):
-            function(walkers.with_rotations(), PERSON)
-
-
-def test_a_body_without_known_joints_is_refused(walkers):
-    names = [f"joint {n}" for n in range(22)]
+    with pytest.raises(ValueError, match="fitted puts it there"):
+        shapes_of(walkers.with_rotations(), PERSON)
     tensors = [getattr(PERSON, name) for name in ("template", "shapes", "regressor", "weights", "faces")]
     with pytest.raises(ValueError, match="the body has no pelvis"):
-        fitted(walkers, Body(names, PERSON.parents, *tensors))
+        fitted(walkers, Body([f"joint {n}" for n in range(22)], PERSON.parents, *tensors))

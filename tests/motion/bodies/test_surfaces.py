@@ -29,6 +29,10 @@ def test_bodies_stand_apart_upright_and_face_the_viewer(up):
             assert ((box.min(0) > other.max(0)) | (box.max(0) < other.min(0))).any()
     assert [text.get_text() for text in ax.texts] == list("abcde")
     assert not any(text.get_parse_math() for text in ax.texts)
+    with pytest.raises(ValueError, match="4 names for 5 bodies"):
+        surfaces(PERSON.faces, people, names=list("abcd"))
+    with pytest.raises(ValueError, match="a face has corner"):
+        surfaces(PERSON.faces, people[:, :9])
 
 
 def test_what_faces_the_viewer_is_drawn_the_nearest_in_front():
@@ -49,18 +53,3 @@ def test_what_faces_the_viewer_is_drawn_the_nearest_in_front():
     assert middle(faces[:, ::-1], square) == (255, 255, 255)
     for order in ([faces, faces + 4], [faces + 4, faces]):
         assert middle(np.concatenate(order), both) == before
-
-
-@pytest.mark.parametrize(
-    ("faces", "vertices", "names", "message"),
-    [
-        (PERSON.faces, PERSON.template[:, :2], (), r"vertices \(P, V, 3\)"),
-        (PERSON.faces[:, :2], PERSON.template, (), r"faces \(F, 3\)"),
-        (PERSON.faces, PERSON.template.repeat(2, 1, 1), ("a",), "1 names for 2 bodies"),
-        (PERSON.faces, PERSON.template * torch.inf, (), "cannot be drawn"),
-        (PERSON.faces, PERSON.template[:9], (), "a face has corner"),
-    ],
-)
-def test_what_cannot_be_drawn_is_refused(faces, vertices, names, message):
-    with pytest.raises(ValueError, match=message):
-        surfaces(faces, vertices, names=names)

@@ -1,11 +1,10 @@
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
 
-from dvae.motion import PROTOCOLS, WALKER, simulate, windows
+from dvae.motion import WALKER, simulate
 from dvae.motion.data.simulator import ACTIVITIES
-from dvae.motion.drawing.plot import futures, pose
+from dvae.motion.drawing.plot import futures
 
 FEET = [WALKER.names.index(name) for name in ("LFoot", "RFoot")]
 
@@ -18,11 +17,6 @@ def people():
 @pytest.fixture(scope="module")
 def positions(people):
     return np.stack([clip.positions for clip in people]).astype(np.float64)
-
-
-def test_the_seed_decides_everything(people):
-    assert simulate(40, 150, seed=3).fingerprint() == people.fingerprint()
-    assert simulate(40, 150, seed=4).fingerprint() != people.fingerprint()
 
 
 def test_bones_are_rigid_within_a_clip_and_differ_between_people(people, positions):
@@ -43,30 +37,6 @@ def test_feet_stay_on_the_floor_and_do_not_slide(positions):
     assert np.median(np.take_along_axis(speed, standing, axis=2)) < 0.1
 
 
-def test_nobody_jumps(positions):
-    acceleration = np.linalg.norm(np.diff(positions, 2, axis=1), axis=-1) * WALKER.fps**2
-    assert acceleration.max() < 120
-
-
-def test_heads_are_above_and_walkers_move_where_they_face(people, positions):
-    head = WALKER.names.index("Head")
-    assert (positions[:, :, head, 1] > positions[:, :, FEET, 1].max(axis=2) + 0.5).all()
-    walking = np.stack([clip.truth["weights"][:, ACTIVITIES.index("walk")] for clip in people])[:, 1:] > 0.99
-    heading = np.stack([clip.truth["heading"] for clip in people])[:, 1:]
-    velocity = np.diff(positions[:, :, 0], axis=1) * WALKER.fps
-    forward = velocity[..., 0] * np.sin(heading) + velocity[..., 2] * np.cos(heading)
-    assert 0.5 < forward[walking].mean() < 2.0
-    sideways = velocity[..., 0] * np.cos(heading) - velocity[..., 2] * np.sin(heading)
-    assert np.abs(sideways[walking]).mean() < 0.3 * forward[walking].mean()
-
-
-def test_the_true_heading_is_the_skeletons(people):
-    standing = [c for c in people if c.labels["activity"] == "stand"]
-    for clip in standing:
-        measured = WALKER.heading(torch.from_numpy(clip.positions[0])).item()
-        assert np.cos(measured - clip.truth["heading"][0]) > np.cos(0.25)
-
-
 def test_wavers_raise_the_hand_that_the_truth_names(people, positions):
     above = positions[:, :, [WALKER.names.index(j) for j in ("LWrist", "RWrist")], 1]
     above = above - positions[:, :, [WALKER.names.index("Neck")], 1]
@@ -81,46 +51,7 @@ def test_wavers_raise_the_hand_that_the_truth_names(people, positions):
         assert ((above[frames] > 0) == raised).mean() > 0.95
 
 
-def test_labels_and_truth_tell_the_same_story(people):
-    for clip in people:
-        activity = clip.truth["activity"]
-        said = np.full(len(activity), -1)
-        for switch in clip.labels["switches"].split():
-            name, frame = switch.split("@")
-            said[int(frame) :] = ACTIVITIES.index(name)
-        np.testing.assert_array_equal(said, activity)
-        assert clip.labels["activity"] == ACTIVITIES[activity[0]]
-        np.testing.assert_allclose(clip.truth["weights"].sum(1), 1)
-        assert 1.2 < float(clip.labels["height_m"]) < 2.3
-
-
-def test_the_same_pose_has_many_futures():
-    cut = windows(simulate(150, 150, seed=1), PROTOCOLS["simulated"], "train").all()["x"]
-    last, future = cut[:, 14], cut[:, 15:]
-    gap = torch.cdist(last, last)
-    near = gap.topk(6, largest=False).indices[:, 1:]
-    later = torch.linalg.vector_norm(future[near][:, :, -1] - future[:, None, -1], dim=-1)
-    now = gap.gather(1, near)
-    assert later.median() > 2 * now.median()
-
-
-def test_one_frame_more_than_none_and_what_cannot_be_simulated():
-    assert simulate(1, 2).clips[0].positions.shape == (2, 17, 3)
-    with pytest.raises(ValueError, match="cannot simulate 0 clips"):
-        simulate(0)
-
-
 class TestFigures:
-    @pytest.fixture(autouse=True)
-    def close(self):
-        yield
-        plt.close("all")
-
-    def test_a_pose_has_one_line_per_bone(self, positions):
-        ax = plt.figure().subplots()
-        pose(ax, positions[0, :4], WALKER)
-        assert len(ax.collections[0].get_segments()) == 4 * 16
-
     @pytest.mark.parametrize(("K", "past_frames", "H"), [(1, 1, 1), (5, 15, 60)])
     def test_futures_draw_past_samples_and_truth(self, positions, K, past_frames, H):
         past, future = positions[:K, :past_frames], positions[:K, past_frames : past_frames + H]
@@ -128,21 +59,16 @@ class TestFigures:
         ax.figure.canvas.draw()
         shown = min(2, past_frames) + 2 * min(4, H)
         assert len(ax.collections) == shown
+        key = [text.get_text() for text in ax.get_legend().get_texts()]
+        assert key == ["observed", "what happened", f"{K} sample{'s' * (K > 1)}"]
         assert ax.get_xticklabels()[-1].get_text() == f"+{H / 30:.1f} s"
 
     def test_given_paths_are_crosses_where_the_joints_should_be(self, positions):
-        samples = positions[:2, 5:65] + np.array([[[[0.0, 0.0, 0.0]]], [[[0.5, 0.0, 0.0]]]])
-        wrist, path = WALKER.names.index("LWrist"), samples[1, :, WALKER.names.index("LWrist")].copy()
-        path[-1] = np.nan
+        samples, wrist = positions[:1, 5:65], WALKER.find("LWrist")
+        path = samples[0, :, wrist].copy()
         ax = futures(WALKER, positions[1, :5], samples, frames=3, paths={"left_wrist": path})
         bone = next(b for b, (_, child) in enumerate(WALKER.edges) if child == wrist)
         for drawn, line in zip(ax.collections[2:4], ax.lines[:2], strict=True):
-            followed = drawn.get_segments()[len(WALKER.edges) + bone]  # of the second sample
-            np.testing.assert_allclose(line.get_xydata()[0], followed[1])
-        assert np.isnan(ax.lines[2].get_xydata()).all()
+            np.testing.assert_allclose(line.get_xydata()[0], drawn.get_segments()[bone][1])
         with pytest.raises(ValueError, match=r"expected a path \(60, 3\) of LWrist"):
             futures(WALKER, positions[1, :5], samples, paths={"LWrist": path[:9]})
-
-    def test_shapes_that_do_not_fit_are_explained(self, positions):
-        with pytest.raises(ValueError, match=r"expected observed \(O, J, 3\)"):
-            futures(WALKER, positions[0, :5], positions[0, 5:9])

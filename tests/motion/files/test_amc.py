@@ -3,31 +3,11 @@
 import numpy as np
 import pytest
 
-from dvae.motion.files.amc import read_amc, read_asf, read_expmap
+from dvae.motion.files.amc import read_amc, read_expmap
 
-JOINTS = [
-    "root",
-    "lfemur",
-    "ltibia",
-    "lfoot",
-    "ltoes",
-    "rfemur",
-    "rtibia",
-    "rfoot",
-    "rtoes",
-    "upperback",
-    "thorax",
-    "lowerneck",
-    "upperneck",
-    "head",
-    "headEnd",
-    "lhumerus",
-    "lradius",
-    "lhand",
-    "rhumerus",
-    "rradius",
-    "rhand",
-]
+LEGS = [f"{side}{bone}" for side in "lr" for bone in ("femur", "tibia", "foot", "toes")]
+ARMS = [f"{side}{bone}" for side in "lr" for bone in ("humerus", "radius", "hand")]
+JOINTS = ["root", *LEGS, "upperback", "thorax", "lowerneck", "upperneck", "head", "headEnd", *ARMS]
 """Where the joints of the archive stand, in its order."""
 
 ASF = """:version 1.10
@@ -69,9 +49,7 @@ def seen(recording):
     ("read", "file", "key"),
     [
         (read_amc, "asfamc/02_01.amc", ("train", "walking_1")),
-        (read_expmap, "expmap/train_walking_1.txt", ("train", "walking_1")),
         (read_expmap, "expmap/train_walking_extra_22.txt", ("train", "walking_extra_22")),  # turns, and faces away
-        (read_expmap, "expmap/test_running_1.txt", ("test", "running_1")),
     ],
 )
 def test_motion_is_that_of_the_archive_to_a_tenth_of_a_millimetre(read, file, key, shared, real):
@@ -104,19 +82,13 @@ def test_a_bone_turns_about_its_own_axes_and_carries_what_hangs_from_it(tmp_path
     [
         ("asf", ":bonedata", ":nothing", "no :bonedata"),
         ("asf", "root thigh", "head thigh", "'thigh' hangs from 'head'"),
-        ("asf", "thigh shin", "thigh foot", "'foot', which is no bone"),
         ("asf", "length 4", "length four", "length of thigh: 'four' is no number"),
         ("asf", "direction 0 -1 0", "direction 0 -1", "direction of thigh has 2 numbers"),
         ("asf", "direction 0 -1 0\n", "", "line 15 ends a bone without"),
         ("asf", "dof rx", "dof rx tx", "expected rx, ry or rz"),
         ("asf", "order TX", "order RX", "expected TX to RZ"),
-        ("asf", "length 1\n", "length 0\n", "length 0"),
         ("amc", "thigh 90", "thigh 90 1", "line 8 is 'thigh 90 1'"),
-        ("amc", "thigh 90", "thigh x", "thigh: 'x' is no number"),
         ("amc", "thigh 90", "", "frame 2 has no row for thigh"),
-        ("amc", "thigh 0\n", "", "frame 1 has no row for thigh"),
-        ("amc", "thigh 0", "knee 0", "line 5 is 'knee 0'"),
-        ("amc", "1\nroot", "root", "line 3"),
     ],
 )
 def test_what_is_damaged_is_refused_with_its_place(file, old, new, message, tmp_path):
@@ -129,31 +101,16 @@ def test_what_is_damaged_is_refused_with_its_place(file, old, new, message, tmp_
     assert str(tmp_path / f"a.{file}") in str(error.value)
 
 
-def test_a_chain_of_many_bones_is_no_matter(tmp_path):
-    bone = "begin\nname b{}\ndirection 0 1 0\nlength 1\nend\n"
-    chain = "".join(f"{'b' + str(i - 1) if i else 'root'} b{i}\n" for i in range(499))
-    text = ":bonedata\n" + "".join(bone.format(i) for i in range(499)) + ":hierarchy\nbegin\n" + chain
-    (tmp_path / "a.asf").write_text(text)
-    (tmp_path / "a.amc").write_text("1\nroot 0 0 0 0 0 0\n")
-    assert read_amc(tmp_path / "a.amc").positions[0, -1].tolist() == [0, 499, 0]
-    (tmp_path / "a.asf").write_text(text + "".join(f"b498 c{i}\n" for i in range(2)))
-    with pytest.raises(ValueError, match="'c0', which is no bone"):
-        read_asf(tmp_path / "a.asf")
-
-
-def test_which_skeleton_is_asked_where_none_or_several_could_be(tmp_path):
+def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):
     (tmp_path / "02_01.amc").write_text(AMC)
     with pytest.raises(FileNotFoundError, match="which skeleton"):
         read_amc(tmp_path / "02_01.amc")
     for name in ("01.asf", "02.asf"):
         (tmp_path / name).write_text(ASF if name == "02.asf" else "")
     assert len(read_amc(tmp_path / "02_01.amc").positions) == 2
-    (tmp_path / "walk.amc").write_text(AMC)
-    with pytest.raises(FileNotFoundError, match="which skeleton"):
-        read_amc(tmp_path / "walk.amc")
 
 
-@pytest.mark.parametrize("text", ["", "1 2 3", "0 " * 117, "0 " * 233 + "x", "0 " * 233 + "nan"])
+@pytest.mark.parametrize("text", ["", "0 " * 117, "0 " * 233 + "nan"])
 def test_what_are_no_exponential_maps_is_refused(text, tmp_path):
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(ValueError, match=r"no rows of 117|no number"):

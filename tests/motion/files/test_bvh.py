@@ -1,21 +1,11 @@
 """BVH files: read as animation programs do, written, and refused where they are damaged."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dvae.motion.files.bvh import read_bvh, write_bvh
-
-SAMPLES = {
-    "bvh/indian_13.bvh": (1996, 57),
-    "01_01.bvh": (2752, 38),
-    "01_03.bvh": (4511, 38),
-    "Boxing_Toes.bvh": (3070, 26),  # a row more than it announces
-}
-DEBIAN = Path("/usr/share/assimp/models/BVH")
-"""Where Debian's package assimp-testmodels puts its samples."""
 
 SMALL = """HIERARCHY
 ROOT hip
@@ -93,51 +83,29 @@ def played(text):
     return np.stack([joint["at"] for joint in joints], 1)
 
 
-@pytest.fixture(params=SAMPLES)
-def sample(request, shared):
-    if "/" in request.param:
-        return shared(f"cmu_raw/{request.param}"), SAMPLES[request.param]
-    if not (DEBIAN / request.param).is_file():
-        pytest.skip(f"{request.param} of Debian's assimp-testmodels is not installed")
-    return DEBIAN / request.param, SAMPLES[request.param]
+@pytest.fixture(params=["small", "bvh/indian_13.bvh"])
+def sample(request, shared, tmp_path):
+    if request.param != "small":
+        return shared(f"cmu_raw/{request.param}")
+    (tmp_path / "small.bvh").write_text(SMALL.replace("a knee", "knee"))
+    return tmp_path / "small.bvh"
 
 
 def test_samples_are_read_as_the_format_says(sample):
-    path, (frames, joints) = sample
-    read = read_bvh(path)
-    assert read.positions.shape == (frames, joints, 3)
-    np.testing.assert_allclose(read.positions, played(path.read_text()), atol=1e-9)
-    assert read.rotations.shape == (frames, joints, 4)
+    read = read_bvh(sample)
+    np.testing.assert_allclose(read.positions, played(sample.read_text()), atol=1e-9)
+    assert read.rotations.shape == (*read.positions.shape[:2], 4)
+    if sample.name == "small.bvh":
+        assert (read.names, read.fps) == (["hip", "knee", "kneeEnd", "arm", "armEnd"], 30)
 
 
-def test_samples_are_written_and_read_back_to_a_tenth_of_a_millimetre(sample, tmp_path):
-    read = read_bvh(sample[0])  # in centimetres, or in units of 5.6
-    write_bvh(
-        tmp_path / "a.bvh",
-        read.names,
-        read.parents,
-        read.offsets / 100,
-        read.rotations,
-        read.positions[:, 0] / 100,
-        read.fps,
-    )
+def test_samples_are_written_and_read_back_to_a_tenth_of_a_millimetre(shared, tmp_path):
+    read = read_bvh(shared("cmu_raw/bvh/indian_13.bvh"))  # in centimetres
+    rest, root = read.offsets / 100, read.positions[:, 0] / 100
+    write_bvh(tmp_path / "a.bvh", read.names, read.parents, rest, read.rotations, root, read.fps)
     again = read_bvh(tmp_path / "a.bvh")
-    assert (again.names, again.parents) == (read.names, read.parents)
+    assert (again.names, again.parents, again.fps) == (read.names, read.parents, read.fps)
     np.testing.assert_allclose(again.positions, read.positions, atol=1e-3)
-    assert again.fps == read.fps
-
-
-def test_any_joint_may_be_placed_and_turned_about_any_axes(tmp_path):
-    (tmp_path / "a.bvh").write_text(SMALL)
-    read = read_bvh(tmp_path / "a.bvh")
-    assert read.names == ["hip", "a knee", "a kneeEnd", "arm", "armEnd"]
-    assert read.fps == 30
-    np.testing.assert_allclose(read.positions[0], [[0, 0, 0], [0, -10, 0], [0, -15, 0], [3, 0, 0], [4, 0, 0]])
-    # the hip at (5, 6, 7) turned by 90 degrees about z: x to y, y to -x
-    hip, knee = np.array([5, 6, 7]), np.array([16, 7, 9])  # placed at (1, -11, 2), in place of its offset
-    np.testing.assert_allclose(read.positions[1, 1], knee, atol=1e-9)
-    np.testing.assert_allclose(read.positions[1, 2], knee + np.array([0, 0, -5]), atol=1e-9)  # its y looks along z
-    np.testing.assert_allclose(read.positions[1, 4], hip + np.array([-1, 3, 0]), atol=1e-9)
 
 
 HEAD, FRAMES = SMALL.replace("a knee", "knee").split("Frame Time")
@@ -146,14 +114,12 @@ HEAD, FRAMES = SMALL.replace("a knee", "knee").split("Frame Time")
 @pytest.mark.parametrize(
     "head",
     [
-        re.sub(r"\s*\n\s*{", " {", HEAD),
         re.sub(r"\s*\n\s*{", "{", HEAD),
         re.sub(r"\s*}", "}", HEAD),
-        " ".join(HEAD.split()) + "\n",
         "\n".join(HEAD.split()) + "\n",
         HEAD.lower(),
     ],
-    ids=["brace after the name", "brace at the name", "brace after a number", "one line", "a line each", "lower case"],
+    ids=["brace at the name", "brace after a number", "a line each", "lower case"],
 )
 def test_words_may_be_anywhere_on_lines(head, tmp_path):
     (tmp_path / "a.bvh").write_text(SMALL.replace("a knee", "knee"))
@@ -168,36 +134,13 @@ def test_what_is_written_has_the_layout_that_animation_programs_import(tmp_path)
     read = read_bvh(tmp_path / "a.bvh")
     write_bvh(tmp_path / "b.bvh", read.names, read.parents, read.offsets, read.rotations, read.positions[:, 0], 25.0)
     lines = [line.strip() for line in (tmp_path / "b.bvh").read_text().splitlines()]
-    assert lines[:5] == [
-        "HIERARCHY",
-        "ROOT hip",
-        "{",
-        "OFFSET 0.000000 0.000000 0.000000",
-        "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation",
-    ]
-    joints = [line.split()[1] for line in lines if line.startswith("JOINT ")]
-    assert joints == ["knee", "kneeEnd", "arm", "armEnd"]
+    assert lines[:4] == ["HIERARCHY", "ROOT hip", "{", "OFFSET 0.000000 0.000000 0.000000"]
+    assert lines[4] == "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation"
     assert lines.count("CHANNELS 3 Zrotation Yrotation Xrotation") == 4
-    for end in (place for place, line in enumerate(lines) if line == "End Site"):
-        assert lines[end + 1 : end + 5] == ["{", "OFFSET 0.000000 0.000000 0.000000", "}", "}"]
-    assert lines.count("End Site") == 2
-    assert lines.count("{") == lines.count("}") == 7
+    assert (lines.count("End Site"), lines.count("{"), lines.count("}")) == (2, 7, 7)
     motion = lines.index("MOTION")
     assert lines[motion + 1 : motion + 3] == ["Frames: 2", "Frame Time: 0.04000000"]
     assert [len(line.split()) for line in lines[motion + 3 :]] == [18, 18]
-
-
-def test_ends_without_a_length_are_no_joints(tmp_path):
-    (tmp_path / "a.bvh").write_text(SMALL.replace("OFFSET 0 -5 0", "OFFSET 0 -0.0 0"))
-    read = read_bvh(tmp_path / "a.bvh")
-    assert (read.names, read.parents) == (["hip", "a knee", "arm", "armEnd"], [-1, 0, 0, 2])
-    np.testing.assert_allclose(read.positions[0], [[0, 0, 0], [0, -10, 0], [3, 0, 0], [4, 0, 0]])
-
-
-def test_names_that_repeat_are_not_written(tmp_path):
-    with pytest.raises(ValueError, match=r"a\.bvh: 'knee' is the name of 2 joints"):
-        write_bvh(tmp_path / "a.bvh", ["hip", "knee", "knee"], [-1, 0, 0], np.ones((3, 3)), None, None, 30)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -205,20 +148,14 @@ def test_names_that_repeat_are_not_written(tmp_path):
     [
         ("MOTION", "", "line 26 is 'Frames: 2'"),
         ("Frames: 2", "Frames: 200", "no 200 frames of 12 channels"),
-        ("Frames: 2", "Frames: -2", "no recording"),
-        ("Frames: 2", "Frames: many", "'many' is no number"),
         ("0.0333333", "0", "no recording"),
-        ("0.0333333", "nan", "'nan' is no number"),
         ("OFFSET 3 0 0", "OFFSET 3 0", "expected three numbers"),
         ("OFFSET 3 0 0", "OFFSET 3 0 inf", "line 17: 'inf' is no number"),
         ("CHANNELS 2 ", "CHANNELS 3 ", "expected their number"),
         ("CHANNELS 2 Yrotation", "CHANNELS 2 Zrotation", "each once"),
-        ("CHANNELS 2 Yrotation Zrotation", "CHANNELS", "expected their number"),
-        ("5 6 7 90", "5 6 7 x", "'x' is no number"),
         ("5 6 7 90", "5 6 90", "no 2 frames"),
         ("JOINT arm", "JOINT hip", "another joint 'hip'"),
         ("JOINT arm\n  {", "JOINT arm", "line 16"),
-        ("ROOT", "JOINT", "one ROOT"),
         ("HIERARCHY", "<html>", "expected ROOT"),
     ],
 )
@@ -228,12 +165,3 @@ def test_what_is_damaged_is_refused_with_its_place(old, new, message, tmp_path):
     with pytest.raises(ValueError, match=message) as error:
         read_bvh(path)
     assert str(path) in str(error.value)
-
-
-def test_channels_without_end_take_no_memory(tmp_path):
-    joints = "JOINT j{}\n{{\nOFFSET 0 1 0\n"
-    tree = "".join(joints.format(j) for j in range(900)) + "}\n" * 900
-    head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xposition\n{tree}}}\nMOTION\n"
-    (tmp_path / "a.bvh").write_text(head + "Frames: 100000\nFrame Time: 0.1\n" + "0\n" * 100_000)
-    with pytest.raises(ValueError, match="90,100,000 places"):
-        read_bvh(tmp_path / "a.bvh")

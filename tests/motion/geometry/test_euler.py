@@ -81,9 +81,8 @@ def test_zero_velocity_by_hand_and_no_error_of_the_truth(windows):
     assert "without the root" in found.notes[0]
 
 
-@pytest.mark.parametrize("options", [{}, {"noise": "step", "velocity": True}])
-def test_the_best_is_among_the_first_futures_by_its_mean_over_the_times(windows, options, monkeypatch):
-    model, counts, seen = mix(windows, **options), (1, 3, 8), []
+def test_the_best_is_among_the_first_futures_by_its_mean_over_the_times(windows, monkeypatch):
+    model, counts, seen = mix(windows, noise="step", velocity=True), (1, 3, 8), []
     shown = model.shown
     monkeypatch.setattr(model, "shown", lambda values, data: seen.append(values["x"]) or shown(values, data))
     found = euler_errors({"mix": model}, windows, times=TIMES, counts=counts, progress=False)
@@ -98,8 +97,6 @@ def test_the_best_is_among_the_first_futures_by_its_mean_over_the_times(windows,
         expected = errors[best, torch.arange(len(windows))].mean(0)
         for place, time in enumerate(TIMES):
             assert found["mix"][f"{time} ms, best of {count}"].mean == pytest.approx(expected[place].item(), rel=1e-4)
-    means = [np.mean([found["mix"][f"{time} ms, best of {count}"].mean for time in TIMES]) for count in counts]
-    assert means[0] > means[1] > means[2]
 
 
 class Shifts(nn.Module):
@@ -132,21 +129,14 @@ def test_positions_are_scored_by_the_turns_that_they_show_on_both_sides(people, 
     again = euler_errors(models, positions, **options)
     for name in again.rows:
         assert again[name]["320 ms, best of 4"].mean == pytest.approx(errors[name], abs=1e-3)
-    twisted = euler_errors({}, windows, times=TIMES, counts=(4,), progress=False)
-    assert twisted["zero velocity"]["320 ms, best of 4"].mean != errors["zero velocity"]  # which the data's own have
-
-
-def test_a_model_is_not_shown_the_future(windows):
-    past = Angles(windows, TIMES).all()["motion"]
+    past = Angles(windows, TIMES).all()["motion"]  # a model is not shown the future
     assert past["x"].shape[1] == past["beside"][TURNS].shape[1] == 5
 
 
 def test_what_it_refuses(people, windows):
     for options, message in (
         ({"times": (80, 1000)}, "nearest to 1000 ms: windows of simulated go on for 12 frames at 30 a second, 400 ms"),
-        ({"times": (10,)}, "no predicted frame is nearest to 10 ms"),
         ({"times": ()}, "nearest to no time"),
-        ({"counts": ()}, "at least one future"),
         ({"counts": (0, 5)}, "at least one future"),
         ({"models": {"near": Shifts(windows, 0.1)}}, "a model of positions makes no turns; score it with inverse=True"),
     ):

@@ -49,25 +49,9 @@ def test_forms_are_those_of_scipy(form):
         torch.testing.assert_close(values, columns.flatten(1)[:, : rotations.size(form)])
 
 
-@pytest.mark.parametrize("form", ["quaternion", "vector", "6d", "matrix", "euler-zyx"])
-@pytest.mark.parametrize("angle", [0.0, torch.pi])
-def test_gradients_are_right_at_no_turn_and_at_half_a_turn(form, angle):
-    values = rotations.from_matrix(torch.diag(torch.tensor([1.0, -1.0, -1.0] if angle else [1.0] * 3).double()), form)
-    if form == "vector":  # of the two for half a turn, what is differentiated is written out
-        values = torch.tensor([angle, 0, 0], dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda v: rotations.to_matrix(v, form), values.requires_grad_(), eps=1e-5, atol=1e-6, rtol=0
-    )
-
-
 @pytest.mark.parametrize(
     ("form", "angle"),
-    [
-        (f, a)
-        for m, f in enumerate(FORMS)
-        for n, a in enumerate([0.0, 1e-9, 1.0, 2.5, torch.pi - 1e-3])
-        if (m + n) % 3 == 0
-    ],
+    [*zip([*rotations.SIZES, "euler-xyx", "euler-zyx"], [1e-9, 1.0, 2.5, 0.0, torch.pi - 1e-3, 1.0], strict=False)],
 )
 def test_gradients_are_those_of_differences(form, angle):
     if form.startswith("euler") and form[-1] == form[-3]:
@@ -79,44 +63,29 @@ def test_gradients_are_those_of_differences(form, angle):
     torch.autograd.gradcheck(lambda v: rotations.from_matrix(rotations.to_matrix(v, "vector"), form), vectors)
 
 
-def test_a_rotation_vector_goes_through_matrices_with_finite_gradients():
-    for angle in (0.0, torch.pi):
-        vector = torch.tensor([angle, 0, 0], dtype=torch.float64, requires_grad=True)
-        for form in ("quaternion", "vector", "6d"):
-            (gradient,) = torch.autograd.grad(
-                rotations.from_matrix(rotations.to_matrix(vector, "vector"), form).square().sum(), vector
-            )
-            assert gradient.isfinite().all()
+@pytest.mark.parametrize("form", ["quaternion", "vector", "6d"])
+@pytest.mark.parametrize("angle", [0.0, torch.pi])
+def test_gradients_are_right_at_no_turn_and_at_half_a_turn(form, angle):
+    values = rotations.from_matrix(torch.diag(torch.tensor([1.0, -1.0, -1.0] if angle else [1.0] * 3).double()), form)
+    if form == "vector":  # of the two for half a turn, what is differentiated is written out
+        values = torch.tensor([angle, 0, 0], dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda v: rotations.to_matrix(v, form), values.requires_grad_(), eps=1e-5, atol=1e-6, rtol=0
+    )
 
 
-def test_quaternions_and_6d_of_any_length_are_read():
-    matrices = turns(0.7)
-    for form in ("quaternion", "6d"):
-        torch.testing.assert_close(rotations.to_matrix(3 * rotations.from_matrix(matrices, form), form), matrices)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
     ("form", "values"),
-    [
-        ("quaternion", [0.0] * 4),
-        ("6d", [0.0] * 6),
-        ("6d", [0.0, 0, 0, 2, 0, 0]),
-        ("6d", [1.0, 2, 3, 0, 0, 0]),
-        ("6d", [1.0, 2, 3, -2, -4, -6]),
-        ("6d", [1e-30] * 6),
-    ],
+    [("quaternion", [0.0] * 4), ("6d", [0.0] * 6), ("6d", [1.0, 2, 3, -2, -4, -6]), ("6d", [1e-30] * 6)],
 )
-def test_numbers_that_tell_no_rotation_are_read_as_one(form, values, dtype):
-    given = torch.tensor(values, dtype=dtype, requires_grad=True)
+def test_numbers_that_tell_no_rotation_are_read_as_one(form, values):
+    given = torch.tensor(values, requires_grad=True)
     found = rotations.to_matrix(given, form)
-    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=dtype))
-    torch.testing.assert_close(torch.linalg.det(found), torch.ones((), dtype=dtype))
+    torch.testing.assert_close(found @ found.mT, torch.eye(3))
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones(()))
     if not any(values):
-        assert torch.equal(found, torch.eye(3, dtype=dtype))
-    if form == "6d" and any(values[:3]) and values[0] == 1:
-        torch.testing.assert_close(found[:, 0], torch.nn.functional.normalize(given[:3], dim=0))
-    (gradient,) = torch.autograd.grad((found * torch.randn(3, 3, dtype=dtype)).sum(), given)
+        assert torch.equal(found, torch.eye(3))
+    (gradient,) = torch.autograd.grad((found * torch.randn(3, 3)).sum(), given)
     assert gradient.abs().max() < 10
 
 
@@ -175,26 +144,17 @@ def test_forward_kinematics_is_a_product_along_every_chain():
         torch.testing.assert_close(world[frame, joint], turn)
 
 
-def test_forward_kinematics_has_a_gradient():
-    offsets, local, root = (value.requires_grad_() for value in random_pose(1))
-    assert torch.autograd.gradcheck(
-        lambda *given: kinematics.forward(WALKER.parents, *given), (local, offsets, root), fast_mode=True
-    )
-
-
-def test_inverse_kinematics_gives_rigid_bodies_back():
+def test_inverse_kinematics_gives_rigid_bodies_back_and_turns_no_bone_about_itself():
     offsets, local, root = random_pose()
     positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
     found = kinematics.inverse(WALKER, positions, offsets)
     again, _ = kinematics.forward(WALKER.parents, found, offsets, root)
     torch.testing.assert_close(again, positions, atol=1e-5, rtol=0)
     torch.testing.assert_close(found @ found.transpose(-1, -2), torch.eye(3).double().expand_as(found))
-
-
-def test_a_bone_is_not_turned_about_itself():
-    offsets, local, root = random_pose()
-    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
-    found = kinematics.inverse(WALKER, positions, offsets)
+    rounded = kinematics.inverse(WALKER, positions.float(), offsets.float()).double()
+    torch.testing.assert_close(
+        rounded, kinematics.inverse(WALKER, positions.float().double(), offsets), atol=1e-4, rtol=0
+    )
     knee, foot = WALKER.find("RKnee"), WALKER.find("RFoot")
     axis = rotations.from_matrix(found[:, knee], "vector")
     torch.testing.assert_close((axis * offsets[foot]).sum(-1), torch.zeros(7).double(), atol=1e-5, rtol=0)
@@ -204,8 +164,7 @@ def test_a_bone_is_not_turned_about_itself():
 CHAIN = Skeleton(("hip", "knee", "foot"), (-1, 0, 1))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("aside", [0.0, 1e-12, 1e-6, 1e-3])
+@pytest.mark.parametrize(("aside", "dtype"), [(0.0, torch.float32), (1e-12, torch.float64), (1e-3, torch.float32)])
 def test_a_bone_that_points_backwards_is_turned_by_half_a_turn(aside, dtype):
     offsets = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0.6, 0.8, 0]], dtype=dtype)
     positions = -offsets.cumsum(0)[None]
@@ -231,51 +190,8 @@ def test_inverse_kinematics_has_a_gradient():
     offsets, local, root = random_pose(1)
     positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
     positions = positions + 0.1 * torch.randn_like(positions)  # of no such body
-    assert torch.autograd.gradcheck(lambda x: kinematics.inverse(WALKER, x, offsets), positions.requires_grad_())
-
-
-def test_rounding_does_not_grow_along_a_chain():
-    body = Skeleton(tuple(map(str, range(30))), tuple(range(-1, 29)))
-    offsets = torch.randn(30, 3)
-    found = kinematics.inverse(body, torch.randn(50, 30, 3), offsets)
-    errors = (found @ found.mT - torch.eye(3)).abs().amax((0, -2, -1))
-    assert errors.max() < 16 * torch.finfo(errors.dtype).eps, errors
-
-
-def test_inverse_kinematics_rounds_as_its_numbers_do():
-    offsets, local, root = random_pose()
-    positions, _ = kinematics.forward(WALKER.parents, local, offsets, root)
-    positions = positions.float()
-    exact = kinematics.inverse(WALKER, positions.double(), offsets)
-    torch.testing.assert_close(
-        kinematics.inverse(WALKER, positions, offsets.float()).double(), exact, atol=1e-4, rtol=0
-    )
-
-
-def test_inverse_kinematics_of_real_people_is_within_a_centimetre(real):
-    motion = real("bandai/bandai2.npz")
-    positions = torch.cat([torch.from_numpy(clip.positions[::10]) for clip in motion]).double()
-    offsets = kinematics.rest(motion.skeleton, positions)
-    local = kinematics.inverse(motion.skeleton, positions, offsets)
-    again, _ = kinematics.forward(motion.skeleton.parents, local, offsets, positions[:, motion.skeleton.root])
-    errors = (again - positions).norm(dim=-1).amax(0)
-    assert errors.max() < 0.001, dict(zip(motion.skeleton.names, errors.tolist(), strict=True))
-    children = [child for _, child in motion.skeleton.edges]
-    torch.testing.assert_close(
-        motion.skeleton.bone_lengths(again), offsets[children].norm(dim=-1).expand(len(again), -1)
-    )
-
-
-def test_a_rest_pose_faces_the_front_on_bones_of_mean_length():
-    people = simulate(clips=1, frames=60, seed=3)
-    positions = torch.from_numpy(people.clips[0].positions).double()
-    offsets = kinematics.rest(people.skeleton, positions)
-    lengths = people.skeleton.bone_lengths(positions).mean(0)
-    children = [child for _, child in people.skeleton.edges]
-    torch.testing.assert_close(offsets[children].norm(dim=-1), lengths)
-    unturned = torch.eye(3, dtype=torch.float64).expand(1, people.skeleton.joints, 3, 3)
-    standing, _ = kinematics.forward(people.skeleton.parents, unturned, offsets, torch.zeros(1, 3).double())
-    assert abs(people.skeleton.heading(standing)).max() < 0.2
+    positions.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: kinematics.inverse(WALKER, x, offsets), positions, fast_mode=True)
 
 
 def test_a_set_is_given_rotations_that_make_its_positions(tmp_path):
@@ -286,34 +202,23 @@ def test_a_set_is_given_rotations_that_make_its_positions(tmp_path):
     found = people.with_rotations()
     assert found.with_rotations() is found
     assert found.fingerprint() != people.fingerprint()
-    one = MotionSet([clip for clip in people if clip is people.clips[0]], people.skeleton).with_rotations()
-    for clip, body in zip([*found, *one], [found] * 3 + [one], strict=True):
-        turns = rotations.to_matrix(torch.from_numpy(clip.rotations), "quaternion").double()
-        root = torch.from_numpy(clip.positions[:, body.skeleton.root]).double()
-        again, _ = kinematics.forward(body.skeleton.parents, turns, body.skeleton.offsets, root)
-        near = 0.03 if body is found else 1e-3  # three people of three sizes on one body; one on its own
-        torch.testing.assert_close(again, torch.from_numpy(clip.positions).double(), atol=10 * near, rtol=0)
-    found.skeleton.to_json(tmp_path / "skeleton.json")
-    assert Skeleton.from_json(tmp_path / "skeleton.json") == found.skeleton
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+    one = MotionSet(people.clips[:1], people.skeleton).with_rotations()
+    (clip,), body = one, one.skeleton
+    turns = rotations.to_matrix(torch.from_numpy(clip.rotations), "quaternion").double()
+    root = torch.from_numpy(clip.positions[:, body.root]).double()
+    again, _ = kinematics.forward(body.parents, turns, body.offsets, root)
+    torch.testing.assert_close(again, torch.from_numpy(clip.positions).double(), atol=1e-2, rtol=0)
+    body.to_json(tmp_path / "skeleton.json")
+    assert Skeleton.from_json(tmp_path / "skeleton.json") == body
+    for change, message in (
         (lambda turns: turns[:, :-1], r"rotations \(20, 16, 4\), expected quaternions \(20, 17, 4\)"),
         (lambda turns: 2 * turns, "no quaternions of unit length"),
-        (lambda turns: np.nan * turns, "no quaternions of unit length"),
-    ],
-)
-def test_rotations_that_are_none_are_refused(change, message):
-    people = simulate(clips=1, frames=20, seed=1).with_rotations()
-    clip = people.clips[0]
-    with pytest.raises(ValueError, match=message):
-        MotionSet([replace(clip, rotations=change(clip.rotations))], people.skeleton)
-
-
-def test_rest_poses_that_are_none_are_refused():
-    with pytest.raises(ValueError, match="has 2 numbers, expected 3 for each of 17"):
-        replace(WALKER, rest=(0.0, 1.0))
-    with pytest.raises(ValueError, match="a joint is nan m"):
-        replace(WALKER, rest=(float("nan"),) * 51)
+    ):
+        with pytest.raises(ValueError, match=message):
+            MotionSet([replace(clip, rotations=change(clip.rotations))], body)
+    for rest, message in (
+        ((0.0, 1.0), "has 2 numbers, expected 3 for each of 17"),
+        ((np.nan,) * 51, "a joint is nan m"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(WALKER, rest=rest)

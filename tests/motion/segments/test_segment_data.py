@@ -6,10 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-import dvae
 from dvae import motion
 from dvae.motion.segments.dataset import SegmentData, Takes
-from dvae.motion.segments.embodied import Segments, SegmentSchema
+from dvae.motion.segments.embodied import SegmentSchema
 
 PEOPLE = motion.simulate(clips=8, frames=80, seed=1)
 
@@ -25,33 +24,22 @@ def written(data):
     return json.dumps(replace(data, warped=True).schema.config())
 
 
-def test_splits_are_by_take_and_leave_nothing_out(data):
+def test_splits_are_by_take_and_leave_nothing_out_and_segments_have_names(data):
     windows = {split: data.windows(split) for split in ("train", "validation", "test")}
     found = {split: {clip.labels["source"] for clip in each.motion} for split, each in windows.items()}
     assert all(found.values())
     assert sum(map(len, found.values())) == len(set.union(*found.values()))
     assert found["test"] == {clip.labels["source"] for clip in data.segments if clip.split == "test"}
     assert sum(map(len, windows.values())) == len(data.segments)
+    first = data.segments.clips[0]
+    for name in (first.name, f"{first.split}/{first.name}", first.labels["source"]):
+        assert data.found(name).motion.clips[0].key == first.key
+    with pytest.raises(
+        ValueError, match=r"no segment or take 'person_00' .did you mean 'person_00.*the first is train"
+    ):
+        data.found("person_00")
     with pytest.raises(ValueError, match="no split 'all': expected train, validation or test"):
         data.windows("all")
-    alone = SegmentData("walks.npz", replace(PEOPLE, clips=[clip for clip in PEOPLE if clip.split == "train"]))
-    with pytest.raises(ValueError, match=r"no segments for test: .* are of takes in train"):
-        alone.windows("test")
-
-
-@pytest.mark.parametrize("options", [{}, {"scaling": "deviation"}])
-def test_frames_of_a_segment_are_made_once(options, monkeypatch):
-    made, seen = [], motion.TimedFrames._seen
-    monkeypatch.setattr(motion.TimedFrames, "_seen", lambda *given: made.append(len(given[1])) or seen(*given))
-    data = SegmentData("simulated", PEOPLE, **options)
-    train, validation = data.windows("train"), data.windows("validation")
-    assert data.schema == train.schema
-    assert data.windows("train").all() is train.all()
-    assert sum(made) == len(train) + len(validation)
-    again = train.timed.to(train.motion)
-    assert torch.equal(again["x"], train.all()["x"])
-    if not options:
-        assert torch.equal(Segments(train.motion).all()["x"], again["x"])
 
 
 @pytest.mark.parametrize("options", [{}, {"scaling": "deviation", "warped": True}], ids=["plain", "warped"])
@@ -107,27 +95,12 @@ def test_takes_that_nobody_divided_are_whole_in_a_split(count, tmp_path):
     assert count == 1 or [clip.frames for clip in found] == [clip.frames for clip in clips]
 
 
-def test_a_segment_is_found_by_its_name_or_that_of_its_take(data):
-    first = data.segments.clips[0]
-    for name in (first.name, f"{first.split}/{first.name}", first.labels["source"]):
-        (clip,) = data.found(name).motion
-        assert clip.key == first.key
-    with pytest.raises(
-        ValueError, match=r"no segment or take 'person_00' .did you mean 'person_00.*the first is train"
-    ):
-        data.found("person_00")
-    both = replace(data.motion, clips=[*data.motion, replace(data.motion.clips[0], split="test")])
-    with pytest.raises(ValueError, match=r"is the name of several; say train/person_0000-.* or test/person_0000"):
-        SegmentData("simulated", both).found(first.name)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda config: config["sizes"].update(turns=10**6), "sizes are .*, and such segments have"),
         (lambda config: config["timed"]["skeleton"].update(up="z"), "is not that of the body that ships"),
         (lambda config: config["timed"].update(frames=10**9), "frames is 1000000000; it must be"),
-        (lambda config: config["timed"].update(mean=[float("nan")] * 102), "NaN or infinite numbers"),
         (lambda config: config["timed"]["references"][0].update(hips=[[1, 0, 0, 0]]), "hips of a reference are"),
     ],
 )
@@ -146,9 +119,3 @@ def test_options_out_of_range_are_refused():
         SegmentData.open("nowhere.npz")
     with pytest.raises(TypeError, match="skip_bad"):
         Takes("simulated", "", skip_bad="yes")
-
-
-def test_a_method_says_what_it_is_fitted_on():
-    kinds = {name: kind.fitted_on for name, kind in dvae.methods().items()}
-    assert kinds.pop("motion-latent") == "segments"
-    assert {*kinds.values()} == {"windows"}

