@@ -1,6 +1,5 @@
 """What models see of a table, and that nothing of it is of what they are tested on."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -242,16 +241,6 @@ def test_gaps_are_there_where_steps_are_uneven(times, step):
         assert gaps.shape == (24, 1)
         np.testing.assert_allclose(gaps[1:, 0], np.diff(times) / step)
         assert gaps[0] == 1
-
-
-def test_a_schema_comes_back_from_json():
-    panel = table(times=np.cumsum([1.0, 3, 1] * 4))
-    for cut in (CUT, Cut(), Cut(3, 2, split="time"), Cut(5, 3, stride=2, seed=4)):
-        schema = PanelSchema.under(panel, cut)
-        again = PanelSchema.from_config(json.loads(json.dumps(schema.config())))
-        assert again == schema
-        assert again.sizes == schema.sizes
-        assert (again.length, again.observed) == (cut.length, cut.observed)
 
 
 @pytest.mark.parametrize(

@@ -175,11 +175,10 @@ def test_a_value_that_is_no_class_is_refused_unless_a_class_stands_for_all_other
     [
         ([1.0, "a few", 2], "column 'y': 2 of 3 .* are numbers; row 1 is 'a few', which is no number; .* na_values"),
         (pd.to_datetime(["2024", None]), r"column 'y' holds datetime64\[.s\], which are no numbers"),
-        ([1j, 2], "column 'y' holds complex128"),
         ([10**400, 1], "column 'y': 1 of 2 values are numbers; row 0 is 1000"),
         (["1,234", "5,678"], "column 'y' holds '1,234', which may be 1234 or a fraction; give the decimal sign"),
     ],
-    ids=["mixed", "dates", "complex", "huge", "sign"],
+    ids=["mixed", "dates", "huge", "sign"],
 )
 def test_what_holds_no_numbers_is_named(column, said):
     with pytest.raises(ValueError, match=said):
@@ -257,7 +256,6 @@ def test_times_are_read_back_however_they_are_written(freq, written):
         (["2020-01", "2021-01", "2021-01"], "two rows at t 2021-01-01 00:00:00, 1 and 2; .* if clocks were set back"),
         (["2020-01-01T01:00+01:00", "2020-01-02", "2020-01-03"], "and others, such as '2020-01-02', without one"),
         (["2020", None, "2021"], "row 1 of column 't' has no time"),
-        (["a", "b", "c"], "times of column 't' are neither numbers, dates nor durations"),
         (["1/2/2020", "13/2/2020", "2/13/2020"], "nor durations: some begin with the day and others with the m"),
         (
             ["30/1/2020", "30/2/2020", "30/3/2020"],
@@ -280,13 +278,8 @@ def test_sequences_are_told_apart_by_all_their_ids():
     assert {one.name: one.values.item() for one in panel} == {"1/u": 1, "1/v": 2, "2/u": 3, "2/": 4}
     numbered = frame.assign(a=[10, 10, 2, 2])
     assert next(iter(Panel.of(numbered, Columns((Column("y"),), id=("a", "b"), time="t")))).name == "2/u"
-
-
-def test_rows_without_an_id_are_refused():
-    frame = pd.DataFrame({"shop": ["a", None, "a", None], "t": range(4), "y": np.arange(4) / 8})
-    with pytest.raises(ValueError, match="2 of 4 rows have no shop, the first of them row 1; fill in which sequence"):
-        Panel.of(frame, Columns((Column("y"),), ("shop",), "t"))
-    assert len(Panel.of(frame.assign(city="n"), Columns((Column("y"),), ("city", "shop"), "t"))) == 2
+    with pytest.raises(ValueError, match="1 of 4 rows have no b, the first of them row 3; fill in which sequence"):
+        Panel.of(frame.assign(t=range(4)), Columns((Column("y"),), ("b",), "t"))
 
 
 def test_groups_and_splits_are_of_sequences():

