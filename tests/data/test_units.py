@@ -176,11 +176,9 @@ def test_scheduled_sampling_and_priors_of_the_data_read_a_large_mean():
 
 @pytest.mark.parametrize("rest", ["", "mask", "lengths"])
 def test_values_that_float32_does_not_resolve_are_refused_without_units(rest):
-    x, mask = 1e9 + torch.randn(4, 6, 3, dtype=torch.float64), torch.rand(4, 6, 3) < 0.9
-    lengths = torch.tensor([6, 5, 6, 2])
-    data = {"": {"x": x}, "mask": {"x": x * mask, "mask": mask}, "lengths": {"x": x, "lengths": lengths}}[rest]
-    if rest == "lengths":
-        data["x"] = torch.where((torch.arange(6) < lengths[:, None])[..., None], x, 0.0)
+    x, mask, lengths = 1e9 + torch.randn(4, 6, 3).double(), torch.rand(4, 6, 3) < 0.9, torch.tensor([6, 5, 6, 2])
+    within = (torch.arange(6) < lengths[:, None])[..., None]
+    data = {"": {"x": x}, "mask": {"x": x * mask, "mask": mask}, "lengths": {"x": x * within, "lengths": lengths}}[rest]
     model = dvae.DynamicalVAE(*PAIR, SIZES)
     with pytest.raises(ValueError, match=r"coordinate 0 of x has mean 1e\+09 and .* model.standardise\('x'\).fit"):
         model.guide(data)
@@ -232,8 +230,7 @@ def test_levels_of_sequences_that_float32_loses_are_named():
     units.fit(1e9 + x - x.mean(1, keepdim=True))
 
 
-@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
-def test_training_reads_a_large_mean_in_float64(precision):
+def test_training_reads_a_large_mean_in_float64():
     torch.manual_seed(0)
     x, losses = torch.randn(6, 5, 3, dtype=torch.float64), []
     for mean in (0.0, 1e9):
@@ -241,6 +238,6 @@ def test_training_reads_a_large_mean_in_float64(precision):
         model = dvae.DynamicalVAE(*PAIR, SIZES, Attention(8, heads=2))
         model.standardise("x").fit(mean + x)
         torch.manual_seed(0)
-        dvae.fit(model, mean + x, steps=2, progress=False, precision=precision)
+        dvae.fit(model, mean + x, steps=2, progress=False, precision="bf16-mixed")
         losses.append(seeded(lambda m=model, d=mean + x: dvae.SequenceELBO().terms(m, d).bound))
     torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-2)
