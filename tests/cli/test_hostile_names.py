@@ -70,40 +70,35 @@ def is_drawn_as_it_is(figure, names=NAMES):
         assert any(blank(name) in blank(text) for text in texts), name
 
 
-def test_models_in_an_evaluation(models, windows):
+def evaluation(models, windows):
     result = evaluate(models, windows, samples=2, references=False, options={}, progress=True)
-    is_shown_as_it_is(result)
-    is_drawn_as_it_is(result.plot(["CRPS", "ELBO"]))
-
-
-def test_notes_and_protocols_in_an_evaluation(models, windows):
-    result = evaluate(models[LINES], windows, samples=2, references=False, progress=False)
-    result.protocol["name"] = "[/p] <b>"
-    result.data["title"] = ["given [/j]"]
-    result.options["[/o]"] = "[/v]"
+    result.protocol["name"], result.data["title"], result.options["[/o]"] = "[/p] <b>", ["given [/j]"], "[/v]"
     result.notes.extend(NAMES)
-    is_shown_as_it_is(result, (*NAMES, "[/p] <b>", "[/j]", "[/o] [/v]"))
+    return result, result.plot(["CRPS", "ELBO"]), ("[/p] <b>", "[/j]", "[/o] [/v]")
 
 
-def test_models_in_a_comparison(models, windows):
+def comparison(models, windows):
     result = dvae.compare(models, windows, particles=4, samples=2, contrasts=0, progress=True)
-    is_shown_as_it_is(result)
-    is_drawn_as_it_is(result.plot())
+    return result, result.plot(), ()
 
 
-def test_models_and_statistics_in_predictive_checks(models, windows):
-    statistics = {name: Statistic(lambda x: x.mean((-1, -2)), name) for name in NAMES[2:6]}
-    few = {name: models[name] for name in NAMES[:2]}
-    checks = predictive_checks(few, windows, statistics, samples=19)
-    is_shown_as_it_is(checks, NAMES[:6])
-    is_drawn_as_it_is(checks.plot(), NAMES[:6])
+def checks(models, windows):
+    statistics = {name: Statistic(lambda x: x.mean((-1, -2)), name) for name in NAMES}
+    result = predictive_checks({NAMES[0]: models[NAMES[0]]}, windows, statistics, samples=19)
+    return result, result.plot(), ()
 
 
-def test_quantities_and_equations_in_a_calibration():
+def calibration(models, windows):
     ranks = np.random.default_rng(0).integers(0, 4, (20, len(NAMES)))
-    calibration = Calibration(ranks, NAMES, 3, 5, 0, {"inference": "q(z_{[/x]$\\frac$})"})
-    is_shown_as_it_is(calibration, (*NAMES, "q(z_{[/x]$\\frac$})"))
-    is_drawn_as_it_is(calibration.plot(worst=1), ("q(z_{[/x]$\\frac$})",))
+    result = Calibration(ranks, NAMES, 3, 5, 0, {"inference": "q(z_{[/x]$\\frac$})"})
+    return result, result.plot(), ("q(z_{[/x]$\\frac$})",)
+
+
+@pytest.mark.parametrize("make", [evaluation, comparison, checks, calibration])
+def test_names_in_results(models, windows, make):
+    result, figure, others = make(models, windows)
+    is_shown_as_it_is(result, (*NAMES, *others))
+    is_drawn_as_it_is(figure, NAMES)
 
 
 def test_masks_in_an_audit():

@@ -152,7 +152,8 @@ def test_quantiles_are_those_of_the_draws_of_the_same_seed_beside_the_rows_of_th
     with np.load(tmp_path / "a.npz") as held:
         draws, truth = held["draws"].reshape(39, -1), held["truth"].ravel()
         assert held["draws"].shape[2] == held["truth"].shape[1] == 2
-        assert held["times"].shape[1] == 5 + 2
+        assert held["past"].shape[1] == held["times"].shape[1] - 2 == 5
+        assert set(held["sequence"]) == set(table["sequence"])
     for level in (0.025, 0.5, 0.9):
         wanted = np.quantile(draws, level, axis=0, method="weibull")
         np.testing.assert_allclose(table[f"q{1000 * level:03.0f}"], wanted, rtol=1e-14)
