@@ -73,15 +73,6 @@ def test_statistics_of_columns_that_share_no_unit_do_not_depend_on_their_units()
     assert "of all columns together are of numbers in their scales" in " ".join(str(first).split())
 
 
-def test_statistics_of_columns_that_share_a_unit_are_in_it():
-    windows = table(UNITS["shared"], factor=1024.0)
-    found = dvae.predictive_checks(dependent(windows), windows, samples=19, progress=False)
-    assert not found.notes
-    assert "mean (m)" in str(found)
-    own = windows.all()["x"][:, 4:].double().mean((-2, -1))
-    np.testing.assert_allclose(found["model", "forecast", "mean"].real, own, rtol=1e-5)
-
-
 def test_nothing_is_inferred_of_a_model_without_latents():
     windows = table(UNITS["shared"])
     latent = dvae.method("vae", latent=2, warm_up=1).build(windows.schema).eval()
