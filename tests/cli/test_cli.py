@@ -123,14 +123,6 @@ def test_version_is_printed(capsys):
     assert capsys.readouterr().out == f"dvae {dvae.__version__}\n"
 
 
-def test_a_typo_in_an_equation_is_shown_under_its_column(capsys, tmp_path):
-    equations = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t", "--inference", "q(z_t | x_t)"]
-    error = failure(capsys, "fit", "equations", *equations, "--out", str(tmp_path / "run"), code=2)
-    equation, caret = error.splitlines()[1:3]
-    assert equation[caret.index("^") - 1] == "t"
-    assert len(equation) == caret.index("^")
-
-
 def test_a_file_that_is_no_motion_is_refused_in_a_sentence(capsys, tmp_path, people):
     class Hostile:
         def __reduce__(self):

@@ -147,7 +147,6 @@ LONG_LIST = b"](" + b"K\x01" * 10**5 + b"e\x94"
 
 ATTACKS = {
     "dtype with fields at an address": one(dtype_state(b"(K\x03\x8c\x01|N\x8c\x01a\x85}K\x08K\x08K\x10t")),
-    "dtype with a subarray": one(dtype_state(b"(K\x03\x8c\x01|\x8c\x02f8K\x08\x85\x86NNK\x40K\x01K\x00t")),
     "dtype of text with an object as its field": one(
         G
         + b"(K\x01K\x01\x85cnumpy\ndtype\n\x8c\x02S8\x89\x88\x87R(K\x03\x8c\x01|N\x8c\x01a\x85}\x8c\x01a"
@@ -170,7 +169,6 @@ ATTACKS = {
     "forty doublings as a shape": one(filled(doublings(40), F4, b"C\x00")),
     "forty doublings as a codec": one(b"c_codecs\nencode\n\x8c\x01a" + doublings(40) + b"\x86R"),
     "forty doublings as a state": one(G + doublings(40) + b"b"),
-    "tuples in tuples in tuples": b"\x80\x04)" + b"\x85" * 500_000 + b".",
     "arrays in arrays in arrays": b"\x80\x04"
     + (G + b"(K\x01)" + OBJECT + b"\x89](") * 2000
     + b"N"
@@ -182,7 +180,6 @@ ATTACKS = {
     "a number of 10^6 digits": b"L" + b"7" * 10**6 + b"L\n.",
     "bytes of 2^60": b"\x80\x04\x8e" + struct.pack("<Q", 2**60) + b".",
     "a billion instructions": b"\x80\x04" + b"N" * (2**21) + b".",
-    "dictionaries without end": b"\x80\x04" + b"}" * (2**20 - 2) + b".",
     "text encoded again and again": b"\x80\x04"
     + LONG_TEXT
     + b"c_codecs\nencode\n\x94h\x00\x8c\x06latin1\x86\x94"

@@ -131,42 +131,39 @@ def labels(path):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("read", "content", "message"),
     [
-        (b"split,clip,style\ntrain,walk\n", "row 2 has 2 cells, the header 3"),
-        (b"split,clip,style,style\ntrain,walk,a,b\n", "column 'style' is there twice"),
-        (b"split,clip\ntrain,walk\n" + b"a" * 200_000 + b",b\n", "row 3 is no row of a csv file .*field larger"),
-        (b"", "expected a column named clip"),
+        (labels, b"split,clip,style\ntrain,walk\n", "row 2 has 2 cells, the header 3"),
+        (labels, b"split,clip,style,style\ntrain,walk,a,b\n", "column 'style' is there twice"),
+        (
+            labels,
+            b"split,clip\ntrain,walk\n" + b"a" * 200_000 + b",b\n",
+            "row 3 is no row of a csv .*field larger",
+        ),
+        (labels, b"", "expected a column named clip"),
+        (read_paths, b"a_x,a_y,a_z\n1,2,inf\n", "the path of a has inf in frame 0"),
+        (read_paths, b"a_x,a_y,a_z\n1,2,3\n1,-1e39,3\n", r"the path of a has -1e\+39 in frame 1; expected metres"),
+        (read_paths, b"a_x,a_y,a_z\n1,2," + b"1" * 200_000 + b"\n", "field larger"),
+        (read_paths, b"a_x,a_y,a_z\n1,2,\x00\n", "is no number|is no row"),
+        (read_paths, b"\xffa_x,a_y,a_z\n1,2,3\n", "is no text"),
+        (
+            read_paths,
+            b"x" * 100_000 + b",a_y,a_z\n1,2,3\n",
+            "a header of columns|column 1 is .* expected a name",
+        ),
     ],
 )
-def test_labels_that_are_no_table_are_told(tmp_path, content, message):
-    (tmp_path / "labels.csv").write_bytes(content)
-    with pytest.raises(ValueError, match=rf"labels\.csv: .*{message}"):
-        labels(tmp_path / "labels.csv")
+def test_labels_and_paths_that_are_none_are_told(tmp_path, read, content, message):
+    (tmp_path / "a.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"a\.csv: .*({message})"):
+        read(tmp_path / "a.csv")
+    assert told(read, tmp_path / "a.csv")
 
 
 def test_labels_are_read_with_a_mark_of_their_encoding_and_quotes(tmp_path):
     text = '\ufeffsplit,clip,style\n\ntrain,walk,"a, ""b"""\n'
     (tmp_path / "labels.csv").write_text(text, encoding="utf-8")
     assert labels(tmp_path / "labels.csv")["train", "walk"].labels["style"] == 'a, "b"'
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"a_x,a_y,a_z\n1,2,inf\n", "the path of a has inf in frame 0"),
-        (b"a_x,a_y,a_z\n1,2,3\n1,-1e39,3\n", r"the path of a has -1e\+39 in frame 1; expected metres"),
-        (b"a_x,a_y,a_z\n1,2," + b"1" * 200_000 + b"\n", "field larger"),
-        (b"a_x,a_y,a_z\n1,2,\x00\n", "is no number|is no row"),
-        (b"\xffa_x,a_y,a_z\n1,2,3\n", "is no text"),
-        (b"x" * 100_000 + b",a_y,a_z\n1,2,3\n", "expected a header of columns|column 1 is .* expected a name"),
-    ],
-)
-def test_paths_that_are_none_are_told(tmp_path, content, message):
-    (tmp_path / "paths.csv").write_bytes(content)
-    with pytest.raises(ValueError, match=rf"paths\.csv: .*({message})"):
-        read_paths(tmp_path / "paths.csv")
-    assert told(read_paths, tmp_path / "paths.csv")
 
 
 def write_path(path, columns, rows, blank=0):

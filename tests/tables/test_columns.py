@@ -55,13 +55,6 @@ def test_a_schema_comes_back_from_toml_with_its_cut_and_from_json(columns, cut):
     assert Columns.from_config(json.loads(json.dumps(columns.config()))) == columns
 
 
-def test_columns_are_real_targets_where_nothing_is_said():
-    assert Columns.from_toml("[columns.a]\n[columns.b]\nrole = 'known'") == Columns((Column("a"), Column("b", "known")))
-    assert Columns.from_toml("id = 's'\n[columns.a]").id == ("s",)
-    assert read_schema("[columns.a]")[1] is None
-    assert read_schema("[cut]\ntest = 0.3") == (None, Cut(test=0.3))
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

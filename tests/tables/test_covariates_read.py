@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import dvae
 from dvae.data.schema import SchemaError
@@ -89,15 +87,6 @@ def test_context_that_a_model_does_not_read_may_be_there_and_does_not_come_back(
     assert view(batch) == batch
     assert view.inverse(batch).keys() == {"x"}
     assert view.keeps_volume
-
-
-@settings(max_examples=20)
-@given(st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3)), min_size=1, max_size=5), st.integers(1, 4))
-def test_coordinates_are_read_by_their_mean_and_scale(told, steps):
-    units = Units(len(told), [Coordinate(mean, scale) for mean, scale in told]).double()
-    values = torch.randn(2, steps, len(told), dtype=torch.float64)
-    mean, scale = torch.tensor(told).double().T
-    torch.testing.assert_close(units(values), (values - mean) / scale)
 
 
 def test_logarithms_are_read_from_a_floor_on_and_have_gradients_everywhere():
