@@ -53,77 +53,50 @@ def test_methods_are_listed_without_importing_them():
 
 
 def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
-    assert main(["show", "hit-dvae", "--out", str(tmp_path / "graph.png")]) == 0
-    printed = capsys.readouterr().out
+    def shown(*arguments):
+        assert main(["show", *arguments]) == 0
+        return capsys.readouterr().out
+
+    printed = shown("hit-dvae", "--out", str(tmp_path / "graph.png"))
     assert "∏_t p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)" in printed
     assert "z_{<t}" in next(line for line in printed.splitlines() if "q(z_t" in line and "│" in line)
     assert "not exact" in printed
     assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
-    equations = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(z_t | z_{t-1}, x_{t:T})"]
-    assert main(["show", *equations]) == 0
-    assert "exact: the guide reads everything" in capsys.readouterr().out
-    assert main(["show", *equations[:2]]) == 0
-    assert "q(z_t | z_{t-1}, x_{>=t})" in capsys.readouterr().out
-    assert main(["show", "--generative", "p(x_t | x_{<t})", "--inference", ""]) == 0
-    assert "nothing is latent" in capsys.readouterr().out
-
-
-def test_wrong_arguments_exit_with_2(capsys, tmp_path):
-    out = ["--out", str(tmp_path / "run")]
-    assert "did you mean 'hit-dvae'" in failure(capsys, "show", "hitdvae", code=2)
-    assert "--generative, with --inference" in failure(capsys, "show", code=2)
-    assert "not both" in failure(capsys, "show", "srnn", "--generative", "p(z_t) p(x_t | z_t)", code=2)
-    unknown = failure(capsys, "fit", "hitdvae", *out, code=2)
-    assert all(name in unknown for name in dvae.methods())
-    for command in ("fit", "resume", "data get"):
-        assert f"dvae {command} --help" in failure(capsys, *command.split(), code=2)
-    assert "did you mean 'data info'" in failure(capsys, "data", "inf", code=2)
-    assert "--step is no option of dvae sweep (did you mean '--steps'" in failure(
-        capsys, "sweep", "--step", "4", code=2
-    )
-    assert "did you mean 'adam'" in failure(capsys, "fit", "vae", *out, "--optimizer", "adm", code=2)
-    assert "--steps" in failure(capsys, "fit", "vae", *out, "--step", "3", code=2)
-    assert "emission" in failure(capsys, "fit", "vae", *out, "--emission", "loud", code=2)
-    assert "batch_size is 0" in failure(capsys, "fit", "vae", *out, "--batch-size", "0", code=2)
-    assert "cmu8" in failure(capsys, "fit", "vae", *out, "--protocol", "cmu", code=2)
-    assert not (tmp_path / "run").exists()
+    assert "exact: the guide reads everything" in shown(*EQUATIONS)
+    assert "q(z_t | z_{t-1}, x_{>=t})" in shown(*EQUATIONS[:2])
+    assert "nothing is latent" in shown("--generative", "p(x_t | x_{<t})", "--inference", "")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("fit vae --learning-rate -1", "learning_rate is -1.0; it must be finite and at least 0"),
-        ("fit vae --learning-rate nan", "learning_rate is nan"),
-        ("fit vae --decay 1.5", "decay is 1.5; it must be between 0 and 1"),
-        ("fit vae --warm-up -3", "warm_up is -3; it must be at least 0"),
-        ("fit vae --self-feeding 2", "self_feeding is 2.0"),
-        ("fit vae --latent 0", "latent is 0"),
-        ("fit vae --accelerator abacus", "abacus"),
-        ("resume RUN --learning-rate nan", "learning_rate is nan"),
+        ("show", "--generative, with --inference"),
+        ("show srnn --generative p(x_t)", "not both"),
+        ("fit", "dvae fit --help"),
+        ("data get", "dvae data get --help"),
+        ("sweep --step 4", "--step is no option of dvae sweep (did you mean '--steps'"),
+        ("fit vae --optimizer adm --out run", "did you mean 'adam'"),
+        ("fit vae --learning-rate -1 --out run", "learning_rate is -1.0; it must be finite and at least 0"),
+        ("fit vae --decay 1.5 --out run", "decay is 1.5; it must be between 0 and 1"),
+        ("fit vae --latent 0 --out run", "latent is 0"),
+        ("fit vae --batch-size 0 --out run", "batch_size is 0"),
+        ("fit vae --accelerator abacus --out run", "abacus"),
+        ("fit vae --out FILE", "is a file; name a directory"),
         ("resume RUN --steps 0", "steps is 0"),
         ("evaluate RUN --samples 0", "--samples is 0; it must be at least 1"),
-        ("evaluate RUN --batch-size 0", "--batch-size is 0"),
         ("evaluate RUN --bound-particles -1", "--bound-particles is -1; it must be at least 0"),
         ("evaluate RUN --out .", "--out . is a directory; name a file"),
         ("evaluate RUN --figure scores.xyz", "--figure scores.xyz: the end of the name is the format, one of"),
-        ("forecast RUN --out .", "--out . is a directory"),
-        ("show srnn --steps 0", "--steps is 0"),
-        ("show srnn --out graph.xyz", "--out graph.xyz: the end of the name is the format"),
+        ("evaluate", "at least one run"),
+        ("evaluate RUN RUN", "named twice"),
         ("show srnn --out graph", "--out graph: the end of the name is the format"),
     ],
 )
-def test_numbers_and_files_that_make_no_sense_exit_with_2_before_any_work(
-    capsys, tmp_path, monkeypatch, arguments, message
-):
+def test_what_makes_no_sense_exits_with_2_first(capsys, tmp_path, monkeypatch, people, fitted, arguments, message):
     monkeypatch.chdir(tmp_path)
-    out = ["--out", "run"] if arguments.startswith("fit") else []
-    error = failure(capsys, *arguments.split(), *out, code=2)
+    error = failure(capsys, *arguments.replace("RUN", str(fitted)).replace("FILE", str(people)).split(), code=2)
     assert message in " ".join(error.replace("│", " ").split())
     assert not list(tmp_path.iterdir())
-
-
-def test_a_run_is_a_directory(capsys, people):
-    assert "is a file; name a directory" in failure(capsys, "fit", "vae", "--out", str(people), code=2)
 
 
 @pytest.mark.parametrize("arguments", [["show", "vae", "--out", "graph.png"], ["list"], ["fit", "--help"]])
@@ -150,38 +123,21 @@ def test_version_is_printed(capsys):
     assert capsys.readouterr().out == f"dvae {dvae.__version__}\n"
 
 
-def test_a_typo_in_an_equation_is_shown_under_its_column(capsys, tmp_path):
-    equations = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t", "--inference", "q(z_t | x_t)"]
-    error = failure(capsys, "fit", "equations", *equations, "--out", str(tmp_path / "run"), code=2)
-    equation, caret = error.splitlines()[1:3]
-    assert equation[caret.index("^") - 1] == "t"
-    assert len(equation) == caret.index("^")
-
-
 def test_a_file_that_is_no_motion_is_refused_in_a_sentence(capsys, tmp_path, people):
     class Hostile:
         def __reduce__(self):
             return os.system, ("true",)
 
-    hostile, text, metres = tmp_path / "hostile.npz", tmp_path / "text.npz", tmp_path / "far" / "metres.npz"
+    hostile, text, metres = (tmp_path / f"{name}.npz" for name in ("hostile", "text", "metres"))
     np.savez(hostile, positions_3d=np.array(Hostile(), dtype=object))
     text.write_text("not a zip archive")
     shutil.copy(people.with_name("people.npz.skeleton.json"), tmp_path / "skeleton.json")
-    metres.parent.mkdir()
-    shutil.copy(people.with_name("people.npz.skeleton.json"), metres.parent / "skeleton.json")
     np.savez(metres, **{"train/a": 1000 * np.load(people)["train/person_0000"]})
     assert "no such file" in failure(capsys, "data", "info", str(tmp_path / "nowhere.npz"))
     assert "system" in failure(capsys, "data", "info", str(hostile))
     assert str(text) in failure(capsys, "data", "info", str(text))
     assert "millimetres" in failure(capsys, "data", "info", str(metres))
     assert "no clips; 1 were skipped" in failure(capsys, "data", "info", str(metres), "--skip-bad")
-
-
-def test_data_info_tells_what_a_file_holds(capsys, people):
-    assert main(["data", "info", str(people)]) == 0
-    printed = capsys.readouterr().out
-    assert "17 joints" in printed
-    assert "train" in printed
 
 
 def test_the_archive_of_human36m_needs_no_skeleton(capsys, tmp_path):
@@ -222,8 +178,6 @@ def test_runs_of_other_windows_are_not_put_in_one_table(capsys, run, people, tmp
     assert main(["fit", "vae", "--data", data, "--out", str(other), "--steps", "5", *SMALL]) == 0
     capsys.readouterr()
     assert "other test windows" in failure(capsys, "evaluate", str(run), str(other))
-    assert "named twice" in failure(capsys, "evaluate", str(run), str(run), code=2)
-    assert "at least one run" in failure(capsys, "evaluate", code=2)
 
 
 def test_forecasts_continue_what_was_observed(capsys, run, tmp_path):
@@ -242,7 +196,6 @@ def test_forecasts_continue_what_was_observed(capsys, run, tmp_path):
         assert file["forecasts"].shape[::2] == (10, 80, 3)
         assert set(file["split"]) == {"train"}
     assert "no clip 'nobody'" in failure(capsys, "forecast", str(run), "--out", str(out), "--clip", "nobody")
-    assert "at least 1" in failure(capsys, "forecast", str(run), "--out", str(out), "--samples", "0", code=2)
 
 
 def test_equations_of_ones_own_are_fitted_and_read_back(people, tmp_path):
@@ -283,7 +236,6 @@ def test_motion_is_completed_along_the_paths_of_a_clip_or_a_file(capsys, tracker
     assert done.observed.shape == (1, 1, 17, 3)
     assert done.keys[0][1] == "person_0003"
     assert np.array_equal(complete(*joints).forecasts, done.forecasts)
-    assert not np.array_equal(complete(*joints, "--seed", "1").forecasts, done.forecasts)
     still = complete(*joints, "--temperature", "0").forecasts
     assert np.array_equal(still[0], still[1])
     assert not np.array_equal(complete(*joints, "--window", "0").truth, complete(*joints, "--window", "1").truth)
@@ -291,13 +243,10 @@ def test_motion_is_completed_along_the_paths_of_a_clip_or_a_file(capsys, tracker
     rows = ["LWrist_x,LWrist_y,LWrist_z", *(f"{x},{y},{z}" for x, y, z in hand), ",,"]
     (tmp_path / "hand.csv").write_text("\n".join(rows))
     np.savez(tmp_path / "hand.npz", LWrist=np.concatenate([hand, np.full((1, 3), np.nan)]))
-    drawn = [
-        complete("--paths", str(tmp_path / f"hand.{kind}"), "--samples", "1", "--exact") for kind in ("csv", "npz")
-    ]
-    assert drawn[0].forecasts.shape == (1, 1, 31, 17, 3)
-    for each in drawn:
-        assert np.abs(each.forecasts[0, 0, :30, 13] - hand).max() < 1e-4
-    assert main(["animate", str(out), "--out", str(tmp_path / "walk.html")]) == 0
+    for kind in ("csv", "npz"):
+        drawn = complete("--paths", str(tmp_path / f"hand.{kind}"), "--samples", "1", "--exact").forecasts
+        assert drawn.shape == (1, 1, 31, 17, 3)
+        assert np.abs(drawn[0, 0, :30, 13] - hand).max() < 1e-4
     error = failure(
         capsys, *run, "--out", str(out), "--joints", "LWrist", "--paths", str(tmp_path / "hand.csv"), code=2
     )
@@ -314,14 +263,9 @@ def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
     assert "no joint 'RPaw'" in failure(capsys, "evaluate", str(tracker), "--joints", "RPaw", *out)
     error = failure(capsys, "evaluate", str(fitted), "--joints", "RFoot", *out, code=2)
     assert "are for methods that take trajectories" in error
-    error = failure(capsys, "evaluate", str(fitted), "--joints", *out, code=2)
-    assert "are for methods that take trajectories" in error
     assert "are given no joints" in failure(capsys, "evaluate", str(tracker), "--exchange", ".01", *out)
-    scored = ["evaluate", str(tracker), "--joints", "RFoot", "--samples", "2"]
-    assert main([*scored, "--exchange", "2"]) == 0
+    assert main(["evaluate", str(tracker), "--joints", "RFoot", "--samples", "2", "--exchange", "2"]) == 0
     assert dvae.Evaluation.load(tracker / "evaluation-RFoot-exchanged-2.json").data["exchanged"]["threshold"] == 2
-    assert main([*scored, "--temperature", "0"]) == 0
-    assert (tracker / "evaluation-RFoot-temperature-0.json").exists()
 
 
 def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, tracker, tmp_path):
@@ -339,50 +283,10 @@ def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
     assert "which takes no paths" in failure(capsys, "forecast", str(fitted), *out, *along, code=2)
     assert "by --joints or --paths" in failure(capsys, "forecast", str(tracker), *out, "--exact", code=2)
     assert "no joint 'tail'" in failure(capsys, "forecast", str(tracker), *out, "--joints", "tail")
-    assert "at least 1" in failure(capsys, "forecast", str(tracker), *out, "--samples", "0", code=2)
     assert "none.csv" in failure(capsys, "forecast", str(tracker), *out, "--paths", str(tmp_path / "none.csv"))
     error = failure(capsys, "fit", "trajevae", "--data", str(people), "--out", str(tmp_path / "run"), "--steps", "2")
     assert "observed=1, such as" in error
     assert "simulated-trajectories" in error
-
-
-def test_a_loaded_run_forecasts_as_the_fitted_model_does(people, tmp_path):
-    data = MotionData.open(people)
-    training = dvae.Training(steps=5, batch_size=4, validate_every=5, progress=False)
-    dvae.fit(dvae.method("vrnn", latent=3, width=8, warm_up=4), data, out=tmp_path / "a", **vars(training))
-    loaded = dvae.load(tmp_path / "a")
-    x = data.windows("test").all()["x"][:, :15]
-    draws = []
-    for model in (loaded.model, dvae.load(tmp_path / "a").model):
-        torch.manual_seed(3)
-        draws.append(model.forecast({"x": x}, 5, 2)["x"])
-    assert torch.equal(*draws)
-    assert loaded.method == dvae.method("vrnn", latent=3, width=8, warm_up=4).suited(data)
-    assert loaded.data.protocol == data.protocol
-
-
-def test_a_resumed_run_is_the_uninterrupted_one(people, tmp_path, capsys):
-    class Stop:
-        def on_step(self, state):
-            if state.step == 7:
-                raise KeyboardInterrupt
-
-        def on_validation(self, state):
-            pass
-
-        def on_end(self, state):
-            pass
-
-    method = dvae.method("vrnn", latent=3, width=8, warm_up=8, self_feeding=0.5)
-    training = dvae.Training(steps=12, batch_size=4, validate_every=5, decay=0.5, progress=False)
-    data = MotionData.open(people)
-    dvae.fit(method, data, out=tmp_path / "whole", **vars(training))
-    with pytest.raises(KeyboardInterrupt, match="interrupted after step 7"):
-        dvae.fit(method, data, out=tmp_path / "parts", callbacks=[Stop()], **vars(training))
-    assert main(["resume", str(tmp_path / "parts")]) == 0
-    assert "finished at step 12" in capsys.readouterr().out
-    whole, parts = ((tmp_path / name / "last.safetensors").read_bytes() for name in ("whole", "parts"))
-    assert whole == parts
 
 
 def log(run):
@@ -393,10 +297,12 @@ def log(run):
 def test_a_longer_run_is_laid_out_anew(people, tmp_path):
     """The learning rate falls over the last half of all steps, self-feeding rises over their first half."""
     out, options = tmp_path / "run", ["--width", "8", "--self-feeding", "0.5", *SMALL]
-    fit = ["fit", "vrnn", "--data", str(people), "--out", str(out), "--learning-rate", "0.01"]
+    fit = ["fit", "vrnn", "--data", str(people), "--out", str(out), "--learning-rate", "0.01", "--tensorboard"]
     assert main([*fit, "--steps", "20", *options]) == 0
     assert [row["learning_rate"] for row in log(out)] == pytest.approx([0.01, 0.001])
-    assert main(["resume", str(out), "--steps", "60"]) == 0
+    assert len(list(out.glob("events.*"))) == 1
+    assert main(["resume", str(out), "--steps", "60", "--tensorboard"]) == 0
+    assert len(list(out.glob("events.*"))) == 2
     rates = [row["learning_rate"] for row in log(out)]
     assert rates[2:] == pytest.approx([0.01, 0.01 * 21 / 30, 0.01 * 11 / 30, 0.01 / 30])
     feeding = dvae.load(out).method.train({}, steps=60).feeding
@@ -413,14 +319,6 @@ def test_a_run_of_a_gpu_goes_on_without_one(people, tmp_path, capsys, monkeypatc
     config.write_text(config.read_text().replace('"accelerator": "auto"', '"accelerator": "cuda"'))
     assert "'auto' takes what there is" in failure(capsys, "resume", str(out), "--steps", "5")
     assert main(["resume", str(out), "--steps", "5", "--accelerator", "auto"]) == 0
-
-
-def test_tensorboard_files_lie_in_the_run(people, tmp_path):
-    out = tmp_path / "run"
-    assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "4", *SMALL, "--tensorboard"]) == 0
-    before = len(list(out.glob("events.*")))
-    assert main(["resume", str(out), "--steps", "5", "--tensorboard"]) == 0
-    assert (before, len(list(out.glob("events.*")))) == (1, 2)
 
 
 def test_of_several_processes_the_first_speaks_and_each_tells_why_it_fails(capsys, monkeypatch):
@@ -503,22 +401,12 @@ def test_a_damaged_run_is_refused(capsys, run):
     ("keys", "value"),
     [
         ([], []),
-        ([], None),
+        (["format"], 3),
         (["method"], "vae"),
         (["method", "latent"], "wide"),
-        (["method", "hidden"], "wide"),
-        (["method", "method"], "nothing"),
-        (["data"], 3),
-        (["data", "path"], 3),
         (["data", "fingerprint"], None),
-        (["schema", "protocol", "observed"], "many"),
-        (["schema", "protocol", "train"], 3),
         (["schema", "protocol", "unknown"], 3),
-        (["training"], []),
-        (["training", "steps"], "many"),
-        (["training", "learning_rate"], "fast"),
         (["training", "learning_rate"], {"schedule": "Falling"}),
-        (["training", "seed"], 0.5),
     ],
 )
 def test_a_config_of_wrong_types_is_refused_in_a_sentence(capsys, run, keys, value):
@@ -529,7 +417,7 @@ def test_a_config_of_wrong_types_is_refused_in_a_sentence(capsys, run, keys, val
         content[keys[-1]] = value
     (run / "config.json").write_text(json.dumps(config if keys else value))
     error = failure(capsys, "resume", str(run), "--steps", "12")
-    assert "config.json" in error
+    assert "config.json" in error or "is a run of format 3, and this version of dvae reads format 2" in error
     assert "looks like a bug" not in error
 
 
@@ -542,12 +430,10 @@ def test_changed_or_moved_data_are_noticed(capsys, people, tmp_path, monkeypatch
     Path("elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     capsys.readouterr()
-    assert "people.npz is not here" in failure(capsys, "evaluate", "../run")
     assert main(["evaluate", "../run", "--data", "../people.npz", "--samples", "2"]) == 0
     motion.save(tmp_path / "people.npz", motion.simulate(clips=14, frames=90, seed=5))
-    capsys.readouterr()
-    assert "has changed since ../run was fitted" in failure(capsys, "resume", "../run", "--data", "../people.npz")
     monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
     assert "has changed since run was fitted" in failure(capsys, "evaluate", "run")
 
 
@@ -562,13 +448,7 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
     other = ["--data", "other/people.npz"]
     assert dvae.load("run").model.sizes["x"] == 48
     capsys.readouterr()
-    for command in (
-        "forecast run --out f.npz",
-        "evaluate run",
-        "compare run",
-        "check calibration run",
-        "resume run --steps 6",
-    ):
+    for command in ("forecast run --out f.npz", "evaluate run", "compare run", "resume run --steps 6"):
         assert "or other data (--data)" in failure(capsys, *command.split())
     assert "own/people.npz is not here" in failure(capsys, "resume", "run", "--data", "own/people.npz")
     assert "has changed since" in failure(capsys, "resume", "run", *other)
@@ -603,13 +483,7 @@ def test_a_guide_is_put_beside_its_posterior(capsys, run, tmp_path):
     assert {path.name for path in tmp_path.glob("*.png")} == {"a-stein.png", "a-posterior.png"}
 
 
-def test_a_run_of_another_format_is_refused(capsys, run):
-    config = json.loads((run / "config.json").read_text())
-    (run / "config.json").write_text(json.dumps(config | {"format": 3}))
-    assert "is a run of format 3, and this version of dvae reads format 2" in failure(capsys, "resume", str(run))
-
-
-def test_data_of_other_joints_are_refused(capsys, run, tmp_path):
+def test_data_of_other_joints_are_refused_unless_they_mean_the_same(capsys, run, tmp_path):
     clips = motion.simulate(clips=14, frames=90, seed=1)
     skeleton = replace(clips.skeleton, name="stranger", fps=60.0)
     motion.save(tmp_path / "far" / "people.npz", motion.MotionSet(list(clips), skeleton, "people"))
@@ -617,11 +491,8 @@ def test_data_of_other_joints_are_refused(capsys, run, tmp_path):
     assert f"people.npz does not fit {run}: " in error
     assert "skeleton.name is 'stranger', not 'walker'" in error
     assert "skeleton.fps is 60.0, not 30.0" in error
-
-
-def test_data_whose_joints_mean_those_of_the_run_are_taken_and_it_is_said(capsys, run, tmp_path):
-    people = motion.simulate(clips=8, frames=90, seed=5)
-    motion.write_motion(tmp_path / "bvh", people, "bvh")
+    other = motion.simulate(clips=8, frames=90, seed=5)
+    motion.write_motion(tmp_path / "bvh", other, "bvh")  # whose joints mean those of the run
     told = ["forecast", str(run), "--data", str(tmp_path / "bvh"), "--out", str(tmp_path / "f.npz"), "--samples", "1"]
     assert main(told) == 0
     assert "its joints are taken for those of" in capsys.readouterr().err
@@ -667,73 +538,52 @@ def test_a_further_ctrl_c_changes_no_exit_code():
         signal.signal(signal.SIGINT, before)
 
 
-def test_clips_without_a_test_window_are_named(tmp_path, capsys):
-    (long,) = motion.simulate(clips=1, frames=400)
-    clips = [
-        replace(long.between(0, frames), split="all", name=name) for name, frames in (("long", 400), ("short", 90))
-    ]
-    motion.save(tmp_path / "two.npz", motion.MotionSet(clips, motion.WALKER))
-    out = ["--out", str(tmp_path / "run"), "--steps", "1", "--batch-size", "2", "--warm-up", "1"]
-    assert main(["fit", "vae", "--data", str(tmp_path / "two.npz"), *out]) == 0
-    told = capsys.readouterr().err
-    assert "1 test windows of 15 + 60 frames, one every 15 frames of 1 clips; too short for one: short" in told
-    assert "train windows of 15 + 60 frames" in told
+def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, tmp_path, capsys):
+    """Models of positions, fitted to an npz, and of turns, to BVH files of the same motion, score alike on either."""
+    folder, npz, options = tmp_path / "bvh", tmp_path / "all.npz", ["--samples", "3"]
+    motion.write_motion(folder, motion.read_motion(people), "bvh")
+    motion.save(npz, motion.read_motion(folder))
+    runs = [str(tmp_path / form) for form in ("positions", "6d")]
+    for data, run, form in zip((npz, folder), runs, ("positions", "6d"), strict=True):
+        fit = ["fit", "srnn", "--data", str(data), "--representation", form, "--steps", "5", *SMALL]
+        assert main([*fit, "--out", run]) == 0
 
+    def table(*arguments):
+        out = tmp_path / "evaluation.json"
+        assert main(["evaluate", *arguments, *options, "--out", str(out)]) == 0
+        return dvae.Evaluation.load(out)
 
-def test_a_model_of_turns_forecasts_bones_of_one_length(people, tmp_path, capsys):
-    fit = ["fit", "vae", "--data", str(people), "--representation", "6d", "--steps", "5", *SMALL]
-    assert main([*fit, "--out", str(tmp_path / "run")]) == 0
-    out = str(tmp_path / "f.npz")
-    assert main(["forecast", str(tmp_path / "run"), "--samples", "2", "--horizon", "4", "--out", out]) == 0
-    futures = motion.Forecasts.load(out)
-    lengths = futures.skeleton.bone_lengths(futures.forecasts)
+    forms = table(*runs, "--data", str(npz))
+    assert any("bounds of 6d: densities of turns" in note for note in forms.notes)
+    for run in runs:
+        name = Path(run).name
+        for other in (table(run, "--data", str(npz)), table(run, "--data", str(folder))):
+            assert {score: value.mean for score, value in other["srnn"].items()} == pytest.approx(
+                {score: value.mean for score, value in forms[name].items()}, rel=1e-4, abs=1e-6
+            )
+    capsys.readouterr()
+    assert "bounds compare where they are densities of the same" in failure(
+        capsys, "compare", *runs, "--data", str(npz)
+    )
+    page, futures = tmp_path / "page.html", str(tmp_path / "f.npz")
+    assert main(["report", *runs, "--data", str(npz), "--windows", "1", "--out", str(page)]) == 0
+    assert page.read_text(encoding="utf-8").count("<canvas") == 2
+    assert main(["forecast", runs[1], "--samples", "2", "--horizon", "4", "--out", futures]) == 0
+    found = motion.Forecasts.load(futures)
+    lengths = found.skeleton.bone_lengths(found.forecasts)  # each has one
     np.testing.assert_allclose(lengths, lengths[:1, :, :1].repeat(2, 0).repeat(4, 2), atol=1e-5)
     other = ["fit", "gsps", "--data", str(people), "--representation", "6d", "--out", str(tmp_path / "other")]
     assert "gsps reads positions of joints" in failure(capsys, *other, "--steps", "2")
 
 
-def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, tmp_path, capsys):
-    """Runs on BVH files and on an npz of the same motion, of models of positions and of turns, in one table."""
-    folder, npz, runs = tmp_path / "bvh", tmp_path / "all.npz", {}
-    motion.write_motion(folder, motion.read_motion(people), "bvh")
-    motion.save(npz, motion.read_motion(folder))
-    for data in (folder, npz):
-        for form in ("positions", "6d"):
-            runs[data, form] = str(tmp_path / f"{data.stem}-{form}")
-            fit = ["fit", "srnn", "--data", str(data), "--representation", form, "--steps", "5", *SMALL]
-            assert main([*fit, "--out", runs[data, form]]) == 0
-
-    def table(*arguments):
-        out = tmp_path / "evaluation.json"
-        assert main(["evaluate", *arguments, "--samples", "3", "--out", str(out)]) == 0
-        return dvae.inference.evaluation.evaluation.Evaluation.load(out)
-
-    forms = table(runs[npz, "positions"], runs[npz, "6d"])
-    assert any("bounds of all-6d: densities of turns" in note for note in forms.notes)
-    for form in ("positions", "6d"):
-        alone = table(runs[npz, form])
-        assert alone["srnn"] == forms[f"all-{form}"]
-        for other in (table(runs[folder, form]), table(runs[npz, form], "--data", str(folder))):
-            assert "srnn" in other.rows
-            for row in other.rows:  # neighbours are those in a run's own data alone
-                assert {name: score.mean for name, score in other[row].items()} == pytest.approx(
-                    {name: score.mean for name, score in alone[row].items()}, rel=1e-4, abs=1e-6
-                )
-    capsys.readouterr()
-    assert "bounds compare where they are densities of the same" in failure(
-        capsys, "compare", runs[npz, "positions"], runs[npz, "6d"]
-    )
-    page = tmp_path / "page.html"
-    assert main(["report", runs[npz, "positions"], runs[npz, "6d"], "--windows", "1", "--out", str(page)]) == 0
-    assert page.read_text(encoding="utf-8").count("<canvas") == 2
-
-
 def test_forecasts_become_tubes_on_validation_windows_or_on_clips_of_a_label(capsys, tmp_path):
     clips = motion.simulate(clips=30, frames=90, seed=1)
     styled = [replace(clip, labels={"style": "ab"[place % 2]}) for place, clip in enumerate(clips)]
+    styled[0] = replace(styled[0].between(0, 60), split="test", name="short")
     motion.save(tmp_path / "people.npz", motion.MotionSet(styled, clips.skeleton, clips.name))
     run = tmp_path / "run"
     assert main(["fit", "vae", "--data", str(tmp_path / "people.npz"), "--out", str(run), "--steps", "5", *SMALL]) == 0
+    assert "too short for one: short" in capsys.readouterr().err
     assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5"]) == 0
     opened = dvae.load(run).data
     assert dvae.Tubes.load(run / "coverage.json").clips == len(opened.windows("validation").clips)

@@ -24,6 +24,15 @@ def failure(capsys, *arguments, code=1):
     return error
 
 
+def change(run, keys, value):
+    """Set one value of a run's config."""
+    config = content = json.loads((run / "config.json").read_text())
+    for key in keys[:-1]:
+        content = content[key]
+    content[keys[-1]] = value
+    (run / "config.json").write_text(json.dumps(config))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Two files of people, and a run fitted on the first; nobody writes to them."""
@@ -45,11 +54,7 @@ def test_a_fit_says_what_to_do_with_the_run_and_resumes(capsys, folder, tmp_path
     assert main(["fit", *SMALL, "--data", str(own), "--out", str(out), "--steps", "4", "--scaling", "deviation"]) == 0
     assert f"dvae evaluate {out}" in capsys.readouterr().out
     config = json.loads((out / "config.json").read_text())
-    assert (config["data"]["kind"], config["data"]["cut"], config["schema"]["kind"]) == (
-        "segments",
-        "clips",
-        "segments",
-    )
+    assert (config["data"]["cut"], config["schema"]["kind"]) == ("clips", "segments")
     assert len(config["schema"]["timed"]["deviation"]) == 102
     assert main(["resume", str(out), "--steps", "5"]) == 0
     assert len(dvae.load(out).data.windows("test")) == 2
@@ -59,9 +64,7 @@ def test_a_fit_says_what_to_do_with_the_run_and_resumes(capsys, folder, tmp_path
 
 def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder, run, tmp_path):
     second = shutil.copytree(run, tmp_path / "second")
-    config = json.loads((second / "config.json").read_text())
-    config["training"]["seed"] = 1
-    (second / "config.json").write_text(json.dumps(config))
+    change(second, ("training", "seed"), 1)
     figure = tmp_path / "boxes.png"
     assert main(["evaluate", str(run), str(second), "--figure", str(figure), "--bound-particles", "2"]) == 0
     printed = capsys.readouterr().out
@@ -75,8 +78,7 @@ def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder,
     assert main(["evaluate", str(run), *other]) == 0
     assert "people.npz is not the data that" in capsys.readouterr().err
     assert "PCA of 11" in Reconstruction.load(run / "evaluation-people.json").rows
-    config["data"]["path"] = "gone.npz"
-    (second / "config.json").write_text(json.dumps(config))
+    change(second, ("data", "path"), "gone.npz")
     assert main(["evaluate", str(second), *other]) == 0
     assert "no principal components" in capsys.readouterr().err
     assert list(Reconstruction.load(second / "evaluation-people.json").rows) == ["motion-latent"]
@@ -93,20 +95,8 @@ def recovered(capsys, folder, *arguments):
 
 
 def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
-    one = [
-        "--from",
-        "person_0001",
-        "--seen",
-        "markers",
-        "--seconds",
-        "0.25",
-        "--gaps",
-        "0.2",
-        "--samples",
-        "2",
-        "--marker",
-        "0.01",
-    ]
+    one = ["--from", "person_0001", "--seen", "markers", "--seconds", ".25", "--gaps", ".2", "--samples", "2"]
+    one += ["--marker", ".01"]
     table, said = recovered(capsys, folder, *one, "--out", tmp_path / "a.npz")
     for word in ("duration", "markers", "vertex", "left", "behind", "k-hat", "train/person_0001"):
         assert word in table
@@ -115,12 +105,10 @@ def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
     assert "train/person_0001, the most probable and 2 draws of each" in said
     clips = motion.read_motion(tmp_path / "a.npz")
     assert [clip.name for clip in clips] == [f"person_0001-{end}" for end in ("found", "draw-01", "draw-02")]
-    for name in ("a.html", "folder"):
-        again, _ = recovered(capsys, folder, *one, "--out", tmp_path / name)
-        assert again == table  # of the same seed
+    again, _ = recovered(capsys, folder, *one, "--out", tmp_path / "a.html")
+    assert again == table  # of the same seed
     page = (tmp_path / "a.html").read_text()
     assert all(name in page for name in ("truth", "most probable", "draw 2"))
-    assert len(list((tmp_path / "folder" / "train").iterdir())) == 3
     one = ["--from", "person_0001", "--seen", "points", "--frames", "3", "--points", "5", "--known-body"]
     recovered(capsys, folder, *one, "--no-aggregate", "--out", tmp_path / "a.bvh")
     assert len(motion.read_motion(tmp_path / "a.bvh")) == 1
@@ -146,9 +134,7 @@ def observations(run, **options):
 def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, opened, tmp_path):
     """One segment or several; the same numbers are the same segments, whatever way they came."""
     moved = shutil.copytree(folder, tmp_path / "moved")
-    config = json.loads((moved / "run" / "config.json").read_text())
-    config["data"]["path"] = "gone.npz"
-    (moved / "run" / "config.json").write_text(json.dumps(config))
+    change(moved / "run", ("data", "path"), "gone.npz")
     seen = observations(opened, fps=10.0)
     np.savez(tmp_path / "both.npz", **seen)
     np.savez(tmp_path / "one.npz", **{name: value[0] for name, value in seen.items()})
@@ -170,22 +156,15 @@ def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, opened,
     [
         (lambda seen: {**seen, "marker": seen["markers"]}, "'marker' is nothing that is seen .did you mean 'markers'"),
         (lambda seen: {**seen, "markers": seen["markers"][:, :, :5]}, r"expected \(2, \d+, 16, 3\)"),
-        (
-            lambda seen: {**seen, "markers": np.nan * seen["markers"]},
-            "nothing was seen of segment 0 of 2, .*leave it out",
-        ),
+        (lambda seen: {**seen, "markers": np.nan * seen["markers"]}, "nothing was seen of segment 0 of 2, .*leave it"),
         (lambda seen: {**seen, "markers": 1000 * seen["markers"]}, "markers has a coordinate of .* expected metres"),
-        (lambda seen: {**seen, "markers": seen["markers"] + np.inf}, "markers has a coordinate of inf"),
         (lambda seen: {**seen, "markers": seen["markers"].astype("U8")}, "markers is <U8 .* expected numbers"),
         (lambda seen: {**seen, "markers": seen["markers"].astype(object)}, "pickled objects"),
         (lambda seen: {**seen, "times": 1000 * seen["times"]}, "times go from 0 to .* expected seconds"),
-        (lambda seen: {name: value[:, :0] for name, value in seen.items()}, "expected numbers"),
-        (lambda seen: {**seen, "times": 0.0}, "some of surfaces, points and markers, at moments"),
         (lambda seen: {"markers": seen["markers"]}, "at moments"),
         (lambda seen: {}, "some of surfaces, points and markers|npz"),
         (lambda seen: {**seen, "times": np.zeros((2, 1001)), "markers": np.zeros((2, 1001, 16, 3))}, "at most 1000"),
         (lambda seen: {**seen, "points": np.zeros((2, 1, 2**17 + 1, 3))}, "at most 131,072 of a segment"),
-        (lambda seen: {**seen, "points": np.zeros((2, 1, 2**20, 3))}, "at most 33,554,432 are read"),
     ],
 )
 def test_files_of_what_nobody_can_have_seen_are_refused(opened, tmp_path, change, message):
@@ -195,16 +174,7 @@ def test_files_of_what_nobody_can_have_seen_are_refused(opened, tmp_path, change
         read_seen(path, opened.model)
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "forecast RUN --out f.npz",
-        "compare RUN",
-        "check calibration RUN",
-        "animate RUN --out f.html",
-        "report RUN --out f.html --evaluate",
-    ],
-)
+@pytest.mark.parametrize("command", ["forecast RUN --out f.npz", "check calibration RUN", "animate RUN --out f.html"])
 def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     error = failure(capsys, *command.replace("RUN", str(folder / "run")).split())
@@ -213,34 +183,22 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_that_forecasts_has_no_segments(capsys, fitted):
-    assert "are for runs of motion-latent" in failure(capsys, "impute", fitted, "--from", "a", code=2)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ("fit motion-latent --protocol cmu8 --out new", "--protocol is about motion, and motion-latent is fitted on"),
         ("fit vae --cut clips --out new", "--cut is about segments of motion, and vae is fitted on motion"),
         ("fit motion-latent --cut clip --out new", "did you mean 'clips'"),
-        (
-            "sweep motion-latent vae --out new",
-            "motion-latent on segments of motion and vae on windows; give those of one kind",
-        ),
+        ("sweep motion-latent vae --out new", "motion-latent on segments of motion and vae on windows; give those of"),
+        ("impute FITTED --from a", "are for runs of motion-latent"),
         ("evaluate RUN --samples 3", "--samples is about forecasts"),
-        ("evaluate RUN --joints left_wrist", "--joints, --exchange and --temperature are about forecasts"),
         ("evaluate RUN FITTED", "on data of several kinds"),
         ("impute RUN", "--from NAME --seen KIND of the run's segments, or a --file"),
-        ("impute RUN --from a --file b.npz", "give what was seen"),
         ("impute RUN --from person_0001", "--seen what of it: surfaces, points or markers"),
-        ("impute RUN --from person_0001 --seen marker", "did you mean 'markers'"),
         ("impute RUN --file b.npz --seen points", "--file says all that was seen"),
         ("impute RUN --from a --seen markers --frames 3 --fps 10", "--frames are seen at unknown times"),
         ("impute RUN --from person_0001 --seen markers --frames 101", "segments of this run have 100"),
-        ("impute RUN --from a --seen markers --gaps 1", "gaps is 1.0; it must be at least 0 and below 1"),
         ("impute RUN --from person_0001 --seen markers --points 9", "--points says how many are seen of a surface"),
-        ("impute RUN --from person_0001 --seen surfaces --gaps .1", "surfaces are seen as a whole"),
-        ("impute RUN --from a --seen markers --marker 0", "marker is 0.0; it must be"),
         ("impute RUN --from a --seen markers --samples 101", "--samples is 101; it must be at most 100"),
         ("impute RUN --from person_0001 person_0001 --seen markers", "names a segment twice"),
         ("impute RUN --from person_0001 person_0002 --seen markers --out a.html", "shows one segment, of 2"),
@@ -259,16 +217,11 @@ def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypat
     [
         (("data", "cut"), "steps", "unknown cut 'steps'"),
         (("data", "kind"), "motion", "data of the kind 'motion' are poses, not 'segments'"),
-        (("schema", "sizes", "turns"), 10**9, "and such segments have"),
         (("schema", "timed", "frames"), 16384, "is larger than its weights"),
         (("schema", "timed", "skeleton", "names"), ["a"], "skeleton|names|parents"),
     ],
 )
 def test_a_config_out_of_range_is_refused(run, keys, value, message):
-    config = content = json.loads((run / "config.json").read_text())
-    for key in keys[:-1]:
-        content = content[key]
-    content[keys[-1]] = value
-    (run / "config.json").write_text(json.dumps(config))
+    change(run, keys, value)
     with pytest.raises(dvae.inference.training.checkpoints.CheckpointError, match=message):
         dvae.load(run)

@@ -14,12 +14,10 @@ from markupsafe import Markup
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.inference.evaluation.evaluation import Evaluation
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.drawing.player import SCRIPT, player
 from dvae.motion.drawing.plot import staged
 from dvae.runs.report import Section, document, lacking, sections
-from dvae.runs.report.sections import Few
 
 SMALL = ["--windows", "2", "--samples", "3", "--bound-windows", "3", "--particles", "4"]
 EVIL = "<script>said=1</script><img src=x onerror=said=1>$\\frac$"
@@ -95,8 +93,7 @@ def test_the_page_is_shown_without_an_error_or_a_network(page, tab, width):
     tab.wait("document.querySelector('.player').dataset.frames")
     assert tab.ask("document.documentElement.scrollWidth") <= width
     assert tab.ask("[...document.images].every(image => image.complete && image.naturalWidth)")
-    assert tab.said == []
-    assert tab.asked == []
+    assert (tab.said, tab.asked) == ([], [])
 
 
 def test_people_play_scrub_and_turn(page, tab):
@@ -163,33 +160,28 @@ def scored(fitted, tmp_path_factory):
     return run
 
 
-def test_records_beside_a_run_are_shown(scored):
+def test_records_beside_a_run_are_shown(scored, tmp_path):
     run = {"a": dvae.load(scored)}
-    evaluation = Evaluation.load(scored / "evaluation.json")
-    facts, scores, criticism = (
-        Tags(document("a", [make(run)])).text for make in (sections.overview, sections.evaluated, sections.calibration)
+    evaluation = dvae.Evaluation.load(scored / "evaluation.json")
+    made = (sections.overview, sections.evaluated, sections.calibration, sections.bracketed, sections.yardsticks)
+    facts, scores, criticism, bracket, beside, tubes = (
+        Tags(document("a", [make(run)])).text for make in (*made, sections.tubes)
     )
     assert str(evaluation["vae"]["ADE"]) in facts
     assert "lowest" in facts or "best bound" in facts
     for row in evaluation.rows:
         assert str(evaluation[row]["ADE"]) in scores
+    assert "changed" not in scores
     assert json.loads((scored / "calibration.json").read_text())["calibration"]["summary"]["verdict"] in criticism
     assert "bone stretch (%)" in criticism
-    assert "changed" not in scores
-
-
-def test_what_the_bench_left_beside_a_run_is_shown(scored, tmp_path):
-    run = {"a": dvae.load(scored)}
-    made = (sections.bracketed, sections.yardsticks, sections.tubes)
-    bracket, beside, tubes = (Tags(document("a", [make(run)])) for make in made)
-    assert "AIS, L = 2, K = 2" in bracket.text
-    assert "amortisation" in bracket.text
-    assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in beside.text
-    assert "beside the posterior of 1 sequences" in beside.text
-    assert "held 40 %" in tubes.text
-    pair = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})")
-    dvae.ablate(pair, steps=2, twins=1).save(tmp_path / "ablation.json")
-    arrows = document("a", [sections.arrows(dvae.Ablation.load(tmp_path / "ablation.json"))])
+    assert "AIS, L = 2, K = 2" in bracket
+    assert "amortisation" in bracket
+    assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in beside
+    assert "beside the posterior of 1 sequences" in beside
+    assert "held 40 %" in tubes
+    pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
+    dvae.ablate(pair, steps=2, twins=1).save(tmp_path / "a.json")
+    arrows = document("a", [sections.arrows(dvae.Ablation.load(tmp_path / "a.json"))])
     assert "z_{t-1} to z_t" in Tags(arrows).text
     assert "<img" in arrows
     (tmp_path / "none.json").write_text("{}")
@@ -269,8 +261,7 @@ def test_text_of_a_hostile_run_is_text(scored, tmp_path, tab):
     tab.open(tmp_path / "a.html", 1280)
     tab.wait("document.querySelector('.player').dataset.frames")
     assert tab.ask("typeof said") == "undefined"
-    assert tab.said == []
-    assert tab.asked == []
+    assert (tab.said, tab.asked) == ([], [])
 
 
 def test_should_a_script_slip_through_it_does_not_run(tmp_path, tab):
@@ -309,13 +300,3 @@ def test_wrong_arguments_exit_with_2_before_any_work(capsys, tmp_path, monkeypat
     assert main(["report", "nowhere", *arguments.split()]) == 2
     assert message in re.sub(r"\s+", " ", capsys.readouterr().err.replace("│", " "))
     assert not list(tmp_path.iterdir())
-
-
-def test_few_windows_are_windows():
-    windows = dvae.ArrayWindows(np.arange(40.0, dtype=np.float32).reshape(10, 4, 1), 2)
-    few = Few(windows, 4)
-    assert few.chosen == [0, 3, 6, 9]
-    assert few.keys == [windows.keys[n] for n in few.chosen]
-    np.testing.assert_array_equal(few.all()["x"], windows.all()["x"][few.chosen])
-    assert Few(windows, 99).keys == list(windows.keys)
-    assert isinstance(few, dvae.data.HeldOutWindows)

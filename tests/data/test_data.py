@@ -92,7 +92,7 @@ ENTRIES = {
 
 @pytest.mark.parametrize(
     ("name", "table"),
-    [*((name, FRAME) for name in ENTRIES), ("fit", FRAME["a"]), ("fit", FRAME.set_index(["unit", "step"]).to_xarray())],
+    [*((name, FRAME) for name in ENTRIES), ("fit", FRAME.set_index(["unit", "step"]).to_xarray())],
 )
 def test_a_table_without_roles_is_refused_with_the_call_that_gives_them(model, name, table):
     with pytest.raises(TypeError, match=r"got (pandas|xarray)\..*PanelData\.of\(frame, dvae.tables.Told\(id="):
@@ -111,7 +111,7 @@ def test_a_fit_to_data_with_parts_validates_on_their_own(model, panel, entry):
     assert entry(model, panel.windows("train"), validation=panel).best_step == 1
 
 
-@pytest.mark.parametrize("data", [X, X.numpy(), {"x": X}, dvae.ArrayWindows(X, observed=4)], ids=type)
+@pytest.mark.parametrize("data", [X.numpy(), {"x": X}, dvae.ArrayWindows(X, observed=4)], ids=type)
 def test_a_method_is_fitted_to_arrays_as_to_their_sizes(data):
     found = fitted_by_method(None, data, validation=data)
     with torch.random.fork_rng():
@@ -122,44 +122,23 @@ def test_a_method_is_fitted_to_arrays_as_to_their_sizes(data):
 
 
 @pytest.mark.parametrize("name", ["evaluate", "checks", "conformal"])
-@pytest.mark.parametrize("data", [X, X.numpy(), {"x": X}], ids=type)
-def test_arrays_do_not_say_which_steps_are_observed(model, name, data):
-    with pytest.raises(TypeError, match=r"got (Tensor|ndarray|dict); of an array x \(N, T, D\).*ArrayWindows\(x, obs"):
-        ENTRIES[name](model, data)
-
-
-def test_reference_rows_know_training_arrays(model):
-    windows = dvae.ArrayWindows(X, observed=4)
-    rows = [
-        dvae.evaluate(model, windows, training_windows=training, references=["mean"], **QUIET)["mean"]
-        for training in (X, {"x": X}, windows)
-    ]
-    assert rows[0] == rows[1] == rows[2]
+def test_arrays_do_not_say_which_steps_are_observed(model, name):
+    for data in (X, X.numpy(), {"x": X}):
+        with pytest.raises(
+            TypeError, match=r"got (Tensor|ndarray|dict); of an array x \(N, T, D\).*ArrayWindows\(x, ob"
+        ):
+            ENTRIES[name](model, data)
 
 
 @pytest.mark.parametrize("name", ["fit", "validation", "a step", "a method's fit", "compare", "forecast", "bound"])
-def test_tensors_without_values_are_refused(model, name):
+def test_tensors_without_values_or_that_are_sparse_are_refused(model, name):
+    with pytest.raises(TypeError, match=r"layout torch\.sparse_coo; .* x\.to_dense\(\)"):
+        ENTRIES[name](model, X.to_sparse())
     with pytest.raises(ValueError, match=r"got a tensor \(20, 6, 3\) on the meta device, which has no values"):
         ENTRIES[name](model, X.to("meta"))
     if name not in ("a method's fit", "compare"):
         with pytest.raises(ValueError, match="on the meta device"):
             ENTRIES[name](dvae.DynamicalVAE("p(z) p(x_t | z)", "q(z | x_{1:T})", {"z": 2, "x": 3}).to("meta"), X)
-
-
-@pytest.mark.parametrize("name", ["fit", "validation", "a step", "a method's fit", "compare", "forecast", "bound"])
-def test_sparse_tensors_are_refused(model, name):
-    with pytest.raises(TypeError, match=r"layout torch\.sparse_coo; .* x\.to_dense\(\)"):
-        ENTRIES[name](model, X.to_sparse())
-
-
-@pytest.mark.parametrize("kind", [np.uint16, np.uint32, np.uint64])
-def test_unsigned_integers_are_read_as_numbers(model, kind):
-    x = np.arange(24, dtype=kind).reshape(2, 4, 3)
-    read = model.read({"x": x})["x"]
-    assert read.dtype is torch.float32
-    np.testing.assert_array_equal(read, x)
-    for given in (x, torch.from_numpy(x)):
-        dvae.data.units.Units(3).fit(given)
 
 
 def test_masks_of_arrays_are_masks_of_batches():
@@ -186,12 +165,6 @@ def test_masks_of_arrays_are_masks_of_batches():
 )
 def test_what_no_model_reads_is_refused(x, said):
     model = dvae.method("autoregressive", width=2).build({"x": 1})
-    for read in (
-        sequences,
-        Panel.of,
-        lambda x: Panel.of([*x]),
-        lambda x: ArrayWindows(x, 1),
-        lambda x: model.model({"x": x}),
-    ):
+    for read in (sequences, Panel.of, lambda x: ArrayWindows(x, 1), lambda x: model.model({"x": x})):
         with pytest.raises(TypeError, match=said):
             read(x)

@@ -14,6 +14,7 @@ def test_gaps_add_up_to_the_time_since_the_start(batch, steps, seed):
     generator = torch.Generator().manual_seed(seed)
     times = torch.rand(batch, steps, generator=generator, dtype=torch.float64).add(0.01).cumsum(1) + 1e6
     lengths = torch.randint(1, steps + 1, (batch,), generator=generator)
+    times[torch.arange(steps) >= lengths[:, None]] = torch.nan  # of padding
     found = gaps(times, lengths)
     assert found.shape == (batch, steps, 1)
     assert found.dtype == times.dtype
@@ -24,29 +25,22 @@ def test_gaps_add_up_to_the_time_since_the_start(batch, steps, seed):
 
 
 def test_whole_numbers_and_arrays_are_times():
-    assert gaps(np.array([[1950, 1953, 1954]])).dtype == torch.get_default_dtype()
-    assert gaps(np.array([[1950, 1953, 1954]])).flatten().tolist() == [0, 3, 1]
-    assert gaps(torch.tensor([[7]])).tolist() == [[[0]]]
+    found = gaps(np.array([[1950, 1953, 1954]]))
+    assert found.dtype == torch.get_default_dtype()
+    assert found.flatten().tolist() == [0, 3, 1]
 
 
 @pytest.mark.parametrize(
     ("times", "message"),
     [
         ([[0.0, 1, 2], [0, 2, 2]], "times of sequence 1 are 2, 2 at steps 1 to 2, counted from 0; .* make one step of"),
-        ([[0.0, 1, 0.5]], "times of sequence 0 are 1, 0.5 at steps 1 to 2"),
         ([[0.0, float("nan"), 2]], "times of sequence 0 are 0, nan at steps 0 to 1"),
-        ([[float("nan"), 1.0]], "times of sequence 0 are nan at steps 0 to 0"),
         ([0.0, 1.0], r"times are \(sequences, steps\), but these have shape \(2,\)"),
     ],
 )
 def test_times_that_do_not_rise_are_refused(times, message):
     with pytest.raises(ValueError, match=message):
         gaps(torch.tensor(times))
-
-
-def test_times_of_padding_may_be_anything():
-    times = torch.tensor([[0.0, 1.0, float("nan")], [0.0, 5.0, 1.0]])
-    assert gaps(times, torch.tensor([2, 2]))[..., 0].tolist() == [[0, 1, 0], [0, 5, 0]]
 
 
 @given(st.integers(1, 3), st.integers(1, 8), st.integers(1, 3), st.integers(0, 100))

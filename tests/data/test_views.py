@@ -5,10 +5,7 @@ import pytest
 import torch
 
 import dvae
-from dvae import motion
-from dvae.data.batch import Batch
-from dvae.data.sequences import ArrayWindows
-from dvae.data.views import History, Parts, Past, View, Views
+from dvae.data.views import LOG_DET, History, Parts, Past, View, Views
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.models.motion.trajectories import Rest
 from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
@@ -21,11 +18,9 @@ ARMS = [i for i in range(D) if i % 6 >= 3]
 TURNED = ("x", "s", "y", "r", "legs", "arms")
 VIEWS = {
     "as it is": (View(), D),
-    "parts": (Parts({"legs": LEGS, "arms": ARMS}), D),
     "parts and history": (Views(History("h"), Parts({"legs": LEGS, "arms": ARMS})), D),
     "first frame": (Past("s"), D),
     "heading": (Heading(WALKER, 3), D),
-    "heading with the root": (Heading(WALKER, 9), 3 * J),
     "heading of parts": (Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS})), D),
     "heading of a first pose": (Views(Past("s"), Rest(True), Heading(WALKER, pose="s", turned=TURNED)), 3 * J),
 }
@@ -48,13 +43,9 @@ def view_and_data(request):
 
 def test_the_way_back_is_the_inverse(view_and_data):
     view, data = view_and_data
-    torch.testing.assert_close(view.inverse(view(data))["x"], data["x"])
-
-
-def test_what_was_seen_is_seen_as_it_is(view_and_data):
-    view, data = view_and_data
     once = view(data)
-    again = view(once)
+    torch.testing.assert_close(view.inverse(once)["x"], data["x"])
+    again = view(once)  # what was seen is seen as it is
     assert once.keys() == again.keys()
     assert all(torch.equal(once[name], again[name]) for name in once)
 
@@ -129,7 +120,7 @@ def missing():
     return x, mask.flatten(-2)
 
 
-@pytest.mark.parametrize("hidden", [0.0, 50.0, torch.nan])
+@pytest.mark.parametrize("hidden", [50.0, torch.nan])
 def test_missing_entries_through_a_view_are_those_of_windows_turned_by_hand(hidden):
     heading = Heading(WALKER, 3)
     model, plain = build(heading), build(None)
@@ -174,8 +165,7 @@ LEFT, RIGHT = ("LHip", "LShoulder"), ("RHip", "RShoulder")
 @pytest.mark.parametrize(
     ("frames", "names", "tells"),
     [
-        ([2], LEFT, 1),  # no left side: the pose before
-        ([1, 2], RIGHT, 0),
+        ([1, 2], RIGHT, 0),  # no right side: the pose before
         ([2], ["LHip"], 1),  # a whole pose goes before one with a shoulder alone
         ([0, 1, 2], ["LHip", "RHip"], 2),  # the sides that are there
     ],
@@ -226,13 +216,6 @@ def test_a_fixed_part_comes_back_bit_for_bit_and_is_seen_turned():
     assert torch.equal(found["x"][..., LEGS], found["legs"])
     turned = seeded(model.forecast, turn(past, 1.0), 3, 2, fix={"legs": turn(legs, 1.0)})
     torch.testing.assert_close(turned["x"], turn(found["x"], 1.0))
-
-
-def test_windows_of_the_simulator_face_one_way():
-    windows = motion.windows(motion.simulate(clips=4, frames=90), motion.PROTOCOLS["simulated"], "train")
-    x = Heading(windows.skeleton, 15).face(windows.all()["x"])
-    poses = windows.positions(x)[:, 14]
-    assert windows.skeleton.heading(poses).abs().max() < 1e-5
 
 
 # ------------------------------------------------------------------------------------------------- bones
@@ -312,6 +295,17 @@ def test_directions_alone_have_no_density_and_need_both_ends():
         view(Batch({"x": x, "mask": {"x": mask}}))
 
 
+def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
+    knee = [i for i in range(D) if i // 3 in (1, 2)]  # of the joints without the root: RKnee, RFoot
+    rest = [i for i in range(D) if i not in knee]
+    view, x = Bones(WALKER, 4, {"shank": knee, "rest": rest}), rigid(4, D)
+    seen = view({"x": x, "shank": x[..., knee]})
+    assert torch.equal(seen["shank"], seen["x"][..., knee])
+    assert torch.equal(view({"rest": x[..., rest]}, seen)["rest"], seen["x"][..., rest])
+    with pytest.raises(ValueError, match="shank alone does not tell that of RKnee, which hangs from RHip"):
+        view({"shank": x[..., knee]}, seen)
+
+
 def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
     torch.manual_seed(0)
     equations = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
@@ -324,17 +318,6 @@ def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
     assert not dvae.SequenceELBO().terms(model, x).likelihood
     with pytest.raises(ValueError, match="has no likelihood"):
         dvae.importance_bound(model, x, 2)
-
-
-def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
-    knee = [i for i in range(D) if i // 3 in (1, 2)]  # of the joints without the root: RKnee, RFoot
-    rest = [i for i in range(D) if i not in knee]
-    view, x = Bones(WALKER, 4, {"shank": knee, "rest": rest}), rigid(4, D)
-    seen = view(Batch({"x": x, "shank": x[..., knee]}))
-    assert torch.equal(seen["shank"], seen["x"][..., knee])
-    assert torch.equal(view(Batch({"rest": x[..., rest]}), seen)["rest"], seen["x"][..., rest])
-    with pytest.raises(ValueError, match="shank alone does not tell that of RKnee, which hangs from RHip"):
-        view(Batch({"shank": x[..., knee]}), seen)
 
 
 # --------------------------------------------------------------------------------------------- views that change volume
@@ -397,8 +380,9 @@ def incomplete(kind):
     return people(B, T, 3), beside, counts
 
 
-@pytest.mark.parametrize("kind", ["complete", "mask", "lengths", "mask and lengths"])
-@pytest.mark.parametrize("estimate", ESTIMATES)
+@pytest.mark.parametrize(
+    ("kind", "estimate"), [("mask" if n % 2 else "mask and lengths", name) for n, name in enumerate(ESTIMATES)]
+)
 def test_densities_are_of_the_data_as_given(estimate, kind):
     """A change of variables: what is said of scaled data, and the log-determinant of the entries that are there."""
     x, beside, counts = incomplete(kind)
@@ -430,30 +414,6 @@ def test_the_log_score_has_the_volume_of_the_future():
         predictive_bound(seeing(Mixed()), x, seen, 8)
 
 
-def test_comparison_and_evaluation_rank_by_densities_of_the_data():
-    x, options = people(B, T, 3), {"progress": False}
-    added = FACTORS.abs().log().sum().item()
-    models = {"seen": seeing(Scaled())}
-    plain = {"seen": seeing(None)}
-    compared = [
-        dvae.compare(m, v, particles=4, contrasts=0, **options)["seen"] for m, v in ((models, x), (plain, x * FACTORS))
-    ]
-    windows = [ArrayWindows(v, 3) for v in (x, x * FACTORS)]
-    chosen = {"bound_particles": 4, "log_score_particles": 4, "samples": 1, **options}
-    scored = [dvae.evaluate(m, w, **chosen)["seen"] for m, w in zip((models, plain), windows, strict=True)]
-    for ours, theirs in (compared, scored):
-        for name in {"ELBO", "importance bound", "log score"} & ours.keys():
-            assert ours[name].mean == pytest.approx(theirs[name].mean + added, rel=1e-9)
-        assert ours["KL z"].mean == pytest.approx(theirs["KL z"].mean)
-
-
-def test_a_scaled_normal_has_its_closed_form():
-    model = dvae.DynamicalVAE("p(x_t)", None, {"x": 3}, view=Scaled()).double()
-    x = people(B, T, 3)
-    expected = torch.distributions.Normal(0, 1 / FACTORS.abs()).log_prob(x).sum((1, 2))
-    torch.testing.assert_close(dvae.SequenceELBO().terms(model, x).bound, expected)
-
-
 def test_the_oracle_of_a_scaled_model_is_the_density_of_the_data():
     model = dvae.twin(*SMALL, T)
     x = people(B, T, 3)
@@ -480,12 +440,9 @@ def test_views_in_a_row_add_their_volumes():
     )
     assert not view.keeps_volume
     assert Views(parts, History("h")).keeps_volume
-
-
-def test_volumes_that_cannot_be_right_are_refused():
     with pytest.raises(ValueError, match="changes the volume of frames that nothing scores"):
         Views(Scaled(), Past("s"))
-    assert Views(Past("s"), Scaled()).log_det(Batch({"x": people(B, T, 3)})).shape == (B,)
+    assert Views(Past("s"), Scaled()).log_det({"x": x}).shape == (B,)
 
 
 def test_what_a_scaled_model_makes_goes_back_and_it_is_fitted_by_the_bound_of_the_data():

@@ -36,15 +36,10 @@ def test_the_future_is_behind_the_last_target():
         assert windows.keys[n][1:] == (one.name, len(one) - 4)
     assert batch["mask"][:, :4].all()
     assert not batch["mask"][:, 4:].any()
-    times, _ = windows.times(7)
-    np.testing.assert_array_equal(times[0], np.arange(8, 15) * 10.0)
-
-
-def test_it_may_be_longer_or_shorter_than_that_of_the_run():
-    panel = table(PLAIN)
-    schema = PanelSchema.under(panel, CUT)
     for horizon in (1, 7):
         assert ahead(panel, schema, horizon).all()["x"].shape == (4, 4 + horizon, 1)
+    times, _ = windows.times(7)
+    np.testing.assert_array_equal(times[0], np.arange(8, 15) * 10.0)
 
 
 def test_the_past_is_that_of_test_windows():

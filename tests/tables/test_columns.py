@@ -13,24 +13,8 @@ from dvae.tables.columns import MOST, parsed
 from dvae.tables.protocol import Cut
 from dvae.tables.reading import read_schema, written_schema
 
-NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=12) | st.sampled_from(
-    [
-        "",
-        ".",
-        "a.b",
-        'say "x"',
-        "\\",
-        "\n\r\t\0\x7f\x85",
-        "'''",
-        '"""',
-        "[columns.x]",
-        "columns",
-        "é",
-        "🚲",
-        "# no",
-        "id",
-    ]
-)
+ODD = ("", "a.b", 'say "x"', "\\", "\n\r\t\0\x7f\x85", "'''", '"""', "[columns.x]", "columns", "🚲", "# no", "id")
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=12) | st.sampled_from(ODD)
 
 
 @st.composite
@@ -51,12 +35,6 @@ def schemas(draw):
     return Columns(tuple(draw(column(name, role)) for name, role in zip(names, roles, strict=False)), **told)
 
 
-@given(schemas())
-def test_a_schema_comes_back_from_toml_and_from_json(columns):
-    assert Columns.from_toml(columns.to_toml()) == columns
-    assert Columns.from_config(json.loads(json.dumps(columns.config()))) == columns
-
-
 @given(
     schemas(),
     st.builds(
@@ -71,15 +49,10 @@ def test_a_schema_comes_back_from_toml_and_from_json(columns):
     )
     | st.just(Cut()),
 )
-def test_a_schema_beside_a_file_comes_back_with_its_cut(columns, cut):
+def test_a_schema_comes_back_from_toml_with_its_cut_and_from_json(columns, cut):
+    assert Columns.from_toml(columns.to_toml()) == columns
     assert read_schema(written_schema(columns, cut)) == (columns, cut)
-
-
-def test_columns_are_real_targets_where_nothing_is_said():
-    assert Columns.from_toml("[columns.a]\n[columns.b]\nrole = 'known'") == Columns((Column("a"), Column("b", "known")))
-    assert Columns.from_toml("id = 's'\n[columns.a]").id == ("s",)
-    assert read_schema("[columns.a]")[1] is None
-    assert read_schema("[cut]\ntest = 0.3") == (None, Cut(test=0.3))
+    assert Columns.from_config(json.loads(json.dumps(columns.config()))) == columns
 
 
 @pytest.mark.parametrize(
@@ -87,35 +60,21 @@ def test_columns_are_real_targets_where_nothing_is_said():
     [
         ("tme = 'x'\n[columns.a]", r"entry 'tme' \(did you mean 'time'\?\)"),
         ("[columns.a]\nfamly = 'count'", r"column 'a' has an entry 'famly' \(did you mean 'family'\?\)"),
-        ("[columns.a]\nname = 'b'", "column 'a' has an entry 'name'"),
-        ("[columns.a]\nrole = 'knwn'", r"unknown role 'knwn' \(did you mean 'known'\?\)"),
         ("[columns.a]\nfamily = 'cont'", r"family 'cont' \(did you mean 'count'\?\); a target has one of real"),
         ("[columns.a]\n[columns.b]\nrole = 'past'\nfamily = 'count'", "a past has one of real, category"),
         ("[columns.a]\nfamily = 'category'", "0 classes; a category, and nothing else, has classes"),
-        ("[columns.a]\nclasses = ['u', 'v']", "'real' and has 2 classes"),
         ("[columns.a]\nfamily = 'category'\nclasses = ['u', 'u']", "has 2 classes, .* all different"),
         ("[columns.a]\nrole = 'known'", "no column is a target; given are a"),
         ("id = 5\n[columns.a]", "id is 5; expected names of columns"),
-        ("id = [5]\n[columns.a]", r"id is \[5\]; expected names"),
         ("time = 5\n[columns.a]", "time is 5; expected the name of a column"),
         ("time = 'a'\n[columns.a]", "column 'a' has two parts to play"),
         ("time = ''\n[columns.a]", "a column has no name"),
-        ("time = 'a'\nzone = 3\n[columns.b]", "zone is 3; expected a time zone"),
         ("time = 'a'\nzone = 'Berlin'\n[columns.b]", "zone is 'Berlin'; expected a name such as 'Europe/Berlin'"),
-        ("time = 'a'\nzone = '+25:00'\n[columns.b]", "zone is '.25:00'; expected"),
         ("zone = 'UTC'\n[columns.b]", "zone is 'UTC', and no column is the time"),
-        (
-            "[columns.a]\nfamily = 'category'\nclasses = ['rain', 'sun']\nother = 'rian'",
-            r"other = 'rian' \(did you mean 'rain'\?\), which is none of its classes",
-        ),
-        ("columns = 3", "columns is 3; expected a table for each column"),
+        ("[columns.a]\nfamily = 'category'\nclasses = ['b', 'c']\nother = 'd'", "other = 'd'.* none of its classes"),
         ("[columns]\na = 3", "column 'a' is 3; expected a table"),
-        ("cut = 3", "cut is a table"),
         ("[cut]\nobservd = 3", r"entry 'observd' \(did you mean 'observed'\?\)"),
         ("[cut]\nobserved = 3", "windows have both, or neither"),
-        ("[cut]\nsplit = 'time'", "say how many steps are observed"),
-        ("[cut]\nsplit = 'tme'", r"unknown split 'tme' \(did you mean 'time'\?\)"),
-        ("[cut]\nvalidation = 0.5\ntest = 0.5", "leave nothing to train on"),
         ("\n".join(f"[columns.a{n}]" for n in range(MOST + 1)), f"at most {MOST} are read"),
     ],
 )
@@ -124,7 +83,10 @@ def test_what_is_no_schema_is_refused_in_a_sentence(text, said):
         read_schema(text)
 
 
-def test_a_category_has_so_many_classes_at_most():
+def test_a_category_has_so_many_classes_at_most_and_dots_in_them_are_none_of_keys():
+    classes = tuple(f"A{n}.{n}" for n in range(300))
+    columns = Columns((Column("a.b.c", family="category", classes=classes),))
+    assert Columns.from_toml(columns.to_toml()) == columns
     with pytest.raises(ValueError, match=f"2 to {MOST}") as error:
         Column("a", family="category", classes=tuple(map(str, range(MOST + 1))))
     assert len(str(error.value)) < 300
@@ -134,26 +96,17 @@ def test_a_category_has_so_many_classes_at_most():
     "text",
     [
         "a = " + "[" * 100_000,
-        "a = " + "{b=" * 100_000,
         ".".join("a" * 400_000) + " = 1",
-        "[" + " . ".join("a" * 200_000) + "]",
         ".".join(['"a.b"'] * 100_000) + " = 1",
-        ".".join(["'a'"] * 100_000) + " = 1",
         'x = {"a" = "\\"", ' + ".".join("a" * 300_000) + " = 1}",
     ],
-    ids=["lists", "tables", "key", "header", "quoted", "literal", "within"],
+    ids=["lists", "key", "quoted", "within"],
 )
 def test_tables_within_tables_without_end_are_refused(text, monkeypatch):
     if "." in text:  # of dotted keys tomllib takes the square of the time
         monkeypatch.setattr(tomllib, "loads", None)
     with pytest.raises(ValueError, match="deeper than any schema"):
         parsed(text)
-
-
-def test_dots_in_names_and_classes_are_none_of_keys():
-    classes = tuple(f"A{n}.{n}" for n in range(300))
-    columns = Columns((Column("a.b.c", family="category", classes=classes),))
-    assert Columns.from_toml(columns.to_toml()) == columns
 
 
 def test_a_column_is_corrected_alone_and_where_it_stands():
@@ -167,8 +120,6 @@ def test_a_column_is_corrected_alone_and_where_it_stands():
     assert columns.without("plan", "sky").names == ["riders"]
     for wrong, said in [
         (lambda: columns.but("ridrs", unit="people"), r"no column 'ridrs' \(did you mean 'riders'\?\)"),
-        (lambda: columns.but("riders", family="cout"), r"family 'cout' \(did you mean 'count'\?\)"),
-        (lambda: columns.but("riders", family="category"), "is of family 'category' and has 0 classes"),
         (lambda: columns.without("sky", "riders"), "no column is a target"),
         (lambda: columns.without("pln"), r"no column 'pln' \(did you mean 'plan'\?\)"),
     ]:

@@ -1,6 +1,5 @@
 """What models see of a table, and that nothing of it is of what they are tested on."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -31,26 +30,21 @@ TOLD = Columns(
     )
 )
 
+FREE = tuple(name for name in TOLD.names if name not in ("height", "town", "sunny"))
+"""Columns that lack values."""
+
 
 def table(n=6, t=12, seed=0, missing=True, times=None):
     rng = np.random.default_rng(seed)
     made = []
     for one in range(n):
-        columns = {
-            "riders": rng.poisson(4, t),
-            "plan": rng.normal(3, 2, t),
-            "kind": rng.integers(0, 3, t),
-            "weather": rng.integers(0, 2, t),
-            "temp": rng.normal(20, 5, t),
-            "price": rng.normal(-3, 0.1, t),
-            "height": np.full(t, rng.normal()),
-            "open": rng.integers(0, 2, t),
-            "town": np.full(t, one % 2),
-            "sunny": rng.integers(0, 2, t),
-        }
+        columns = {"plan": rng.normal(3, 2, t), "temp": rng.normal(20, 5, t), "price": rng.normal(-3, 0.1, t)}
+        columns |= {"riders": rng.poisson(4, t), "kind": rng.integers(0, 3, t), "height": np.full(t, rng.normal())}
+        columns |= {name: rng.integers(0, 2, t) for name in ("weather", "open", "sunny")}
+        columns["town"] = np.full(t, one % 2)
         values = np.stack([columns[name] for name in TOLD.names], 1).astype(float)
         if missing:
-            free = [place for place, name in enumerate(TOLD.names) if name not in ("height", "town", "sunny")]
+            free = [TOLD.names.index(name) for name in FREE]
             values[:, free] = np.where(rng.random((t, len(free))) < 0.2, NAN, values[:, free])
         made.append(Series(f"s{one}", values, times))
     return Panel(made, TOLD)
@@ -66,10 +60,8 @@ def column(panel, name, parts):
 
 def test_logarithms_of_a_column_are_read_as_they_vary_and_stand_for_what_is_missing():
     """A column that hardly varies is not blown up, however it is rounded; zeros are read as the least that is not."""
-    columns, rng = (
-        Columns((Column("flow", family="power"), Column("flat", family="positive"))),
-        np.random.default_rng(0),
-    )
+    columns = Columns((Column("flow", family="power"), Column("flat", family="positive")))
+    rng = np.random.default_rng(0)
     values = np.stack([rng.lognormal(1, 2, 9), 3 + 1e-15 * rng.normal(size=9)], 1)
     values[0, 0], values[1, 0] = 0, NAN
     panel = Panel([Series(f"s{n}", values) for n in range(4)], columns)
@@ -96,9 +88,7 @@ def test_a_column_far_from_zero_has_its_own_units():
     ("family", "values", "said"),
     [
         ("positive", 1e9 + np.arange(9.0), r"has mean 1e\+09 and standard deviation 2\.58, .* the family 'real'"),
-        ("count", 1e9 + np.arange(9.0), "does not resolve in the family 'count'"),
         ("real", 1e-40 * np.arange(9.0), r"column 'x' is 2\.58199e-40; .* multiply the values"),
-        ("positive", 1e-40 * np.arange(1, 10.0), "multiply the values by a constant"),
     ],
 )
 def test_targets_that_float32_does_not_resolve_are_refused(family, values, said):
@@ -127,10 +117,8 @@ def test_units_are_those_of_the_training_sequences():
         known = column(panel, name, parts)
         assert schema.means[name] == pytest.approx(known.mean(), rel=1e-12)
         assert schema.scales[name] == pytest.approx(known.std(), rel=1e-12)
-    assert (schema.means["riders"], schema.scales["riders"]) == (
-        0,
-        pytest.approx(column(panel, "riders", parts).mean()),
-    )
+    assert schema.means["riders"] == 0
+    assert schema.scales["riders"] == pytest.approx(column(panel, "riders", parts).mean())
     means, scales, typical, floor, _, _ = map(list, zip(*schema.units["x"], strict=True))
     assert not any(floor)
     names = ["riders", "kind", "kind", "kind", "temp", "open"]
@@ -141,7 +129,7 @@ def test_units_are_those_of_the_training_sequences():
     assert (means[-1], scales[-1]) == (share, pytest.approx((share * (1 - share)) ** 0.5))
     assert schema.coordinates == ["riders", "kind=u", "kind=v", "kind=w", "temp", "open"]
     assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2}
-    assert schema.lacking == tuple(n for n in TOLD.names if n not in ("height", "town", "sunny"))
+    assert schema.lacking == FREE
 
 
 def test_guides_read_indicators_where_training_data_lack_targets():
@@ -157,15 +145,11 @@ def test_guides_read_indicators_where_training_data_lack_targets():
 def altered(panel, split, cut):
     """The panel with other values, classes, times and gaps wherever it is only tested."""
     rng = np.random.default_rng(9)
-    trained = [set(), {}]
-    for place, low, last in cut.starts(panel, split):
-        trained[0].add(place)
-        trained[1][place] = low, last + cut.length
+    trained = {place: last + cut.length for place, _, last in cut.starts(panel, split)}
     series = []
     for place, one in enumerate(panel.series):
         values = one.values.copy()
-        low, high = trained[1].get(place, (0, 0))
-        later = np.arange(len(one)) >= high
+        later = np.arange(len(one)) >= trained.get(place, 0)
         for name in ("riders", "plan", "temp", "price"):
             values[later, TOLD.names.index(name)] = rng.integers(50, 90, later.sum())
         for name in ("kind", "weather", "open", "sunny"):
@@ -176,8 +160,7 @@ def altered(panel, split, cut):
     return replace(panel, series=series)
 
 
-@pytest.mark.parametrize("cut", [CUT, Cut(5, 3, split="time", test=0.3)], ids=lambda cut: cut.split)
-@pytest.mark.parametrize("missing", [False, True])
+@pytest.mark.parametrize(("cut", "missing"), [(CUT, False), (Cut(5, 3, split="time", test=0.3), True)])
 def test_nothing_of_what_is_tested_is_in_what_is_trained_on(cut, missing):
     panel = table(t=40, missing=missing, times=np.arange(40.0))
     other = altered(panel, "train", cut)
@@ -191,55 +174,35 @@ def test_nothing_of_what_is_tested_is_in_what_is_trained_on(cut, missing):
     assert all(torch.equal(batch[name], again[name]) for name in batch)
 
 
-def test_a_constant_has_no_unit_whatever_rounding_leaves_of_it():
-    values = np.where(np.arange(80).reshape(40, 2) % 4 < 2, 0.3, 0.1 + 0.2)
-    assert values[:, 0].std() > 0
-    told = Columns((Column("y"), Column("plan", "known")))
-    schema = PanelSchema.under(Panel([Series(f"s{n}", values) for n in range(5)], told), CUT)
-    assert schema.scales == {"y": 1.0, "plan": 1.0}
-
-
 def by_hand(one, schema):
     """c, row by row, as the file says."""
     last, rows = {}, []
     for row in one.values:
         found = []
-        for place, told in enumerate(schema.columns.columns):
+        for value, told in zip(row, schema.columns.columns, strict=True):
             if told.role not in ("known", "past"):
                 continue
-            value, known = row[place], not np.isnan(row[place])
-            last[told.name] = value if known else last.get(told.name, NAN)
-            held = last[told.name]
+            held = last[told.name] = last.get(told.name, NAN) if np.isnan(value) else value
             if told.family == "category":
                 found += [float(held == n) for n in range(len(told.classes))]
             else:
-                mean = schema.means[told.name]
-                found.append(((mean if np.isnan(held) else held) - mean) / schema.scales[told.name])
+                found.append(np.nan_to_num((held - schema.means[told.name]) / schema.scales[told.name]))
             if told.name in schema.lacking:
-                found.append(float(known))
+                found.append(float(not np.isnan(value)))
         rows.append(found)
     return np.array(rows)
 
 
-def test_covariates_have_their_last_value_or_before_any_the_mean():
+def test_covariates_have_their_last_value_or_before_any_the_mean_and_classes_are_one_of_several():
     panel = table(seed=3)
     for place in (0, 1):  # nothing at first, and nothing at all
         panel.series[place].values[: (4, 12)[place], [1, 3, 5]] = NAN
     schema = PanelSchema.under(panel, CUT)
     for one in panel:
         np.testing.assert_allclose(schema.context(one), by_hand(one, schema), rtol=1e-12, atol=1e-12)
-
-
-def test_targets_are_coordinates_and_classes_are_one_of_several():
-    panel = table()
-    schema = PanelSchema.under(panel, CUT)
-    for one in panel:
-        x = schema.targets(one)
-        np.testing.assert_array_equal(x[:, [0, 4, 5]], one.values[:, [0, 4, 7]])
-        kinds = one.values[:, 2]
-        assert (np.isnan(x[:, 1:4]) == np.isnan(kinds)[:, None]).all()
-        known = ~np.isnan(kinds)
-        np.testing.assert_array_equal(x[known, 1:4], np.eye(3)[kinds[known].astype(int)])
+        kinds, x = one.values[:, 2], schema.targets(one)
+        eye = np.where(np.isnan(kinds)[:, None], NAN, np.eye(3)[np.nan_to_num(kinds).astype(int)])
+        np.testing.assert_array_equal(x, np.column_stack([one.values[:, 0], eye, one.values[:, [4, 7]]]))
 
 
 def test_what_is_static_is_of_the_sequence():
@@ -262,14 +225,11 @@ def test_what_is_static_is_of_the_sequence():
     ("times", "step"),
     [
         (None, 0),
-        (np.arange(24.0) * 7, 0),
         (np.arange("2020-01", "2022-01", dtype="datetime64[M]").astype("datetime64[s]").astype(float), 0),
-        (np.arange("1996", "2020", dtype="datetime64[Y]").astype("datetime64[s]").astype(float), 0),
         (np.cumsum([1.0, 2, 2, 4] * 6), 2),
         (np.cumsum([2.0] * 23 + [0.01]), 2),
-        (np.cumsum([1.0, 1, 1, 1, 3, 1] * 4), 1),
     ],
-    ids=["none", "weeks", "months", "years", "uneven", "near", "weekends"],
+    ids=["none", "months", "uneven", "near"],
 )
 def test_gaps_are_there_where_steps_are_uneven(times, step):
     panel = table(t=24, times=times)
@@ -283,26 +243,14 @@ def test_gaps_are_there_where_steps_are_uneven(times, step):
         assert gaps[0] == 1
 
 
-def test_a_schema_comes_back_from_json():
-    panel = table(times=np.cumsum([1.0, 3, 1] * 4))
-    for cut in (CUT, Cut(), Cut(3, 2, split="time"), Cut(5, 3, stride=2, seed=4)):
-        schema = PanelSchema.under(panel, cut)
-        again = PanelSchema.from_config(json.loads(json.dumps(schema.config())))
-        assert again == schema
-        assert again.sizes == schema.sizes
-        assert (again.length, again.observed) == (cut.length, cut.observed)
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         ({"means": {}}, "no mean and scale of height, plan, price"),
-        ({"scales": {"plan": 1.0}}, "no mean and scale of height, price"),
         (
-            {"scales": {"plan": 0.0, "height": 1.0, "price": 1.0}},
-            r"scales\['plan'\] is 0.0; it must be finite and above 0",
+            {"scales": dict.fromkeys(("plan", "height", "price"), 0.0)},
+            r"scales\['plan'\] is 0.0; it must be finite and",
         ),
-        ({"means": {"plan": float("inf"), "height": 0.0, "price": 0.0}}, r"means\['plan'\] is inf; it must be finite"),
         ({"lacking": ()}, "no indicator of price, weather"),
         ({"step": -1.0}, "step is -1.0"),
     ],
@@ -312,38 +260,26 @@ def test_a_schema_that_lacks_what_it_needs_is_refused(change, said):
         replace(PanelSchema.under(table(), CUT), **change)
 
 
-def test_every_family_has_the_law_of_its_columns():
+def test_columns_of_a_family_have_one_law_and_categories_one_each():
     told = Columns(
         (
+            Column("real", family="category", classes=KINDS),  # may have the name of a family
             Column("a"),
             Column("n", family="count"),
-            Column("k", family="category", classes=KINDS),
             Column("b"),
             Column("l", family="category", classes=("u", "v")),
-            Column("m", family="count"),
         )
     )
     law = PanelSchema(columns=told).emission
     assert isinstance(law, Product)
-    assert dict(law.parts) == {
-        (0, 5): FAMILIES["real"],
-        (1, 8): FAMILIES["count"],
-        (2, 3, 4): FAMILIES["category"],
-        (6, 7): FAMILIES["category"],
-    }
+    places = {(0, 1, 2): "category", (3, 5): "real", (4,): "count", (6, 7): "category"}
+    assert dict(law.parts) == {place: FAMILIES[name] for place, name in places.items()}
     for family, spec in FAMILIES.items():
         classes = ("u", "v") if family == "category" else ()
         assert PanelSchema(columns=Columns((Column("y", family=family, classes=classes),))).emission == spec
 
 
-def test_a_category_may_have_the_name_of_a_family():
-    told = Columns((Column("real", family="category", classes=KINDS), Column("y"), Column("count", family="count")))
-    law = PanelSchema(columns=told).emission
-    assert [places for places, _ in law.parts] == [(0, 1, 2), (3,), (4,)]
-    assert [spec for _, spec in law.parts] == [FAMILIES["category"], FAMILIES["real"], FAMILIES["count"]]
-
-
-def test_a_column_without_values_to_train_on_is_refused():
+def test_training_parts_without_values_or_windows_are_refused():
     panel = table()
     for place, _, _ in CUT.starts(panel, "train"):
         panel.series[place].values[:, TOLD.names.index("temp")] = NAN

@@ -1,12 +1,13 @@
 """A panel is the same whatever held its numbers, and says what it cannot hold."""
 
 import re
+from dataclasses import replace
 from decimal import Decimal
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvae.distributions.family import FAMILIES
@@ -43,48 +44,34 @@ def long(numbers):
 
 def test_the_same_numbers_from_everywhere_are_the_same_panel():
     numbers = grid()
-    wanted = {str(n): each for n, each in enumerate(numbers)}
-    same(values(Panel.of(numbers)), wanted)
-    same(values(Panel.of(list(numbers))), wanted)
-    same(values(Panel.of([torch.from_numpy(each) for each in numbers])), wanted)
-    same(values(Panel.of(torch.from_numpy(numbers))), wanted)
-    same(values(Panel.of(torch.from_numpy(numbers).requires_grad_())), wanted)
-    same(values(Panel.of(long(numbers), LONG)), wanted)
+    wanted = {str(n): each.copy() for n, each in enumerate(numbers)}
+    tensors = torch.from_numpy(numbers).requires_grad_()
+    for held in (numbers, list(numbers), tensors, [*tensors]):
+        same(values(Panel.of(held)), wanted)
+    frame = long(numbers)
     for index in ("s", "t", ["s", "t"], ["t", "s"]):
-        same(values(Panel.of(long(numbers).set_index(index), LONG)), wanted)
-    same(values(Panel.of(long(numbers).set_index("t", drop=False), LONG)), wanted)
+        indexed = frame.set_index(index)
+        same(values(Panel.of(indexed, LONG)), wanted)
+        pd.testing.assert_frame_equal(indexed, frame.set_index(index))
+    same(values(Panel.of(frame.set_index("t", drop=False), LONG)), wanted)
     dataset = xr.Dataset({name: (("s", "t"), numbers[..., n]) for n, name in enumerate(("x0", "x1"))})
-    same(values(Panel.of(dataset, LONG)), wanted)
-    same(values(Panel.of(dataset)), wanted)
-    same(values(Panel.of(dataset.transpose("t", "s"), ["x0", "x1"])), wanted)
+    for each in (Panel.of(dataset, LONG), Panel.of(dataset), Panel.of(dataset.transpose("t", "s"), ["x0", "x1"])):
+        same(values(each), wanted)
     first = {name: each[:, :1] for name, each in wanted.items()}
     same(values(Panel.of(dataset["x0"])), first)
     wide = pd.DataFrame(numbers[..., 0].T, columns=list("012"))
     same(values(Panel.wide(wide)), first)
     same(values(Panel.wide(wide.set_axis(pd.date_range("2024", periods=5, tz="Asia/Tokyo")))), first)
-
-
-def test_one_sequence_needs_no_name():
-    numbers = grid()[0]
-    same(values(Panel.of(numbers)), {"0": numbers})
-    same(values(Panel.of(pd.DataFrame(numbers))), {"0": numbers})
-    assert Panel.of(pd.DataFrame(numbers)).columns.names == ["0", "1"]
-    same(values(Panel.of(pd.Series(numbers[:, 0], name="a"))), {"0": numbers[:, :1]})
-
-
-def test_what_changes_later_elsewhere_does_not_change_a_panel():
-    numbers = grid()
-    panel, wanted = Panel.of(numbers), numbers[0].copy()
+    panel = Panel.of(numbers)
     numbers[:] = 0
-    np.testing.assert_array_equal(panel.series[0].values, wanted)
+    same(values(panel), wanted)
 
 
 DAYS = pd.to_datetime(["2024-01-01", "2024-01-02", "2024-01-05", "2024-01-06"])
 
 
-@pytest.mark.parametrize("name", [None, "day", "y"])
 @pytest.mark.parametrize(
-    "days", [DAYS, DAYS.tz_localize("Asia/Tokyo"), DAYS.to_period("D")], ids=["", "zone", "period"]
+    ("name", "days"), [(None, DAYS), ("day", DAYS.tz_localize("Asia/Tokyo")), ("y", DAYS.to_period("D"))]
 )
 def test_dates_in_an_index_are_times(days, name):
     frame = pd.DataFrame({"x": [1.0, 2.0, 3.0, 4.0], "time": [0.5, 0.5, 0.25, 0.5]}, index=days.rename(name))[::-1]
@@ -124,13 +111,7 @@ def test_an_index_that_says_nothing_is_no_column():
         Panel.of(frame.set_axis(pd.Index([7, 8, 9], name="y")))
 
 
-def test_a_panel_leaves_its_frame_as_it_was():
-    frame = long(grid()).set_index(["s", "t"])
-    before = frame.copy()
-    Panel.of(frame, LONG)
-    pd.testing.assert_frame_equal(frame, before)
-
-
+@settings(max_examples=20)
 @given(st.permutations(range(15)))
 def test_the_order_of_rows_does_not_matter(order):
     frame = long(grid())
@@ -159,188 +140,110 @@ def of(column, family="real", classes=()):
 
 
 @pytest.mark.parametrize(
-    "column",
+    ("column", "classes", "wanted"),
     [
-        [1.0, np.nan, 0.0],
-        [1, None, 0],
-        np.array([1, None, 0], object),
-        np.array([1, pd.NA, 0], object),
-        np.array([1, float("nan"), 0], object),
-        np.array([True, None, False], object),
-        np.array([Decimal(1), None, Decimal(0)], object),
-        pd.array([1, None, 0], "Int64"),
-        pd.array([1, None, 0], "Float32"),
-        pd.array([True, None, False], "boolean"),
-        pd.Categorical([1, None, 0]),
-        ["1", None, "0"],
+        (np.array([1, pd.NA, 0], object), (), [1, np.nan, 0]),
+        (np.array([True, None, False], object), (), [1, np.nan, 0]),
+        (np.array([Decimal(1), None, Decimal(0)], object), (), [1, np.nan, 0]),
+        (pd.array([1, None, 0], "Int64"), (), [1, np.nan, 0]),
+        (pd.array([True, None, False], "boolean"), (), [1, np.nan, 0]),
+        (["1", None, "0"], (), [1, np.nan, 0]),
+        (["v", None, "u"], ("u", "v"), [1, np.nan, 0]),
+        ([2, None, 1], ("1", "2"), [1, np.nan, 0]),
+        (pd.Categorical(["b", None]), ("a", "b"), [1, np.nan]),
+        ([1.5, None], ("1.5", "2"), [0, np.nan]),
+        ([None, None], ("1", "2"), [np.nan, np.nan]),
     ],
     ids=str,
 )
-def test_missing_values_of_every_kind_are_missing(column):
-    np.testing.assert_array_equal(of(column), [1.0, np.nan, 0.0])
+def test_values_and_classes_are_the_same_however_they_and_missing_ones_are_written(column, classes, wanted):
+    np.testing.assert_array_equal(of(column, "category" if classes else "real", classes), wanted)
 
 
-def test_true_and_false_are_1_and_0():
-    np.testing.assert_array_equal(of([True, False], "binary"), [1, 0])
-
-
-def test_classes_are_texts_and_whole_numbers_are_written_alike_whether_some_are_missing():
-    np.testing.assert_array_equal(of(["v", None, "u"], "category", ("u", "v")), [1, np.nan, 0])
-    np.testing.assert_array_equal(of([2, 1], "category", ("1", "2")), [1, 0])
-    np.testing.assert_array_equal(of([2, None, 1], "category", ("1", "2")), [1, np.nan, 0])
-    np.testing.assert_array_equal(of(pd.Categorical(["b", None]), "category", ("a", "b")), [1, np.nan])
-    np.testing.assert_array_equal(of([1.5, None], "category", ("1.5", "2")), [0, np.nan])
-    np.testing.assert_array_equal(of([None, None], "category", ("1", "2")), [np.nan, np.nan])
-    with pytest.raises(ValueError, match=r"'y' has 'rian' \(did you mean 'rain'\?\), which is none of its classes"):
+def test_a_value_that_is_no_class_is_refused_unless_a_class_stands_for_all_others():
+    with pytest.raises(
+        ValueError, match=r"'y' has 'rian' \(did you mean 'rain'\?\), .*; a class can stand for all oth"
+    ):
         of(["rian"], "category", ("rain", "sun"))
-
-
-def test_a_class_that_is_named_stands_for_all_others():
-    frame = pd.DataFrame({"y": ["rain", "hail", None, "sun"]})
     told = Columns((Column("y", family="category", classes=("rain", "else", "sun"), other="else"),))
-    np.testing.assert_array_equal(Panel.of(frame, told).series[0].values[:, 0], [0, 1, np.nan, 2])
-    with pytest.raises(ValueError, match="classes: rain, sun; a class can stand for all others: other = 'sun'"):
-        Panel.of(frame, Columns((Column("y", family="category", classes=("rain", "sun")),)))
+    panel = Panel.of(pd.DataFrame({"y": ["rain", "hail", None, "sun"]}), told)
+    np.testing.assert_array_equal(panel.series[0].values[:, 0], [0, 1, np.nan, 2])
 
 
 @pytest.mark.parametrize(
     ("column", "said"),
     [
-        (
-            [1.0, "a few", 2],
-            "column 'y': 2 of 3 values are numbers; row 1 is 'a few', which is no number; .* na_values",
-        ),
-        (["x", None], "column 'y': row 0 is 'x', which is no number"),
+        ([1.0, "a few", 2], "column 'y': 2 of 3 .* are numbers; row 1 is 'a few', which is no number; .* na_values"),
         (pd.to_datetime(["2024", None]), r"column 'y' holds datetime64\[.s\], which are no numbers"),
-        (pd.to_timedelta([1, 2], "s"), "column 'y' holds timedelta"),
-        ([1j, 2], "column 'y' holds complex128"),
         ([10**400, 1], "column 'y': 1 of 2 values are numbers; row 0 is 1000"),
-        ([[1], 2], "column 'y': row 0 is .1., which is no number"),
         (["1,234", "5,678"], "column 'y' holds '1,234', which may be 1234 or a fraction; give the decimal sign"),
     ],
-    ids=["mixed", "text", "dates", "spans", "complex", "huge", "lists", "sign"],
+    ids=["mixed", "dates", "huge", "sign"],
 )
 def test_what_holds_no_numbers_is_named(column, said):
     with pytest.raises(ValueError, match=said):
         of(column)
 
 
-GOOD = {
-    "binary": [0, 1],
-    "category": [0, 1],
-    "share": [0.25, 0.75],
-    "angle": [-np.pi, np.pi],
-    "positive": [0.5, 3],
-    "log-normal": [0.5, 3],
-    "power": [0, 2.5],
-    **{key: [0, 70] for key in ("count", "overdispersed", "sparse", "sparse-overdispersed")},
+COUNTS = ([0, 70], [0.5, -1])
+VALUES = {
+    "binary": ([0, 1], [0.5, 2, -1]),
+    "category": ([0, 1], [2, -1, 0.5]),
+    "share": ([0.25, 0.75], [0, 1, 1 - 1e-12, 1e-50]),
+    "angle": ([-np.pi, np.pi], [3.2, -4]),
+    "positive": ([0.5, 3], [0, -1, 1e-50]),
+    "log-normal": ([0.5, 3], [0, -1]),
+    "power": ([0, 2.5], [-0.1]),
+    **dict.fromkeys(("count", "overdispersed", "sparse", "sparse-overdispersed"), COUNTS),
 }
-BAD = {
-    "binary": [0.5, 2, -1],
-    "category": [2, -1, 0.5],
-    "share": [0, 1, 1 - 1e-12, 1e-50],
-    "angle": [3.2, -4],
-    "positive": [0, -1, 1e-50],
-    "log-normal": [0, -1],
-    "power": [-0.1],
-    **{key: [0.5, -1] for key in ("count", "overdispersed", "sparse", "sparse-overdispersed")},
-}
+"""Of a family: values that it has, and values that it has not; the others have all."""
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_values_are_of_their_family_as_models_see_them(family):
     columns = Columns((Column("a"), Column("y", family=family, classes=("u", "v") if family == "category" else ())))
-
-    def panel(value):
-        told = [Series("p", np.array([[0.0, np.nan]])), Series("q", np.array([[0.0, np.nan], [0.0, value]]))]
-        return Panel(told, columns, "riders")
-
-    for value in GOOD.get(family, [-3.5, 0.0]):
-        panel(value)
-    for value in [*BAD.get(family, []), np.inf, 1e31]:
+    good, bad = VALUES.get(family, ([-3.5, 0.0], []))
+    for value in [*good, *bad, np.inf, 1e31]:
+        series = [Series("p", np.array([[0.0, np.nan]])), Series("q", np.array([[0.0, np.nan], [0.0, value]]))]
+        if value in good:
+            Panel(series, columns, "riders")
+            continue
         advice = "give it another family" if np.isfinite(value) else "where none is known, write NaN"
-        with pytest.raises(
-            ValueError, match=rf"'q' of riders has .* in row 1 of column 'y', and the family '\S+' is of .*; {advice}"
-        ) as refused:
-            panel(value)
+        said = rf"'q' of riders has .* in row 1 of column 'y', and the family '\S+' is of .*; {advice}"
+        with pytest.raises(ValueError, match=said) as refused:
+            Panel(series, columns, "riders")
         assert len(re.findall("below", str(refused.value))) <= 1
 
 
 @pytest.mark.parametrize(
-    "column",
+    ("column", "gaps"),
     [
-        pd.date_range("2020-03-28", periods=3, tz="Europe/Berlin"),
-        ["2020-03-28T00:00+01:00", "2020-03-29T00:00+01:00", "2020-03-30T00:00+02:00"],
-        pd.to_datetime(["2020-03-27 23:00", "2020-03-28 23:00", "2020-03-29 22:00"]),
+        (["2020-01-01", "2020-01-01 12:00", "2020-01-02"], [43200, 43200]),
+        (["1500-01-01", "1500-01-02", "1500-01-03"], [86400, 86400]),
     ],
-    ids=["zone", "texts", "utc"],
+    ids=["of several lengths", "before 1970"],
 )
-def test_dates_with_time_zones_are_moments(column):
-    frame = pd.DataFrame({"t": column, "y": [1.0, 2.0, 3.0]})
-    panel = Panel.of(frame)
-    assert panel.columns.time == "t"
-    assert panel.calendar.kind == "dates"
-    np.testing.assert_array_equal(np.diff(panel.series[0].times) / 3600, [24, 23])  # summer time
-    assert panel.series[0].times[0] == 1585350000
-
-
-@pytest.mark.parametrize(
-    "column",
-    [["2020-01-01", "2020-01-01 12:00", "2020-01-02"], pd.period_range("2020-01-01", periods=3, freq="12h")],
-    ids=["of several lengths", "periods"],
-)
-def test_dates_are_read_as_they_are_written(column):
+def test_dates_are_read_as_they_are_written(column, gaps):
     times = Panel.of(pd.DataFrame({"t": column, "y": [1.0, 2, 3]}), Columns((Column("y"),), time="t")).series[0].times
-    np.testing.assert_array_equal(np.diff(times), [43200, 43200])
-
-
-@pytest.mark.parametrize(
-    "written",
-    [
-        "%Y-%m-%d %H:%M",
-        "%Y/%m/%d %H:%M",
-        "%Y%m%dT%H%M",
-        "%d/%m/%Y %H:%M",
-        "%d.%m.%Y %H:%M:%S",
-        "%d-%m-%Y, %H:%M",
-        "%m/%d/%Y %I:%M %p",
-        "%Y-%m-%d %I:%M %p",
-        "%d %b %Y %H:%M",
-        "%d-%b-%y %H:%M",
-        "%B %d, %Y %I:%M%p",
-        "%a, %d %b %Y %H:%M:%S +0000",
-        " %d/%m/%Y %H:%M UTC",
-    ],
-)
-def test_moments_are_read_back_however_they_are_written(written):
-    when = pd.date_range("2024-01-01", periods=400, freq="11h") + pd.Timedelta("7min")
-    frame = pd.DataFrame({"t": when.strftime(written), "y": np.arange(400.0)})
-    panel = Panel.of(frame, Columns((Column("y"),), time="t"))
-    np.testing.assert_array_equal(panel.series[0].times, when.astype("datetime64[s]").astype(int))
-    assert proposed(frame).time == "t"
+    np.testing.assert_array_equal(np.diff(times), gaps)
 
 
 @pytest.mark.parametrize(
     ("freq", "written"),
     [
-        *(("MS", written) for written in ("%Y-%m", "%Y/%m", "%m/%Y", "%b %Y", "%B %Y", "number %Y%m")),
-        *(("QS", written) for written in ("%YQq", "%Y-Qq", "%Y Qq")),
-        *(("W-MON", written) for written in ("%G-W%V", "%GW%V", "%G-W%V-1", "number %Y%m%d")),
+        *(("667min", how) for how in ("%Y%m%dT%H%M", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %I:%M %p", " %d/%m/%Y %H:%M UTC")),
+        *(("MS", how) for how in ("%Y-%m", "%m/%Y", "number %Y%m")),
+        *(("QS", how) for how in ("%YQq", "%Y-Qq")),
+        *(("W-MON", how) for how in ("%G-W%V", "%GW%V", "number %Y%m%d")),
     ],
 )
-def test_months_quarters_and_weeks_are_read_back(freq, written):
+def test_times_are_read_back_however_they_are_written(freq, written):
     when = pd.date_range("1975-01-01", periods=300, freq=freq)
     said = [each.strftime(written.removeprefix("number ")).replace("q", str(each.quarter)) for each in when]
     frame = pd.DataFrame({"t": [int(each) for each in said] if "number" in written else said, "y": np.arange(300.0)})
-    times = Panel.of(frame).series[0].times
-    np.testing.assert_array_equal(times, when.astype("datetime64[s]").astype(int))
-
-
-def test_dates_before_1970_are_times_too():
-    frame = pd.DataFrame({"t": ["1500-01-01", "1500-01-02", "1969-12-31"], "y": [1.0, 2, 3]})
-    times = Panel.of(frame, Columns((Column("y"),), time="t")).series[0].times
-    assert times[1] - times[0] == 86400
-    assert times[2] == -86400
+    panel = Panel.of(frame)
+    assert panel.columns.time == "t"
+    np.testing.assert_array_equal(panel.series[0].times, when.astype("datetime64[s]").astype(int))
 
 
 @pytest.mark.parametrize(
@@ -350,35 +253,17 @@ def test_dates_before_1970_are_times_too():
             [0, 1, 1],
             "sequence '0' has two rows at t 1, 1 and 2; name the id .*, or remove the row that is there twice$",
         ),
-        (
-            ["2020-01", "2021-01", "2021-01"],
-            "two rows at t 2021-01-01 00:00:00, 1 and 2; .* if clocks were set back, their zone",
-        ),
-        (["1:00:00", "2:00:00", "2:00:00"], "two rows at t 0 days 02:00:00, .*, or write the date before clocks"),
-        (
-            ["2020-01-01T01:00+01:00", "2020-01-02", "2020-01-03"],
-            "and others, such as '2020-01-02', without one",
-        ),
-        ([0, None, 1], "row 1 of column 't' has no time"),
+        (["2020-01", "2021-01", "2021-01"], "two rows at t 2021-01-01 00:00:00, 1 and 2; .* if clocks were set back"),
+        (["2020-01-01T01:00+01:00", "2020-01-02", "2020-01-03"], "and others, such as '2020-01-02', without one"),
         (["2020", None, "2021"], "row 1 of column 't' has no time"),
-        (["a", "b", "c"], "times of column 't' are neither numbers, dates nor durations"),
+        (["1/2/2020", "13/2/2020", "2/13/2020"], "nor durations: some begin with the day and others with the m"),
         (
-            ["1/2/2020", "13/2/2020", "2/13/2020"],
-            "nor durations: some begin with the day and others with the m",
+            ["30/1/2020", "30/2/2020", "30/3/2020"],
+            "nor durations: '30/2/2020' in row 1 among them; write dates as 2024",
         ),
-        (["13/1/2020", "n.a.", "15/1/2020"], "nor durations: 'n.a.' in row 1 among them; write dates as 2024-12-31"),
-        (["30/1/2020", "30/2/2020", "30/3/2020"], "nor durations: '30/2/2020' in row 1 among them"),
-        (
-            ["1/2/2020", "2/2/2020", "12/2/2020"],
-            "column 't' holds dates such as '1/2/2020', .* as 2024-12-31",
-        ),
-        (["1.2.20", "2.2.20", "13.2.20"], "column 't' holds dates such as '1.2.20'"),
-        (["2024-02-28", "2024-02-29", "2024-02-30"], "nor durations: '2024-02-30' in row 2 among"),
+        (["1/2/2020", "2/2/2020", "12/2/2020"], "column 't' holds dates such as '1/2/2020', .* as 2024-12-31"),
         (["12:30", "12:40", "12:50"], "nor durations: '12:30' in row 0 among them; .* durations as 02:30:00"),
-        (
-            ["22:00:00", "23:00:00", "00:00:00"],
-            "goes back from t 0 days 23:00:00 in row 1 to 0 days .* in row 2; .* midnight",
-        ),
+        (["22:00:00", "23:00:00", "00:00:00"], "goes back from t 0 days 23:00:00 in row 1 to 0 days .* midnight"),
     ],
 )
 def test_rows_without_a_time_of_their_own_are_refused(column, said):
@@ -393,22 +278,8 @@ def test_sequences_are_told_apart_by_all_their_ids():
     assert {one.name: one.values.item() for one in panel} == {"1/u": 1, "1/v": 2, "2/u": 3, "2/": 4}
     numbered = frame.assign(a=[10, 10, 2, 2])
     assert next(iter(Panel.of(numbered, Columns((Column("y"),), id=("a", "b"), time="t")))).name == "2/u"
-
-
-def test_an_array_of_times_is_refused():
-    times = np.arange(6).astype("datetime64[D]").reshape(6, 1)
-    for each in (times, [times], times - times[0]):
-        with pytest.raises(
-            TypeError, match=r"array of (date|time).*; give a pandas frame with the times in one column"
-        ):
-            Panel.of(each)
-
-
-def test_rows_without_an_id_are_refused():
-    frame = pd.DataFrame({"shop": ["a", None, "a", None], "t": range(4), "y": np.arange(4) / 8})
-    with pytest.raises(ValueError, match="2 of 4 rows have no shop, the first of them row 1; fill in which sequence"):
-        Panel.of(frame, Columns((Column("y"),), ("shop",), "t"))
-    assert len(Panel.of(frame.assign(city="n"), Columns((Column("y"),), ("city", "shop"), "t"))) == 2
+    with pytest.raises(ValueError, match="1 of 4 rows have no b, the first of them row 3; fill in which sequence"):
+        Panel.of(frame.assign(t=range(4)), Columns((Column("y"),), ("b",), "t"))
 
 
 def test_groups_and_splits_are_of_sequences():
@@ -425,7 +296,33 @@ def test_groups_and_splits_are_of_sequences():
         Panel.of(frame.assign(p="train", g=[1, 1, 2, None]), told)
 
 
-def test_the_wrong_column_has_the_nearest_named():
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ([], "sequences are .T, D.; got none"),
+        (torch.zeros(3), r"got \(3,\); one sequence of one column is \(T, 1\)"),
+        ([np.zeros((3, 2)), np.zeros((4, 3))], r"sequence '1' of panel has shape \(4, 3\); expected rows of 2 columns"),
+        (np.zeros((2, 0, 3)), r"shape \(0, 3\)"),
+        (pd.DataFrame(np.zeros((2, 2)), columns=["a", "a"]), "two columns 'a'"),
+        (pd.DataFrame({"a": [1.0]}).iloc[:0], "the table has no rows"),
+        (np.zeros((6, 1), "datetime64[D]"), "array of date.*; give a pandas frame with the times in one column"),
+        ({"a": [1]}, "not of dict"),
+    ],
+)
+def test_what_holds_no_sequences_is_refused(data, said):
+    with pytest.raises((ValueError, TypeError), match=said):
+        Panel.of(data)
+
+
+def test_sequences_are_checked():
+    one, told = np.zeros((2, 1)), Columns((Column("y"),))
+    for series, said in (
+        ([Series("a", one), Series("a", one)], "two sequences 'a'"),
+        ([Series("a", one, np.array([1.0, 1.0]))], "times that do not increase"),
+        ([], "has no sequences"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            Panel(series, told)
     with pytest.raises(ValueError, match=r"no column 'x00' \(did you mean 'x0'\?\); there are x0, x1, s, t"):
         Panel.of(long(grid()), Columns((Column("x00"),)))
     with pytest.raises(ValueError, match=r"no sequence '21' \(did you mean '2'\?\)"):
@@ -433,52 +330,11 @@ def test_the_wrong_column_has_the_nearest_named():
     assert [one.name for one in Panel.of(grid()).only(["2", "0"])] == ["2", "0"]
 
 
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        ([], "sequences are .T, D.; got none"),
-        ([1.0, 2.0], r"got \(\), \(\); one sequence of one column is \(T, 1\)"),
-        (np.zeros(3), r"got \(3,\); one sequence of one column is \(T, 1\)"),
-        (torch.zeros(3), r"got \(3,\); one sequence of one column is \(T, 1\)"),
-        ([np.zeros((3, 2)), np.zeros((4, 3))], r"sequence '1' of panel has shape \(4, 3\); expected rows of 2 columns"),
-        (np.zeros((2, 0, 3)), r"shape \(0, 3\)"),
-        (pd.DataFrame(np.zeros((2, 2)), columns=["a", "a"]), "two columns 'a'"),
-        (pd.DataFrame({"a": [1.0]}).iloc[:0], "the table has no rows"),
-    ],
-)
-def test_what_holds_no_sequences_is_refused(data, said):
-    with pytest.raises(ValueError, match=said):
-        Panel.of(data)
-
-
-def test_data_of_another_kind_are_refused():
-    for data in ("abc", {"a": [1]}, 3):
-        with pytest.raises(TypeError, match=r"not of (str|dict|int)"):
-            Panel.of(data)
-
-
-def test_sequences_are_checked():
-    one = np.zeros((2, 1))
-    told = Columns((Column("y"),))
-    with pytest.raises(ValueError, match="two sequences 'a'"):
-        Panel([Series("a", one), Series("a", one)], told)
-    with pytest.raises(ValueError, match="times that do not increase"):
-        Panel([Series("a", one, np.array([1.0, 1.0]))], told)
-    with pytest.raises(ValueError, match="has no sequences"):
-        Panel([], told)
-
-
 def test_every_part_of_a_panel_has_a_share_in_its_fingerprint():
     told = Columns((Column("y"),))
     base = Series("a", np.zeros((2, 1)), np.array([0.0, 1.0]), "g", "train")
-    changes = [
-        Series("b", base.values, base.times, "g", "train"),
-        Series("a", base.values + 1, base.times, "g", "train"),
-        Series("a", base.values, base.times + 1, "g", "train"),
-        Series("a", base.values, None, "g", "train"),
-        Series("a", base.values, base.times, "h", "train"),
-        Series("a", base.values, base.times, "g", "test"),
-    ]
-    prints = {Panel([each], told).fingerprint() for each in (base, *changes)}
+    changes = {"name": "b", "values": base.values + 1, "times": base.times + 1, "group": "h", "split": "test"}
+    changed = [replace(base, **{name: value}) for name, value in changes.items()]
+    prints = {Panel([each], told).fingerprint() for each in (base, replace(base, times=None), *changed)}
     prints.add(Panel([base], Columns((Column("z"),))).fingerprint())
     assert len(prints) == 8

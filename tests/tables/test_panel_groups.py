@@ -21,8 +21,15 @@ def panel(cut):
     return PanelData.of(pd.DataFrame(rows), columns, cut)
 
 
-def test_windows_of_a_group_share_it_where_they_have_the_same_present():
-    data = panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
+@pytest.fixture(scope="module")
+def data():
+    return panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
+
+
+OWN = {"generative": "p(g) p(x_t | g)", "inference": "q(g | x_{1:T})", "grouped": ("g",), "latent": 1, "width": 8}
+
+
+def test_windows_of_a_group_share_it_where_they_have_the_same_present(data):
     test = data.windows("test")
     groups = {one.name: one.group for one in data.panel.series}
     keys = [(groups[name], start) for _, name, start in test.keys]
@@ -31,23 +38,18 @@ def test_windows_of_a_group_share_it_where_they_have_the_same_present():
     assert len({groups[name] for _, name, _ in test.keys}) == 3
 
 
-def test_batches_for_training_have_several_windows_of_a_group():
-    train = panel(Cut(4, 4, split="group", validation=0.2, test=0.3)).windows("train")
+def test_batches_for_training_have_several_windows_of_a_group(data):
+    train = data.windows("train")
     batch = train.sample(20, torch.Generator().manual_seed(0))
     assert batch["group"].tolist() == sorted(batch["group"].tolist())
     assert batch["group"].bincount().max() >= 8
     means = torch.stack([batch["x"][batch["group"] == g].mean() for g in batch["group"].unique()])
     assert means.diff().abs().min() > 0.3  # of which each has its own
-    again = train.sample(20, torch.Generator().manual_seed(0))
-    assert torch.equal(again["x"], batch["x"])
 
 
-def test_errors_are_over_groups_whose_sequences_share_what_is_drawn():
+def test_errors_are_over_groups_whose_sequences_share_what_is_drawn(data):
     """Bounds of a group's sequences are equal shares of its own: their spread tells nothing of other groups."""
-    data = panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
-    torch.manual_seed(0)
-    pair = {"generative": "p(g) p(x_t | g)", "inference": "q(g | x_{1:T})"}
-    model = dvae.method("equations", **pair, grouped=("g",), latent=1, width=8).build(data.schema)
+    model = dvae.method("equations", **OWN).build(data.schema)
     test = data.windows("test")
     how = {"progress": False, "samples": 2}
     found = dvae.compare({"ours": model}, test, particles=5, contrasts=0, **how)
@@ -67,17 +69,8 @@ def test_errors_are_over_groups_whose_sequences_share_what_is_drawn():
     assert np.isfinite(scores["ours"]["CRPS"].standard_error)
 
 
-def test_what_a_group_shares_is_learned_and_told_by_its_sequences(tmp_path):
-    data = panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
-    method = dvae.method(
-        "equations",
-        generative="p(g) p(x_t | g)",
-        inference="q(g | x_{1:T})",
-        grouped=("g",),
-        latent=1,
-        width=8,
-        warm_up=None,
-    )
+def test_what_a_group_shares_is_learned_and_told_by_its_sequences(data):
+    method = dvae.method("equations", **OWN, warm_up=None)
     model = method.build(data.schema)
     recipe = method.train(data.windows("train"), data.windows("validation"), 150)
     dvae.fit(model, recipe, batch_size=32, learning_rate=1e-2, progress=False)

@@ -2,8 +2,7 @@
 
 import csv
 import warnings
-from dataclasses import dataclass, field
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,25 +12,8 @@ from dvae.tables.reading import read_panel
 
 pd = pytest.importorskip("pandas")
 
-WORDS = [
-    "07",
-    "7",
-    "7.0",
-    "1E5",
-    "100000",
-    "NA",
-    "None",
-    "nan",
-    "0x10",
-    "16",
-    "true",
-    "é",
-    "a,b",
-    "a;b",
-    'say "x"',
-    "-",
-    "?",
-]
+WORDS = ["07", "7", "7.0", "1E5", "100000", "NA", "None", "nan", "0x10", "16", "true"]
+WORDS += ["é", "a,b", "a;b", 'say "x"', "-", "?"]
 """Texts that a reader could take for something else."""
 NUMBERS = {
     "noise": lambda random, n: random.normal(size=n),
@@ -59,19 +41,11 @@ CLOCKS = {
 }
 
 
-@dataclass
-class Table:
+class Table(SimpleNamespace):
     """Cells (N) of each column as text, and what they are."""
 
-    cells: dict[str, list[str]] = field(default_factory=dict)
-    ids: list[str] = field(default_factory=list)
-    times: list[str] = field(default_factory=list)
-    columns: list[Column] = field(default_factory=list)
-    values: list[np.ndarray] = field(default_factory=list)
-    sequence: Any = None
-    seconds: Any = None
-    decimal: str = "."
-    marks: int = 0
+    def __init__(self):
+        super().__init__(cells={}, ids=[], times=[], columns=[], values=[], sequence=None, seconds=None, marks=0)
 
 
 def numeral(value, decimal, thousands):
@@ -88,13 +62,11 @@ def draw(random, separator):
     table, number = Table(), random.integers(1, 5)
     table.decimal = "," if random.random() < (0.1 if separator == "," else 0.5) else "."
     names = [str(each) for each in random.choice(WORDS, number, replace=False)]
-    rows = [
-        (n, step) for n in range(number) for step in range(random.integers(3, 12)) if step < 3 or random.random() < 0.8
-    ]
+    rows = [(n, t) for n in range(number) for t in range(random.integers(3, 12)) if t < 3 or random.random() < 0.8]
     sequence, step = np.array(rows).T
     clock = random.choice(["none", "numbers", *CLOCKS])
     if clock != "none" and random.random() < 0.5:
-        order = random.permutation(len(rows)) if random.random() < 0.5 else np.lexsort([sequence, step])
+        order = random.permutation(len(step)) if random.random() < 0.5 else np.lexsort([sequence, step])
         sequence, step = sequence[order], step[order]
     if number > 1 or random.random() < 0.3:
         table.ids = ["station"] if random.random() < 0.7 else ["region", "line"]
@@ -151,12 +123,9 @@ def write(table, random, path, separator):
     with path.open("w", encoding=encoding, newline="") as file:
         head = random.choice(["", "", "# made up\n", f"sep={separator}\n"])
         file.write(str(head))
-        writer = csv.writer(
-            file,
-            delimiter=separator,
-            quoting=csv.QUOTE_ALL if random.random() < 0.2 or len(names) == 1 else csv.QUOTE_MINIMAL,
-            lineterminator=str(random.choice(["\n", "\r\n"])),
-        )
+        quoting = csv.QUOTE_ALL if random.random() < 0.2 or len(names) == 1 else csv.QUOTE_MINIMAL
+        end = str(random.choice(["\n", "\r\n"]))
+        writer = csv.writer(file, delimiter=separator, quoting=quoting, lineterminator=end)
         writer.writerow(names)
         writer.writerows(zip(*(table.cells[name] for name in names), strict=True))
         if empty := random.integers(0, 3) * (random.random() < 0.2) * (len(names) > 1):
@@ -236,8 +205,7 @@ def check(seed, path):
     return ""
 
 
-@pytest.mark.parametrize("part", range(3))
-def test_tables_come_back_from_csv_or_are_named(tmp_path, part):
-    refused = [check(seed, tmp_path / "a.csv") for seed in range(50 * part, 50 * part + 50)]
-    assert sum(map(bool, refused)) < 25  # most are read without a schema
+def test_tables_come_back_from_csv_or_are_named(tmp_path):
+    refused = [check(seed, tmp_path / "a.csv") for seed in range(70)]
+    assert sum(map(bool, refused)) < 35  # most are read without a schema
     assert max(map(len, refused)) < 1000
