@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table, numbers to the right."""
     lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def tabled(rows: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]]) -> str:
+    """A table of rows by their names, and of columns by what they say of a row."""
+    return table(["", *columns], [[name, *(cell(row) for cell in columns.values())] for name, row in rows.items()])
 
 
 def code(text: str) -> str:

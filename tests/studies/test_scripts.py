@@ -19,6 +19,7 @@ from benchmarks.studies import (
     bounds,
     bracket,
     completion,
+    engine,
     family,
     hit_dvae,
     irregular,
@@ -213,23 +214,23 @@ def test_probes_tell_what_is_there_and_nothing_else():
 def test_mix_and_match(tmp_path, page, monkeypatch):
     """Fitted and scored once, whatever is asked again; two alphas make a curve."""
     monkeypatch.setattr(mix_and_match, "BODY", motion.WALKER.names)
-    monkeypatch.setattr(mix_and_match, "OPTIONS", {"width": 8})
-    monkeypatch.setattr(mix_and_match, "JUDGED", {"width": 4})
-    monkeypatch.setattr(mix_and_match, "TUNING", mix_and_match.RAW)
+    little = {"STEPS": 2, "EVERY": 20, "SAMPLES": 3, "WATCHED": 3, "FUTURES": 5, "THINNED": 2}
+    little |= {"OPTIONS": {"width": 8}, "JUDGED": {"width": 4}, "TUNING": mix_and_match.RAW}
+    little |= {"JUDGE": {**mix_and_match.JUDGE, "examples": 8, "steps": 2}}
+    for name, value in little.items():
+        monkeypatch.setattr(mix_and_match, name, value)
     named = {name: mix_and_match.NAMED[name] for name in ("mix", "mix, velocity", "no noise")}
-    alphas = {name: mix_and_match.SWEEP[name] for name in ("alpha 0.1", "alpha 0.3")}
+    alphas = {name: mix_and_match.CASES["sweep"][name] for name in ("alpha 0.1", "alpha 0.3")}
     sections = {
         name: mix_and_match.Section(mix_and_match.RAW, c)
         for name, c in {mix_and_match.RAW: named, "alpha": alphas}.items()
     }
     monkeypatch.setattr(mix_and_match, "SECTIONS", sections)
     motion.write_motion(tmp_path / "bvh", motion.simulate(clips=2, frames=240, seed=1), "bvh")
-    budget = mix_and_match.Budget(2, 20, 3, 8, 2, 3, 5, 2)
     options = {
         "raw": tmp_path / "bvh",
         "runs": tmp_path / "runs",
         "page": page,
-        "budget": budget,
         "picture": tmp_path / "a.png",
     }
     mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
@@ -238,7 +239,7 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
     mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
     assert page.read_text() == first
     assert [file.stat().st_mtime_ns for file in files] == times
-    (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / mix_and_match.MEASURED).unlink()
+    (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / engine.MEASURED).unlink()
     mix_and_match.main(sections=(mix_and_match.RAW,), cases=("mix",), seeds=(0, 1), **options)
     ways, noise, angles, swept, _ = tables(page)
     assert [row[0] for row in ways[1:]] == ["zero velocity", "mix", "mix, velocity", "no noise"]
