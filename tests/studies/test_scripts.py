@@ -285,8 +285,9 @@ def test_motion_latent(tmp_path, page, monkeypatch):
     monkeypatch.setattr(motion_latent, "PAIRS", 4)
     for cases in motion_latent.SECTIONS.values():
         for name, case in cases.items():
-            small = replace(case, method={"widths": (8,), **case.method, "latent": case.method.get("latent", 64) // 16})
-            monkeypatch.setitem(cases, name, small)
+            options = {"widths": (8,), **case.get("method", {})}
+            small = {**options, "latent": options.get("latent", 64) // 16}
+            monkeypatch.setitem(cases, name, {**case, "method": small})
     options = {"runs": tmp_path / "runs", "page": page, "picture": tmp_path / "a.png", "steps": 3}
     data = {"data": tmp_path / "people.npz", "other": tmp_path / "people.npz"}
     main, tuning = motion_latent.main, ("both phases", "turns scaled", "z of 16")
@@ -297,7 +298,7 @@ def test_motion_latent(tmp_path, page, monkeypatch):
     main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
     assert page.read_text() == text
     assert [file.stat().st_mtime_ns for file in files] == times
-    (tmp_path / "runs" / "tuning" / "z-of-16-0" / motion_latent.MEASURED).unlink()
+    (tmp_path / "runs" / "tuning" / "z-of-16-0" / engine.MEASURED).unlink()
     main(**data, sections=("tuning",), cases=("z of 16",), seeds=(0,), **options)
     assert page.read_text().count("| z of 16 |") == 1
     varied, _, same, against, other, _ = tables(page)
