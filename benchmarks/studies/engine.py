@@ -14,6 +14,7 @@ import json
 import sys
 import time
 import tomllib
+import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,11 +24,13 @@ import numpy as np
 import torch
 
 import dvae
+from dvae import files
 from dvae.inference.evaluation.estimates import Crossed, Estimate
 from dvae.inference.evaluation.record import plain
 from dvae.inference.training.checkpoints import Run
 from dvae.inference.training.fit import Fit
 from dvae.runs.directory import Config
+from dvae.runs.sweep import sweep
 
 OURS, MEASURED = "ours", "measured.json"
 
@@ -86,6 +89,21 @@ def fitted(
     return dvae.fit(model, recipe, out=out, **told, **options)
 
 
+def swept(
+    row: str, method: Any, data: Any, runs: Path, seeds: Sequence[int], training: Any, jobs: int = 1
+) -> list[Path]:
+    """The run directories of a method, by seed, each fitted once.
+
+    Raises:
+        RuntimeError: a run failed.
+    """
+    outcomes = sweep({folder(row): method}, data, runs, seeds, training, jobs)
+    for outcome in outcomes:
+        if outcome.status == "failed":
+            raise RuntimeError(str(outcome))
+    return [outcome.path for outcome in outcomes]
+
+
 def scores_of(clips: Mapping[str, float], rows: Mapping[str, Any]) -> dict[str, Any]:
     """A measurement of scores by clip, and how many windows each clip has."""
     return {"clips": [*clips], "weights": [*clips.values()], "rows": rows}
@@ -134,9 +152,12 @@ class Row:
         there = ~np.isnan(values).any(0)
         if not there.any():
             return None
-        clips, weights = np.array(first["clips"])[there], np.array(first["weights"], float)[there]
+        values, clips, weights = values[:, there], np.array(first["clips"])[there], np.array(first["weights"])[there]
         order = {clip: place for place, clip in enumerate(dict.fromkeys(clips))}
-        found = Crossed.by_clip(values[:, there] * weights, weights, np.array([order[clip] for clip in clips]))
+        if len(order) == len(clips):  # no sum that is divided again, so that equal seeds have no error
+            found = Crossed.of(values, weights)
+        else:
+            found = Crossed.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))
         return found if self.trained else replace(found, seeds=0.0, rest=0.0, count=sys.maxsize)
 
     def estimate(self, score: str, other: Row | None = None) -> Estimate | None:
@@ -153,10 +174,47 @@ class Row:
         return spread([run.get(name) for run in self.runs])
 
 
+class Archive:
+    """Measurements by name, in one compressed file that is the same for the same ones."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    @property
+    def names(self) -> list[str]:
+        """Of what is in it, sorted; none before the first."""
+        if not self.file.exists():
+            return []
+        with zipfile.ZipFile(self.file) as opened:
+            return sorted(opened.namelist())
+
+    def read(self, names: Iterable[str]) -> list[dict[str, Any]]:
+        """Measurements, whose clips are stored with their windows."""
+        with zipfile.ZipFile(self.file) as opened:
+            found = [json.loads(opened.read(name)) for name in names]
+        return [each | {"clips": [*each["clips"]], "weights": [*each["clips"].values()]} for each in found]
+
+    def add(self, name: str, measurement: Mapping[str, Any]) -> None:
+        """Beside what there is; `clips` are of the form clip: windows."""
+        contents = {name: json.dumps(measurement, separators=(",", ":")).encode()}
+        if self.file.exists():
+            with zipfile.ZipFile(self.file) as opened:
+                contents = {name: opened.read(name) for name in opened.namelist()} | contents
+        with files.written(self.file) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as out:
+            for name in sorted(contents):
+                out.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_DEFLATED, 9)
+
+
 def read(path: Path, cases: Iterable[str], file: str = MEASURED) -> dict[str, Row]:
     """Cases of which there are measurements, each of all its seeds."""
     files = {case: sorted(path.glob(f"{folder(case)}-[0-9]*/{file}")) for case in cases}
     return {case: Row([json.loads(each.read_text()) for each in found]) for case, found in files.items() if found}
+
+
+def read_all(path: Path, name: str) -> Row | None:
+    """What all runs measured under one name; None where none did."""
+    found = [json.loads(file.read_text()) for file in sorted(path.glob(f"*/{name}.json"))]
+    return Row(found) if found else None
 
 
 def said(found: Estimate | None, digits: int = 1) -> str:

@@ -22,9 +22,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
-def tabled(rows: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]]) -> str:
+def tabled(rows: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]], head: str = "") -> str:
     """A table of rows by their names, and of columns by what they say of a row."""
-    return table(["", *columns], [[name, *(cell(row) for cell in columns.values())] for name, row in rows.items()])
+    return table([head, *columns], [[name, *(cell(row) for cell in columns.values())] for name, row in rows.items()])
 
 
 def code(text: str) -> str:

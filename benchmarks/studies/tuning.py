@@ -8,7 +8,6 @@ section, in `benchmarks/scores/tuning`: the script goes on where it was stopped,
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import isnan, nan, sqrt
@@ -24,12 +23,11 @@ from dvae import Training, motion
 from dvae.models import registry
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.scoring.energies import pose_prior_energy
-from dvae.options import tuples
 from dvae.runs.directory import load
-from dvae.runs.sweep import sweep
 
+from .engine import settings, swept
 from .pages import refuse_unknown, table, write
-from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, folder, judging, parted
+from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
@@ -81,18 +79,12 @@ class Section:
 PATHS = replace(motion.PROTOCOLS["bandai2-trajectories"], name="bandai2-paths-tuning", train=("A",), test=("B",))
 
 
-def sections(file: Path) -> dict[str, Section]:
-    """What was tried, by method, from a file of TOML."""
-    found = {}
-    for name, told in tomllib.loads(file.read_text(encoding="utf-8")).items():
-        protocol = PATHS if told.pop("paths", False) else TUNING
-        training, options = Training(**told.pop("training")), tuples(told.pop("options", {}))
-        cases = {case: tuples(each) for case, each in told.pop("cases").items()}
-        found[name] = Section(training=training, cases=cases, options=options, protocol=protocol, **told)
-    return found
-
-
-SECTIONS = sections(Path(__file__).with_suffix(".toml"))
+SECTIONS = {
+    name: Section(
+        training=Training(**told.pop("training")), protocol=PATHS if told.pop("paths", False) else TUNING, **told
+    )
+    for name, told in settings(__file__).items()
+}
 
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
@@ -142,10 +134,8 @@ def of_judges(data: MotionData, runs: Path, store: Store) -> None:
             for seed in SEEDS_OF[name]:
                 if store.lacks(row, seed):
                     judge = registry.judges()[method](**options)
-                    (outcome,) = sweep({folder(row): judge}, data, runs, (seed,), told, jobs=1)
-                    if outcome.status == "failed":
-                        raise RuntimeError(str(outcome))
-                    store.add(row, seed, of_judge(name, outcome.path, windows))
+                    (path,) = swept(row, judge, data, runs, (seed,), told)
+                    store.add(row, seed, of_judge(name, path, windows))
 
 
 def of_judge(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
@@ -242,11 +232,9 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
         for case in section.cases:
             if seeds := [seed for seed in section.seeds if store.lacks(case, seed)]:
                 method, training = section.of(case, prior)
-                outcomes = sweep({folder(case): method}, own, runs / name, seeds, training, jobs)
-                for seed, outcome in zip(seeds, outcomes, strict=True):
-                    if outcome.status == "failed":
-                        raise RuntimeError(str(outcome))
-                    store.add(case, seed, score(outcome.path, own, judged))
+                paths = swept(case, method, own, runs / name, seeds, training, jobs)
+                for seed, path in zip(seeds, paths, strict=True):
+                    store.add(case, seed, score(path, own, judged))
 
 
 def main(
