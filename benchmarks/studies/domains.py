@@ -7,7 +7,6 @@ chosen with `--part validation`, seed 0; `--part test` scores the runs of three 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -27,7 +26,7 @@ from dvae.tables.domains import speech
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 
-from .engine import OURS, Row, cell, fitted, folder, kept, read, scores_of, settings
+from .engine import OURS, Row, cell, fitted, measure, read, scores_of, settings
 from .pages import DOCS, tabled, write
 
 FORECASTS = 100
@@ -199,7 +198,7 @@ def forecasts(case: str, seed: int, model: Any, data: Data) -> dict[str, Any]:
     return scores_of(found.clips, {name: row.clip_means for name, row in found.rows.items()})
 
 
-def run(case: str, seed: int, out: Path, data: Data, part: str) -> dict[str, Any]:
+def run(data: Data, part: str, case: str, seed: int, out: Path) -> dict[str, Any]:
     """Fits and scores a case."""
     section, opened = SECTIONS[data.name], data.training
     chosen = section.cases[case]
@@ -319,10 +318,7 @@ def main(
     """
     torch.set_num_threads(1)
     for name in domains:
-        data = Data(name)
-        for seed, case in itertools.product(seeds, cases or SECTIONS[name].cases):
-            out = runs / name / f"{folder(case)}-{seed}"
-            kept(out / f"{part}.json", partial(run, case, seed, out, data, part))
+        measure(runs / name, cases or SECTIONS[name].cases, seeds, partial(run, Data(name), part), f"{part}.json")
     write(page, *tables(runs, part))
 
 

@@ -10,6 +10,7 @@ A `Row` is one row of what several seeds measured; scripts say in a dictionary w
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 import time
@@ -17,6 +18,7 @@ import tomllib
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,15 @@ def kept(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]
         print(f"{file}: {spent:.0f} s of processor time", flush=True)
     read: dict[str, Any] = json.loads(file.read_text())
     return read
+
+
+def measure(
+    path: Path, cases: Iterable[str], seeds: Iterable[int], run: Callable[[str, int, Path], Any], file: str = MEASURED
+) -> None:
+    """Fit and measure what is not there yet, seed by seed: `run` of a case, a seed and its directory."""
+    for seed, case in itertools.product(seeds, cases):
+        out = path / f"{folder(case)}-{seed}"
+        kept(out / file, partial(run, case, seed, out))
 
 
 def fitted(
@@ -215,6 +226,12 @@ def read_all(path: Path, name: str) -> Row | None:
     """What all runs measured under one name; None where none did."""
     found = [json.loads(file.read_text()) for file in sorted(path.glob(f"*/{name}.json"))]
     return Row(found) if found else None
+
+
+def budget(rows: Iterable[Row], steps: int) -> str:
+    """What the fits took, in a sentence."""
+    seconds = [run["seconds"] for row in rows for run in row.runs]
+    return f"{steps} steps of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
 
 
 def said(found: Estimate | None, digits: int = 1) -> str:

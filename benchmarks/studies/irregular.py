@@ -7,7 +7,6 @@ the runs of three seeds.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from dvae.networks import Dense, LinearSDE, LinearSDEGuide, Recurrent
 from dvae.networks.base import share_modules
 from dvae.tables.domains import domain
 
-from .engine import OURS, cell, kept, read
+from .engine import OURS, cell, measure, read
 from .pages import DOCS, table, write
 
 PARTICLES = 100
@@ -39,12 +38,7 @@ STEPS = {8: 1000, 16: 1500}
 SIZE: dict[str, Any] = {"width": 64, "decoder": (64,)}
 TIMES = (1.0, 30.0)
 """Frames, over which the prior forgets."""
-TRAINING: dict[str, Any] = {
-    "batch_size": 64,
-    "learning_rate": 3e-3,
-    "decay": 0.2,
-    "validate_every": 50,
-}
+TRAINING: dict[str, Any] = {"batch_size": 64, "learning_rate": 3e-3, "decay": 0.2, "validate_every": 50}
 
 Utterances = Sequence[np.ndarray]
 
@@ -97,7 +91,7 @@ def built(train: Mapping[str, torch.Tensor], latent: int) -> dvae.DynamicalVAE:
     return model
 
 
-def run(fitted_on: str, latent: int, seed: int, out: Path, part: str) -> dict[str, Any]:
+def run(latent: int, part: str, fitted_on: str, seed: int, out: Path) -> dict[str, Any]:
     """Fits and scores a model."""
     train, validation = (batch_of(utterances(each), KEPT[fitted_on], seed) for each in ("train", "validation"))
     torch.manual_seed(seed)
@@ -157,9 +151,8 @@ def main(
         latents: sizes of their latent.
     """
     torch.set_num_threads(1)
-    for latent, seed, fitted_on in itertools.product(latents, seeds, KEPT):
-        out = runs / str(latent) / f"{fitted_on}-{seed}"
-        kept(out / f"{part}.json", partial(run, fitted_on, latent, seed, out, part))
+    for latent in latents:
+        measure(runs / str(latent), KEPT, seeds, partial(run, latent, part), f"{part}.json")
     found = {latent: runs / str(latent) for latent in STEPS if (runs / str(latent)).exists()}
     heads = {latent: f"Latent of {latent} numbers, {STEPS[latent]} steps:\n" for latent in found}
     write(page, *(each for latent, own in found.items() for each in (heads[latent], tables(own, part))))

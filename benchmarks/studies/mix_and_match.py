@@ -33,7 +33,7 @@ from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.judges.quality import STILL, RealOrMade, quality
 from dvae.program.batch import rows
 
-from .engine import MEASURED, OURS, Row, fitted, folder, kept, read, scores_of, settings, spread
+from .engine import OURS, Row, budget, fitted, folder, measure, read, scores_of, settings, spread
 from .pages import DOCS, table, tabled, write
 
 OPTIONS: dict[str, Any] = {"width": 128, "scale": 0.01}
@@ -72,6 +72,11 @@ class Section:
     protocol: str
     cases: Mapping[str, Mapping[str, Any]]
     share: float = 1.0
+
+    @property
+    def steps(self) -> int:
+        """Of a run."""
+        return round(self.share * STEPS)
 
 
 CASES = settings(__file__)
@@ -113,9 +118,9 @@ def some_scores(held: Any) -> list[Measure]:
     return [measure for measure in motion.scores(held) if measure.name in SCORES]
 
 
-def measured(case: str, options: Mapping[str, Any], data: motion.MotionData, seed: int, steps: int, out: Path) -> Any:
+def measured(section: Section, data: motion.MotionData, case: str, seed: int, out: Path) -> dict[str, Any]:
     """Fits a case, and scores it by clip, the runs of "mix" beside zero velocity."""
-    method = dvae.method("mix-and-match", **{**OPTIONS, **options})
+    steps, method = section.steps, dvae.method("mix-and-match", **{**OPTIONS, **section.cases[case]})
     train, test = data.windows("train"), data.windows("test")
     fewer = test.with_protocol(replace(test.protocol, test_stride=THINNED * test.protocol.test_stride))
     some = torch.linspace(0, len(test) - 1, min(WATCHED, len(test))).long()
@@ -215,9 +220,8 @@ def angles(found: Mapping[str, Row]) -> str:
 def tables(name: str, found: Mapping[str, Row]) -> list[str]:
     """Of a section: what was done, and its tables."""
     first = next(iter(found.values())).runs[0]
-    clips, seconds = first["futures"]["weights"], [run["seconds"] for row in found.values() for run in row.runs]
-    done = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {round(SECTIONS[name].share * STEPS)} steps "
-    done += f"of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time.\n"
+    clips, spent = first["futures"]["weights"], budget(found.values(), SECTIONS[name].steps)
+    done = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {spent}\n"
     futures = {case: row.of("futures") for case, row in found.items()}
     made = [tabled(futures, SCORED), tabled(heard(found), LISTENING)]
     return [f"## {name}\n", done, *made, *([angles(found)] if "angles" in first else [])]
@@ -283,12 +287,9 @@ def main(
     """
     torch.set_num_threads(1)
     for name, section in ((name, SECTIONS[name]) for name in sections):
-        if (file := raw if section.protocol == RAW else data) is None:
-            continue
-        opened, steps = data_of(section.protocol, file), round(section.share * STEPS)
-        for seed, case in itertools.product(seeds, cases or section.cases):
-            out = runs / folder(name) / f"{folder(case)}-{seed}"
-            kept(out / MEASURED, partial(measured, case, section.cases[case], opened, seed, steps, out))
+        if file := raw if section.protocol == RAW else data:
+            run = partial(measured, section, data_of(section.protocol, file))
+            measure(runs / folder(name), cases or section.cases, seeds, run)
     there = {name: read(runs / folder(name), section.cases) for name, section in SECTIONS.items()}
     found = {
         name: ({STILL: replace(rows["mix"], name=STILL)} if "mix" in rows else {}) | rows

@@ -26,7 +26,7 @@ from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
-from .engine import MEASURED, OURS, Row, fitted, folder, interval, kept, read, settings
+from .engine import OURS, Row, budget, fitted, folder, interval, measure, read, settings
 from .pages import DOCS, tabled, write
 
 TUNING, HELD = "tuning", "held out"
@@ -88,7 +88,7 @@ def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
     }
 
 
-def run(section: str, case: str, seed: int, out: Path, file: Path, other: Path | None, steps: int) -> dict[str, Any]:
+def run(section: str, file: Path, other: Path | None, steps: int, case: str, seed: int, out: Path) -> dict[str, Any]:
     """Fits and measures a case."""
     options = SECTIONS[section][case]
     data = segments(section, file, **options.get("data", {}))
@@ -145,11 +145,10 @@ def against(cases: Mapping[str, Row]) -> str:
 def tables(section: str, cases: Mapping[str, Row]) -> list[str]:
     """Of a section: what was done, and two tables for each test set; walks and runs are of the first one alone."""
     first, parts = next(iter(cases.values())).runs[0], []
-    seconds = [run["seconds"] for case in cases.values() for run in case.runs]
     for test in first["tests"]:
         takes, own = first[test]["clips"], {name: row.of(test) for name, row in cases.items()}
-        done = f"{len(takes)} segments of {len({*takes})} takes. {first['steps']} steps of training, "
-        done += f"{min(seconds):.0f} to {max(seconds):.0f} s of processor time.\n"
+        spent = budget(cases.values(), first["steps"])
+        done = f"{len(takes)} segments of {len({*takes})} takes. {spent}\n"
         scored = tabled(own, SCORED | (INTERPOLATED if test == SAME else {}))
         parts += [f"## {section.capitalize()}, {test}\n", done, scored, against(own)]
     return parts
@@ -209,10 +208,8 @@ def main(
         steps: of training.
     """
     torch.set_num_threads(1)
-    for seed, section in itertools.product(seeds, sections if data else ()):
-        for case in cases or SECTIONS[section]:
-            out = runs / folder(section) / f"{folder(case)}-{seed}"
-            kept(out / MEASURED, partial(run, section, case, seed, out, data, other, steps))
+    for section in sections if data else ():
+        measure(runs / folder(section), cases or SECTIONS[section], seeds, partial(run, section, data, other, steps))
     there = {name: rows_of(runs / folder(name), name) for name in SECTIONS}
     write(page, *itertools.chain(*(tables(name, rows) for name, rows in there.items() if rows)))
     draw(there[HELD], there[TUNING], picture)

@@ -16,10 +16,16 @@ DOCS = Path(__file__).parents[2] / "docs"
 BEGIN, END = "<!-- tables -->\n", "<!-- end of tables -->\n"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, numbers to the right."""
-    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], rule: str = "") -> str:
+    """A Markdown table, numbers to the right, or by another rule below its head."""
+    head, *lines = [f"| {' | '.join(line)} |" for line in (header, *rows)]
+    head = head.replace("|  |", "| |") if rule else head
+    return "\n".join([head, rule or f"| --- |{' ---: |' * (len(header) - 1)}", *lines]) + "\n"
+
+
+def words(*header: str, rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table of words, to the left."""
+    return table(header, rows, "|---" * len(header) + "|")
 
 
 def tabled(rows: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]], head: str = "") -> str:
