@@ -395,9 +395,8 @@ def certain(
         return ((truth - drawn.mean(0)).abs() <= reach * spread).float().mean(-1)
 
     found: dict[str, list[Any]] = {"spread": [], "error": []}
-    shares: dict[str, list[Tensor]] = {"surface": [], "seen": []} | (
-        {} if isinstance(sight, Sight) else {"duration": []}
-    )
+    told = ("surface", "seen", *(() if isinstance(sight, Sight) else ("duration",)))
+    shares: dict[str, list[Tensor]] = {what: [] for what in told}
     for n in range(len(x[0])):
         drawn, truth = places(x[:, n], shapes[:, n]), places(batch[WHOLE][n], batch[SHAPE][n])
         if "duration" in shares:
@@ -455,9 +454,9 @@ def completions(found: Mapping[Sight, Row]) -> str:
 
     def more(sight: Sight) -> str:
         whole = found.get(replace(sight, frames=ALL))
-        return (
-            "–" if whole is None else spread(100 * (found[sight].by_seed("chamfer") / whole.by_seed("chamfer") - 1), 1)
-        )
+        if whole is None:
+            return "–"
+        return spread(100 * (found[sight].by_seed("chamfer") / whole.by_seed("chamfer") - 1), 1)
 
     columns: dict[str, Callable[[Sight], str]] = {
         "Chamfer (mm)": lambda sight: found[sight].said("chamfer"),

@@ -27,7 +27,7 @@ from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 
 from .engine import OURS, Row, cell, fitted, measure, read, scores_of, settings
-from .pages import DOCS, tabled, write
+from .pages import DOCS, ordered, table, tabled, write
 
 FORECASTS = 100
 BASELINE = "autoregressive"
@@ -241,7 +241,7 @@ def bounds(cases: Mapping[str, Row], section: Section) -> str:
     baseline = cases.get(BASELINE)
     columns: dict[str, Callable[[Row], str]] = {
         f"nats a {section.unit}, K = {section.particles}": lambda row: said(row, "bounds", BOUND),
-        f"minus {BASELINE}": lambda row: "–" if baseline in (row, None) else said(row, "bounds", BOUND, baseline),
+        f"minus {BASELINE}": lambda row: "–" if baseline in (None, row) else said(row, "bounds", BOUND, baseline),
         "ELBO": lambda row: said(row, "bounds", ELBO),
         FIVO: lambda row: said(row, "bounds", FIVO),
         "KL": lambda row: ", ".join(f"{mean(row, 'bounds', score):.2f}" for score in latents(row)) or "–",
@@ -249,9 +249,7 @@ def bounds(cases: Mapping[str, Row], section: Section) -> str:
         "weights": lambda row: f"{row.runs[0]['parameters']:,}",
         "s a fit": lambda row: f"{np.mean([run['seconds'] for run in row.runs]):.0f}",
     }
-    return tabled(
-        {name: cases[name] for name in sorted(cases, key=lambda name: -mean(cases[name], "bounds", BOUND))}, columns
-    )
+    return tabled(ordered(cases, lambda row: -mean(row, "bounds", BOUND)), columns)
 
 
 def of_forecasts(cases: Mapping[str, Row]) -> str:
@@ -259,18 +257,15 @@ def of_forecasts(cases: Mapping[str, Row]) -> str:
     first = [run for row in cases.values() for run in row.runs if len(run["forecasts"]["rows"]) > 1]
     beside = {name: Row(first, name, trained=False) for run in first for name in run["forecasts"]["rows"]}
     found = {**cases, **{name: row for name, row in beside.items() if name != OURS}}
-    order = sorted(found, key=lambda name: mean(found[name], "forecasts", "CRPS"))
-    return tabled(
-        {name: found[name] for name in order}, {score: partial(said, part="forecasts", score=score) for score in SHOWN}
-    )
+    columns = {score: partial(said, part="forecasts", score=score) for score in SHOWN}
+    return tabled(ordered(found, lambda row: mean(row, "forecasts", "CRPS")), columns)
 
 
 def sound(cases: Mapping[str, Row]) -> str:
     """Cases by how well their resynthesis sounds."""
-    order = sorted(cases, key=lambda name: -mean(cases[name], "sound", SDR))
-    columns = {"SI-SDR, dB": lambda name: said(cases[name], "sound", SDR)}
-    columns["the review's, of other speech"] = lambda name: f"{REVIEW[name]:.1f}"
-    return tabled({name: name for name in order if latents(cases[name])}, columns)
+    order = ordered(cases, lambda row: -mean(row, "sound", SDR))
+    lines = [[name, said(row, "sound", SDR), f"{REVIEW[name]:.1f}"] for name, row in order.items() if latents(row)]
+    return table(["", "SI-SDR, dB", "the review's, of other speech"], lines)
 
 
 def tables(runs: Path, part: str) -> list[str]:
@@ -282,8 +277,8 @@ def tables(runs: Path, part: str) -> list[str]:
             continue
         first, cut = next(iter(cases.values())).runs, section.forecast
         own, minutes = first[0]["bounds"], sum(run["seconds"] for row in cases.values() for run in row.runs) / 60
-        parts += [f"### {name.capitalize()}, {part}\n"]
         parts += [
+            f"### {name.capitalize()}, {part}\n",
             f"{len({*own['clips']})} sequences, {sum(own['weights'])} steps; {len(first)} seeds; all fits took "
             f"{minutes:.0f} minutes of processor time.\n",
             bounds(cases, section),
@@ -291,10 +286,8 @@ def tables(runs: Path, part: str) -> list[str]:
         if "sound" in first[0]:
             parts += ["Resynthesis from the posterior:\n", sound(cases)]
         if "forecasts" in first[0]:
-            parts += [
-                f"Forecasts of {cut.horizon} steps from {cut.observed}, {FORECASTS} draws:\n",
-                of_forecasts(cases),
-            ]
+            made = f"Forecasts of {cut.horizon} steps from {cut.observed}, {FORECASTS} draws:\n"
+            parts += [made, of_forecasts(cases)]
     return parts
 
 

@@ -12,7 +12,7 @@ import tyro
 import dvae
 
 from .engine import said
-from .pages import DOCS, tabled, write
+from .pages import DOCS, ordered, tabled, write
 
 DIGITS = {"ADE": 3, "FDE": 3, "MMADE": 3, "MMFDE": 3, "APD": 2, "energy score": 2}
 ARROWS = {"ADE": " ↓", "FDE": " ↓", "MMADE": " ↓", "MMFDE": " ↓", "energy score": " ↓"}
@@ -39,12 +39,12 @@ def tables(comparison: dvae.Comparison) -> list[str]:
         score + ARROWS.get(score, ""): lambda name, score=score, digits=digits: said(comparison[name][score], digits)
         for score, digits in DIGITS.items()
     }
-    order = sorted(ranking, key=lambda name: comparison[name]["energy score"].mean)
+    order = ordered({name: name for name in ranking}, lambda name: comparison[name]["energy score"].mean)
     return [
         f"Teacher-forced, nats a frame ({len(comparison.keys)} windows):\n",
         tabled({name: name for name in ranking}, forced),
         f"Free-running, {comparison.samples} forecasts a window, metres:\n",
-        tabled({name: name for name in order}, free),
+        tabled(order, free),
     ]
 
 

@@ -33,6 +33,11 @@ def tabled(rows: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]],
     return table([head, *columns], [[name, *(cell(row) for cell in columns.values())] for name, row in rows.items()])
 
 
+def ordered(rows: Mapping[str, Any], key: Callable[[Any], float]) -> dict[str, Any]:
+    """Rows in the order of a number of theirs, the least first."""
+    return dict(sorted(rows.items(), key=lambda item: key(item[1])))
+
+
 def code(text: str) -> str:
     """Text as Markdown code within a table."""
     return "`" + text.replace("|", "\\|") + "`"
