@@ -33,18 +33,8 @@ from .studies.pages import DOCS, refuse_unknown, require_gpu, table, write
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
-NAMES = (
-    "speed",
-    "gsps",
-    "hit_dvae",
-    "mix_and_match",
-    "trajevae",
-    "completion",
-    "startup",
-    "files",
-    "mapped",
-    "scaling",
-)
+NAMES = ("speed", "gsps", "hit_dvae", "mix_and_match", "trajevae")
+NAMES += ("completion", "startup", "files", "mapped", "scaling")
 PROCESSORS = {
     "speed: segments": "says what one core does",
     "gsps: memory": "is the process's, not the device's",
@@ -185,20 +175,11 @@ def page(records: list[dict[str, Any]], path: Path | None = DOCS / "results" / "
     last, before = newest[0], released(records, records[-1])
     lines = []
     for name in sorted(last["rows"], key=_place):
-        value = last["rows"][name]
-        target = last["targets"].get(name, ("at most", None))
-        aimed = target[1] is not None
-        number = f"**{value:.2f}**" if aimed and met(value, target) else f"{value:.2f}"
-        change = f"{value / before[name][0]:.2f}" if name in before and target[0] in COMPARED else "–"
-        lines.append(
-            [
-                name,
-                f"{target[0]} {target[1]:g}" if aimed else "",
-                number,
-                *(_number(r["rows"].get(name)) for r in newest[1:4]),
-                change,
-            ]
-        )
+        value, (side, bound) = last["rows"][name], last["targets"].get(name, ("at most", None))
+        number = f"**{value:.2f}**" if bound is not None and met(value, (side, bound)) else f"{value:.2f}"
+        change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
+        earlier = (_number(record["rows"].get(name)) for record in newest[1:4])
+        lines.append([name, "" if bound is None else f"{side} {bound:g}", number, *earlier, change])
     heads = [f"{record['version']} ({record['commit']}), {record['date']}" for record in newest[:4]]
     history = table(["", "target", *heads, "last over the release"], lines)
     write(path, history, name="history" if how(last)[0] == "cpu" else "GPU history")

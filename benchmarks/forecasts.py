@@ -1,4 +1,4 @@
-"""Quality on real motion: `python benchmarks/forecasts.py`, or `make bench`; about 15 minutes a file on one core.
+"""Quality on real motion: `python benchmarks/forecasts.py`; about 15 minutes a file on one core.
 
 Fits hit-dvae on bandai2 (by style) and on cmu8, as `dvae fit` does, and asks of its forecasts on the test windows
 
@@ -12,82 +12,74 @@ A file that is not there is left out. The exit code is 1 where something is miss
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
+import tyro
 
 import dvae
 from dvae.motion.data.dataset import MotionData
-from dvae.runs import directory as runs
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+WINDOWS = 100
 FILES = (DATA / "bandai" / "bandai2.npz", DATA / "cmu" / "cmu8.npz")
 
 
-def scores(file: Path, steps: int, batch_size: int) -> dict[str, tuple[float, str, bool]]:
-    """Name to value, what is asked of it, and whether it holds."""
+def rows(file: Path, steps: int, batch_size: int) -> Iterator[tuple[str, float, str, float]]:
+    """Name, value, and what is asked of it."""
     data = MotionData.open(file)
     with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        training = dvae.Training(steps=steps, batch_size=batch_size, decay=0.5, validate_every=max(steps // 12, 1))
-        dvae.fit(dvae.method("hit-dvae", loss="evidence"), data, out=Path(folder) / "run", **vars(training))
-        model = runs.load(Path(folder) / "run").model
-        minutes = (time.perf_counter() - start) / 60
-    test = data.windows("test")
-    training = data.windows("train+validation")
-    evaluation = dvae.evaluate(model, test, scores=dvae.motion.scores, batch_size=64, training_windows=training)
+        start, out = time.perf_counter(), Path(folder) / "run"
+        training = {"steps": steps, "batch_size": batch_size, "decay": 0.5, "validate_every": max(steps // 12, 1)}
+        dvae.fit(dvae.method("hit-dvae", loss="evidence"), data, out=out, **training)
+        model = dvae.load(out).model
+        yield "minutes", (time.perf_counter() - start) / 60, "at most", 15.0
+    test, known = data.windows("test"), data.windows("train+validation")
+    evaluation = dvae.evaluate(model, test, scores=dvae.motion.scores, batch_size=64, training_windows=known)
     print(evaluation)
     ours, still = evaluation["model"], evaluation["zero velocity"]
-    rows = {"minutes": (minutes, "at most 15", minutes <= 15)}
-    for name in ("ADE", "FDE"):
-        limit = still[name].mean
-        rows[name] = (ours[name].mean, f"below {limit:.3f}", ours[name].mean < limit)
-    rows |= {n: (ours[n].mean, "above 0.1", ours[n].mean > 0.1) for n in evaluation.metrics if n.startswith("KL")}
-    return rows | long_run(model, test)
+    yield from ((name, ours[name].mean, "at most", still[name].mean) for name in ("ADE", "FDE"))
+    yield from ((name, ours[name].mean, "at least", 0.1) for name in evaluation.metrics if name.startswith("KL"))
 
-
-def long_run(
-    model: dvae.DynamicalVAE, test: dvae.motion.Windows, windows: int = 100
-) -> dict[str, tuple[float, str, bool]]:
-    """What 300 free-running frames look like."""
     x = test.all()["x"]
-    x = x[:: max(1, len(x) // windows)]
+    x = x[:: max(1, len(x) // WINDOWS)]
     torch.manual_seed(0)
     futures = model.forecast({"x": x[:, : test.protocol.observed]}, horizon=300, samples=2, draw_emission=False)["x"]
-    real, ours = test.positions(x), test.positions(futures)
-    bones, true = test.skeleton.bone_lengths(ours), test.skeleton.bone_lengths(real).mean((0, 1))
-    error = (bones / true - 1).abs().mean((0, 1, 2))
-    second = round(test.protocol.fps)
-    speed = [p.diff(dim=-3).norm(dim=-1).mean().item() for p in (ours[:, :, -second:], real)]
-    finite = bool(torch.isfinite(futures).all())
-    return {
-        "300 frames finite": (float(finite), "1", finite),
-        "worst bone": (error.max().item(), "at most 0.15", error.max().item() <= 0.15),
-        "mean bone": (error.mean().item(), "at most 0.15", error.mean().item() <= 0.15),
-        "speed at the end / real": (speed[0] / speed[1], "at least 0.5", speed[0] >= 0.5 * speed[1]),
-    }
+    real, made = test.positions(x), test.positions(futures)
+    bones, true = test.skeleton.bone_lengths(made), test.skeleton.bone_lengths(real).mean((0, 1))
+    error, second = (bones / true - 1).abs().mean((0, 1, 2)), round(test.protocol.fps)
+    end, moving = (p.diff(dim=-3).norm(dim=-1).mean().item() for p in (made[:, :, -second:], real))
+    yield "300 frames finite", float(torch.isfinite(futures).all()), "at least", 1.0
+    yield "worst bone", error.max().item(), "at most", 0.15
+    yield "mean bone", error.mean().item(), "at most", 0.15
+    yield "speed at the end / real", end / moving, "at least", 0.5
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="*", type=Path, default=FILES)
-    parser.add_argument("--steps", type=int, default=2400)
-    parser.add_argument("--batch-size", type=int, default=32)
-    options = parser.parse_args()
+def main(files: tyro.conf.Positional[tuple[Path, ...]] = FILES, steps: int = 2400, batch_size: int = 32) -> int:
+    """Fit and score.
+
+    Args:
+        files: motion files.
+        steps: of training.
+        batch_size: windows of each.
+    """
     missed = False
-    for file in options.files:
+    for file in files:
         if not file.exists():
             print(f"{file.name}: not there, left out")
             continue
-        for name, (value, target, holds) in scores(file, options.steps, options.batch_size).items():
-            print(f"{file.stem:8s} {name:24s} {value:8.3f}   {target:16s} {'ok' if holds else 'MISSED'}", flush=True)
+        for name, value, side, bound in rows(file, steps, batch_size):
+            holds = value <= bound if side == "at most" else value >= bound
+            print(
+                f"{file.stem:8s} {name:24s} {value:8.3f}   {side} {bound:.3f} {'ok' if holds else 'MISSED'}", flush=True
+            )
             missed |= not holds
     return int(missed)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(tyro.cli(main, description=__doc__))

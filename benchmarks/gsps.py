@@ -22,7 +22,7 @@ from dvae import motion
 from dvae.distributions.flow import QRFlowLaw
 from dvae.models.motion.gsps import PRESETS, GSPSModel
 
-from .speed import moved, products, seconds, training_step
+from .speed import fed_step, over_products, seconds
 
 TARGETS = {"energies": ("at most", 0.25), "prior": ("at least", 3.0), "memory": ("under", 6.7)}
 
@@ -47,10 +47,7 @@ def rows(device: torch.device) -> dict[str, float]:
     assert isinstance(model, GSPSModel)
     method.train(windows).prepare(model)
     model.to(device)
-    source, generator = method.train(windows).batches, torch.Generator().manual_seed(0)
-    elbo, objective = dvae.SequenceELBO(), method.train(windows).objective
-    draw = lambda: moved(source.sample(16, generator), device)  # noqa: E731
-    step = training_step(model, lambda: objective(elbo.terms(model, draw()), 0))
+    step, draw = fed_step(method, model, windows, 16, device)
     for _ in range(5):
         step()
     batch = draw()
@@ -64,17 +61,13 @@ def rows(device: torch.device) -> dict[str, float]:
 
     past = batch["x"][:, :25]
     futures = lambda: model.forecast(past, 100, 50)  # noqa: E731
-    whole, alone, energies, ahead, apart = seconds(step, products(step), scored, futures, products(futures), repeat=5)
-    found = {"step": whole / alone, "energies": energies / whole, "futures": ahead / apart}
+    found = dict(zip(("step", "futures"), over_products(step, futures, repeat=5), strict=True))
+    whole, energies = seconds(step, scored, repeat=5)
+    found["energies"] = energies / whole
 
     flow, poses = model.pose_prior.flow, torch.randn(53_000, 48, device=device, requires_grad=True)
-    both = seconds(
-        *(
-            lambda f=f: f().square().sum().backward()
-            for f in (lambda: sequential(flow, poses), lambda: flow.to_noise(poses)[0])
-        ),
-        repeat=3,
-    )
+    ways = (lambda: sequential(flow, poses), lambda: flow.to_noise(poses)[0])
+    both = seconds(*(lambda way=way: way().square().sum().backward() for way in ways), repeat=3)
     found["prior"] = both[0] / both[1]
     if device.type == "cpu":
         found["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6

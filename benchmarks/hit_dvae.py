@@ -28,7 +28,7 @@ import dvae
 from dvae import motion
 from dvae.program.rollout import SelfFeeding
 
-from .speed import Held, moved, products, seconds, stopwatch, training_step
+from .speed import Held, fed_step, over_products, seconds, stopwatch
 
 TARGETS = {
     "frame": ("at most", 3.0),
@@ -77,8 +77,7 @@ def rows(device: torch.device) -> dict[str, float]:
     )
     small = dvae.method("hit-dvae", pose_prior=0.0).build(windows).to(device).eval()
     generation = lambda: small.forecast(one, 60, 50, draw_emission=False)  # noqa: E731
-    made, apart = seconds(generation, products(generation), repeat=3)
-    found["frame"] = made / apart
+    (found["frame"],) = over_products(generation)
     found["cache"] = anew / cached
     found["growth"] = (long - cached) / (300 - 60) / (cached / 60)
     clock = stopwatch()
@@ -101,20 +100,16 @@ def rows(device: torch.device) -> dict[str, float]:
         return lambda: dvae.evaluate(small, held, **options), len(held)
 
     few, _ = evaluation(10, batch_size=6)  # products of as many shapes as there are frames are held
-    made, apart = seconds(few, products(few), repeat=3)
-    found["evaluation"] = made / apart
+    (found["evaluation"],) = over_products(few)
     more, count = evaluation(64, batch_size=64)
     found["evaluation, seconds"] = seconds(more, repeat=1)[0] / count * WINDOWS
 
     model.train()
-    source, objective, elbo = method.train(windows).batches, method.train(windows).objective, dvae.SequenceELBO()
-    generator = torch.Generator().manual_seed(0)
+    draws = method.train(windows).objective.draws
 
-    def step(feeding: SelfFeeding | None):
+    def step(feeding: SelfFeeding | None) -> Callable[[], None]:
         fed = None if feeding is None else replace(feeding, start=windows.protocol.observed)
-        program = {"draws": objective.draws, "self_feeding": fed}
-        draw = lambda: moved(source.sample(16, generator), device)  # noqa: E731
-        return training_step(model, lambda: objective(elbo.terms(model, draw(), **program), 0))
+        return fed_step(method, model, windows, 16, device, draws=draws, self_feeding=fed)[0]
 
     kinds = {
         "exact": SelfFeeding(1.0, gradient=False),

@@ -168,6 +168,25 @@ def products(action: Callable[[], object]) -> Callable[[], None]:
     return noted.run
 
 
+def over_products(*actions: Callable[[], object], repeat: int = 3) -> list[float]:
+    """Times of actions over those of their matrix products alone."""
+    times = seconds(*(each for action in actions for each in (action, products(action))), repeat=repeat)
+    return [whole / alone for whole, alone in zip(times[::2], times[1::2], strict=True)]
+
+
+def step_of(model: Any, x: Tensor) -> Callable[[], None]:
+    """A training step by the ELBO."""
+    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
+    return training_step(model, lambda: evidence(elbo.terms(model, x), 0))
+
+
+def fed_step(method: Any, model: Any, windows: Any, size: int, device: torch.device, **program: Any) -> Any:
+    """A training step as a method has it, on so many windows; and what draws these."""
+    recipe, elbo, generator = method.train(windows), dvae.SequenceELBO(), torch.Generator().manual_seed(0)
+    draw = lambda: moved(recipe.batches.sample(size, generator), device)  # noqa: E731
+    return training_step(model, lambda: recipe.objective(elbo.terms(model, draw(), **program), 0)), draw
+
+
 def training_step(model: nn.Module, loss: Callable[[], Tensor]) -> Callable[[], None]:
     optimizer = torch.optim.Adam(model.parameters(), fused=True)
 
@@ -215,10 +234,7 @@ def program(x: Tensor) -> float:
     """Pyro step over hand-written step."""
     model = dvae.method("srnn", latent=10).build({"x": SIZE}).to(x.device)
     by_hand = ByHand(SIZE, 10).to(x.device)
-    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
-    ours = training_step(model, lambda: evidence(elbo.terms(model, x), 0))
-    theirs = training_step(by_hand, lambda: by_hand(x))
-    a, b = seconds(ours, theirs)
+    a, b = seconds(step_of(model, x), training_step(by_hand, lambda: by_hand(x)))
     return a / b
 
 
@@ -227,8 +243,7 @@ def chain(x: Tensor) -> float:
     model = dvae.method("srnn", latent=10).build({"x": SIZE}).to(x.device)
     plain = copy.deepcopy(model)
     plain.encoder["z"].chain = lambda *_: None
-    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
-    a, b = seconds(*(training_step(m, lambda m=m: evidence(elbo.terms(m, x), 0)) for m in (plain, model)))
+    a, b = seconds(step_of(plain, x), step_of(model, x))
     return a / b
 
 
@@ -255,10 +270,9 @@ def cache(device: torch.device, length: int = 100, samples: int = 50) -> float:
 def linear(device: torch.device) -> float:
     """Exponent of T in the time of a training step."""
     model = dvae.method("srnn").build({"x": SIZE}).to(device)
-    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
     lengths = [125, 250, 500, 1000]
-    data = [torch.randn(8, length, SIZE, device=device) for length in lengths]
-    times = seconds(*(training_step(model, lambda x=x: evidence(elbo.terms(model, x), 0)) for x in data), repeat=5)
+    steps = [step_of(model, torch.randn(8, length, SIZE, device=device)) for length in lengths]
+    times = seconds(*steps, repeat=5)
     return math.log(times[-1] / times[0]) / math.log(lengths[-1] / lengths[0])
 
 
@@ -309,8 +323,7 @@ def filters(device: torch.device, steps: int = 10_000, batch: int = 1, size: int
 def member(name: str, x: Tensor) -> float:
     """Training step of a member of the family over its LSTM layers."""
     model = dvae.method(name, **FAMILY[name]).build({"x": SIZE}).to(x.device)
-    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
-    step, alone = seconds(training_step(model, lambda: evidence(elbo.terms(model, x), 0)), layers(model, x))
+    step, alone = seconds(step_of(model, x), layers(model, x))
     return step / alone
 
 

@@ -18,7 +18,7 @@ import torch
 import dvae
 from dvae import motion
 
-from .speed import moved, products, seconds, stopwatch, training_step
+from .speed import fed_step, over_products, stopwatch
 
 TARGETS = {"bend": ("under", None)}
 
@@ -29,15 +29,11 @@ def rows(device: torch.device) -> dict[str, float]:
     method = dvae.method("trajevae")
     method = method.filled(method.preset(motion.HUMAN36M))
     model = method.build(windows).to(device).train()
-    source, generator = method.train(windows).batches, torch.Generator().manual_seed(0)
-    elbo, objective = dvae.SequenceELBO(), method.train(windows).objective
-    draw = lambda: moved(source.sample(32, generator), device)  # noqa: E731
-    step = training_step(model, lambda: objective(elbo.terms(model, draw()), 0))
+    step, _ = fed_step(method, model, windows, 32, device)
     batch = {name: value[:1].to(device) for name, value in windows.given(["RFoot", "LFoot"]).all().items()}
     past = {"x": batch["x"][:, :1], "y": batch["y"]}
     sampling = lambda: model.forecast(past, 100, 50)  # noqa: E731
-    times = seconds(step, products(step), sampling, products(sampling), repeat=3)
-    found = {"step": times[0] / times[1], "sampling": times[2] / times[3]}
+    found = dict(zip(("step", "sampling"), over_products(step, sampling), strict=True))
 
     positions = windows.positions(batch["x"].cpu())[0].numpy()
     path = {"LWrist": positions[1:, windows.skeleton.find("LWrist")]}

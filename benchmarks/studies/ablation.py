@@ -11,7 +11,7 @@ from dvae.inference.evaluation.estimates import number
 from dvae.runs.ablation import Arrow
 
 from .audits import FAMILY, spread
-from .pages import DOCS, code, write
+from .pages import DOCS, code, words, write
 
 NAMES = ("DKF", "SRNN", "DSAE")
 LEVEL = ("p(z_t | z_{t-1}) p(x_t | z_t)", "faithful")
@@ -23,12 +23,10 @@ KEEPS, MOVES, NOISE, STEPS = 0.95, 0.3, 0.5, 20
 
 def twins(names: tuple[str, ...], steps: int, seeds: int) -> str:
     """What each arrow of some models is worth."""
-    lines = ["| | model | arrow | price of leaving it out |", "|---|---|---|---|"]
-    for name in names:
-        model = FAMILY[name][0]
-        for arrow, price in dvae.model_arrow_prices(model, steps=steps, seeds=seeds).items():
-            lines.append(f"| {name} | {code(model)} | {code(arrow)} | {spread(price)} |")
-    return "\n".join(lines) + "\n"
+    models = {name: FAMILY[name][0] for name in names}
+    prices = {name: dvae.model_arrow_prices(model, steps=steps, seeds=seeds) for name, model in models.items()}
+    rows = [(n, code(models[n]), code(arrow), spread(price)) for n in names for arrow, price in prices[n].items()]
+    return words("", "model", "arrow", "price of leaving it out", rows=rows)
 
 
 def sensors(path: Path, sequences: int = 600) -> dvae.tables.PanelData:
@@ -65,14 +63,14 @@ def exact(arrow: Arrow, found: dvae.Ablation) -> float:
 
 def fitted(found: dvae.Ablation) -> str:
     """All prices of each arrow."""
-    head = "| arrow | of | on twins, nats a sequence | fitted, nats a step | 95 % | p | exact, nats a step |"
-    lines = [head, "|---|---|---|---|---|---|---|"]
+    lines = []
     for arrow in found.arrows:
         costs, estimate = torch.tensor(found.prices[arrow.run]), found.differences[arrow.run]
         low, high = map(number, estimate.interval())
         cells = [spread(costs), str(estimate), f"{low} to {high}", number(found.p_values[arrow.run])]
-        lines.append(f"| {code(arrow.name)} | {arrow.of} | {' | '.join(cells)} | {exact(arrow, found):.3f} |")
-    return "\n".join(lines) + "\n"
+        lines.append([code(arrow.name), arrow.of, *cells, f"{exact(arrow, found):.3f}"])
+    head = ("arrow", "of", "on twins, nats a sequence", "fitted, nats a step", "95 %", "p", "exact, nats a step")
+    return words(*head, rows=lines)
 
 
 def main(

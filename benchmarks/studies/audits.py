@@ -9,46 +9,10 @@ import tyro
 import dvae
 from dvae.inference.evaluation.estimates import number
 
-from .pages import DOCS, code, write
+from .engine import settings
+from .pages import DOCS, code, table, words, write
 
-HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
-KVAE = "p(z_t | z_{t-1}, a_{<t}) p(a_t | z_t, a_{<t}) p(x_t | a_t)"
-COLLAPSED = "p(a_t | a_{<t}) p(x_t | a_t)"
-TWO_LAYERS = "p(w) p(u_t | u_{t-1}, w) p(z_t | z_{t-1}, u_t) p(x_t | x_{<t}, z_t)"
-
-FAMILY = {
-    "VAE": ("p(z_t) p(x_t | z_t)", "q(z_t | x_t)"),
-    "DKF": ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"),
-    "DKF, bidirectional": ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"),
-    "KVAE": (KVAE, "q(a_t | x_t) q(z_t | z_{t-1}, a_{1:T})"),
-    "KVAE, z integrated out": (COLLAPSED, "q(a_t | x_t)"),
-    "KVAE, a_{<t} and x_{>t} added": (COLLAPSED, "q(a_t | a_{<t}, x_{t:T})"),
-    "STORN, filtering": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t})"),
-    "STORN, smoothing": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{1:T})"),
-    "STORN, z_{<t} added": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | z_{<t}, x_{1:T})"),
-    "VRNN": ("p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t}, z_{<t})"),
-    "VRNN, x_{>t} added": ("p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})", "q(z_t | z_{<t}, x_{1:T})"),
-    "SRNN": ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"),
-    "RVAE, causal": ("p(z_t) p(x_t | z_{<=t})", "q(z_t | z_{<t}, x_{t:T})"),
-    "RVAE, non-causal": ("p(z_t) p(x_t | z_{1:T})", "q(z_t | z_{<t}, x_{1:T})"),
-    "DSAE": ("p(w) p(z_t | z_{<t}) p(x_t | z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
-    "DSAE, z_{<t} added": (
-        "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)",
-        "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)",
-    ),
-    "HiT-DVAE": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
-    "HiT-DVAE, z_{<t} added": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)"),
-    "two layers": (
-        TWO_LAYERS,
-        "q(w | x_{1:T}) q(u_t | u_{t-1}, z_{t-1}, x_{1:T}, w) q(z_t | z_{t-1}, u_t, x_{1:T}, w)",
-    ),
-    "two layers, u_{t-1} dropped": (
-        TWO_LAYERS,
-        "q(w | x_{1:T}) q(u_t | z_{t-1}, x_{1:T}, w) q(z_t | z_{t-1}, u_t, x_{1:T}, w)",
-    ),
-}
-
-
+FAMILY: dict[str, tuple[str, str]] = settings(__file__)
 DERIVED = ("DKF", "SRNN", "DSAE", "HiT-DVAE", "two layers")
 """Whose guides are derived, and their arrows priced."""
 
@@ -61,23 +25,18 @@ def spread(price: torch.Tensor) -> str:
 
 def derived(names: Sequence[str]) -> str:
     """The guides of some models that miss nothing, by what they cost."""
-    lines = ["| | guide | drawn | arrows | looped | KL by draws |", "|---|---|---|---:|---|---|"]
-    for name in names:
-        for guide, order, *rest in dvae.alternatives(FAMILY[name][0]).rows:
-            lines.append(f"| {name} | {code(guide)} | {order} | {' | '.join(rest)} |")
-    return "\n".join(lines) + "\n"
+    rows = [(name, code(guide), *rest) for name in names for guide, *rest in dvae.alternatives(FAMILY[name][0]).rows]
+    return table(["", "guide", "drawn", "arrows", "looped", "KL by draws"], rows, "|---|---|---|---:|---|---|")
 
 
 def arrows(names: Sequence[str], steps: int, seeds: int) -> str:
     """What each arrow of the derived guide is worth by itself."""
-    lines = ["| | arrow | price of leaving it out |", "|---|---|---|"]
-    for name in names:
-        for arrow, price in dvae.arrow_prices(FAMILY[name][0], steps=steps, seeds=seeds).items():
-            lines.append(f"| {name} | {code(arrow)} | {spread(price)} |")
-    return "\n".join(lines) + "\n"
+    prices = {name: dvae.arrow_prices(FAMILY[name][0], steps=steps, seeds=seeds) for name in names}
+    rows = [(name, code(arrow), spread(price)) for name, each in prices.items() for arrow, price in each.items()]
+    return words("", "arrow", "price of leaving it out", rows=rows)
 
 
-def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> str:
+def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> list[str]:
     """A line of the table."""
     audit = dvae.audit(generative, inference)
     missing, redundant = (
@@ -86,13 +45,7 @@ def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> s
     )
     sizes = dict.fromkeys((*audit.generative.variables,), 1)
     price = dvae.price(generative, inference, sizes, steps=steps, seeds=seeds)
-    cells = (name, code(generative), code(inference), missing, redundant, spread(price))
-    return f"| {' | '.join(cells)} |"
-
-
-HEADER = """| | model | guide | missing | redundant | price |
-|---|---|---|---|---|---|
-"""
+    return [name, code(generative), code(inference), missing, redundant, spread(price)]
 
 
 def main(page: Path = DOCS / "audits.md", steps: int = 5, seeds: int = 5) -> None:
@@ -104,7 +57,7 @@ def main(page: Path = DOCS / "audits.md", steps: int = 5, seeds: int = 5) -> Non
         seeds: models of random weights.
     """
     rows = [row(name, *equations, steps, seeds) for name, equations in FAMILY.items()]
-    write(page, HEADER + "\n".join(rows) + "\n")
+    write(page, words("", "model", "guide", "missing", "redundant", "price", rows=rows))
     names = [name for name in DERIVED if name in FAMILY]
     write(page, derived(names), name="derived")
     write(page, arrows(names, steps, seeds), name="arrows")

@@ -7,8 +7,9 @@ import tyro
 
 import dvae
 
-from .pages import DOCS, code, write
+from .pages import DOCS, code, words, write
 
+MODEL = "p(z_t | z_{t-1}) p(x_t | z_t)"
 GUIDES = {
     "blind": "q(z_t | z_{t-1})",
     "mean-field": "q(z_t | x_{1:T})",
@@ -17,24 +18,19 @@ GUIDES = {
 }
 
 
-HEADER = """| guide | ELBO (exact) | IWAE | FIVO, resampled below .25 K | below .5 K | always |
-|---|---|---|---|---|---|
-"""
-
-
 TEMPERATURES = (10, 30, 100)
 
 
-def fitted(inference: str, steps: int, fitting: int) -> tuple[dvae.DynamicalVAE, dvae.Oracle]:
+def fitted(inference: str, steps: int, fitting: int, scale: float = 0.5) -> tuple[dvae.DynamicalVAE, dvae.Oracle]:
     """The best guide of a factorization."""
-    model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", inference, {"z": 1, "x": 1}, steps, scale=0.5)
+    model = dvae.twin(MODEL, inference, {"z": 1, "x": 1}, steps, scale=scale)
     oracle = dvae.Oracle(model, steps)
     oracle.fit_guide(fitting)
     torch.manual_seed(0)
     return model.requires_grad_(False), oracle
 
 
-def annealed(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> str:
+def annealed(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> list[str]:
     """Bounds from both sides minus the evidence."""
     model, oracle = fitted(inference, steps, fitting)
     drawn = model.sample(sequences, steps)
@@ -44,10 +40,10 @@ def annealed(name: str, inference: str, steps: int, sequences: int, particles: i
         for start in (None, {"z": drawn["z"]}):
             gap = dvae.annealed_bound(model, drawn["x"], temperatures, particles, latents=start).bound - evidence
             cells.append(f"{gap.mean():.3f} ± {gap.std() / sequences**0.5:.3f}")
-    return f"| {code(inference)}, {name} | {' | '.join(cells)} |"
+    return [f"{code(inference)}, {name}", *cells]
 
 
-def row(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> str:
+def row(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> list[str]:
     """Evidence minus each bound, for the best guide of the factorization."""
     model, oracle = fitted(inference, steps, fitting)
     x = model.sample(sequences, steps)["x"]
@@ -57,7 +53,7 @@ def row(name: str, inference: str, steps: int, sequences: int, particles: int, f
     bounds += [dvae.particle_bound(model, x, particles, resample_below=share).bound for share in (0.25, 0.5, 1.0)]
     gaps = [evidence - bound for bound in bounds]
     cells = [f"{gap.mean():.2f} ± {gap.std() / sequences**0.5:.2f}" for gap in gaps]
-    return f"| {code(inference)}, {name} | {exact:.2f} | {' | '.join(cells)} |"
+    return [f"{code(inference)}, {name}", f"{exact:.2f}", *cells]
 
 
 def main(
@@ -78,12 +74,11 @@ def main(
         fitting: steps of the guide to its best.
         sides: sequences of the table of bounds from both sides.
     """
-    rows = [row(name, inference, steps, sequences, particles, fitting) for name, inference in GUIDES.items()]
-    write(page, HEADER + "\n".join(rows) + "\n")
+    head = ("guide", "ELBO (exact)", "IWAE", "FIVO, resampled below .25 K", "below .5 K", "always")
+    write(page, words(*head, rows=[row(*guide, steps, sequences, particles, fitting) for guide in GUIDES.items()]))
     columns = [f"{side}, L = {number}" for number in TEMPERATURES for side in ("lower", "upper")]
-    head = f"| guide | {' | '.join(columns)} |\n|{'---|' * (1 + len(columns))}\n"
-    rows = [annealed(name, inference, steps, sides, particles, fitting) for name, inference in GUIDES.items()]
-    write(page, head + "\n".join(rows) + "\n", name="sides")
+    rows = [annealed(*guide, steps, sides, particles, fitting) for guide in GUIDES.items()]
+    write(page, words("guide", *columns, rows=rows), name="sides")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ it may work on other parts or runs at once. Tables are of what is there, over al
 
     prediction    of the rest from the first quarter of a second, beside residual-sup and the last frame held
     completion    from M points a frame in all of 100 frames, and from few of them, with and without 16 markers
-    grid          all M times all numbers of frames
     uncertainty   what intervals hold of surfaces and durations, k-hat, and whether descents converge
     tuning        deviations and descents, by a run that was fitted on file group A alone (`--tuned`), judged on B
 
@@ -16,11 +15,10 @@ to poses, on quaternions and places, fitted to the takes of the same training se
 from __future__ import annotations
 
 import itertools
-import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +29,8 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.data.batch import WHOLE
-from dvae.inference.evaluation.estimates import Crossed
+from dvae.data.views import WHOLE
 from dvae.inference.evaluation.result import canvas
-from dvae.inference.training.checkpoints import LAST, load_weights
 from dvae.motion import bodies
 from dvae.motion.geometry.rotations import to_matrix
 from dvae.motion.geometry.skeleton import rotate_about_up
@@ -51,17 +47,17 @@ from dvae.motion.segments.completion import (
 from dvae.motion.segments.dataset import SegmentData, thinned
 from dvae.motion.segments.embodied import SHAPE, Segments
 
-from .engine import fitted, folder, interval, kept, said
-from .pages import DOCS, table, write
+from .engine import OURS, Row, fitted, folder, interval, kept, read_all, spread
+from .pages import DOCS, refuse_unknown, table, tabled, write
 
-PARTS = ("prediction", "completion", "grid", "uncertainty", "tuning")
+PARTS = ("prediction", "completion", "uncertainty", "tuning")
 MARKS, TUNING = "completion", "tuning"
 DEVIATIONS, DESCENT = Deviations(), dvae.Descent()
 """Chosen by the part "tuning"."""
 SECONDS, HORIZON = 0.25, 1.2
 RESIDUAL: dict[str, Any] = {"alpha": 0.0, "velocity": True, "width": 256}
 TRAINING: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5}
-OURS, UNTOLD, SUP, STILL, NEAR = "ours", "ours, body unknown", "residual-sup", "last frame held", "reconstruction"
+UNTOLD, SUP, STILL, NEAR = "ours, body unknown", "residual-sup", "last frame held", "reconstruction"
 POINTS, FRAMES = (10, 50, 100), (5, 10, 20, 50, 100)
 FEW, ALL = 50, FRAMES[-1]
 """Points a frame where the number of frames changes, and frames where that of points does."""
@@ -148,7 +144,6 @@ SIGHTS = {
     "7b": [Sight(FEW, frames, markers) for frames in FRAMES for markers in (False, True)],
     "markers alone": [Sight(0, frames, True) for frames in FRAMES],
 }
-GRID = [Sight(points, frames, markers) for markers in (False, True) for points in POINTS for frames in FRAMES]
 SURE = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
 """Of which intervals are judged, and deviations chosen, each one of a kind."""
 TRIED = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02, 0.05, 0.1)}
@@ -156,133 +151,81 @@ TRIED |= {"point": (0.05, 0.1, 0.2)}
 KINDS = dict(zip(map(str, SURE), ("surface", "marker", "point"), strict=True))
 PRIORS = {"aggregate": True, "standard": False}
 """That of known segments, and N(0, I)."""
-DESCENTS = [
-    dvae.Descent(steps, rate, starts)
-    for steps, rate, starts in (
-        (100, 0.05, 1),
-        (100, 0.05, 4),
-        (100, 0.1, 4),
-        (200, 0.05, 4),
-        (200, 0.1, 4),
-        (400, 0.05, 4),
-        (200, 0.05, 8),
-        (400, 0.1, 4),
-    )
-]
+DESCENTS = [dvae.Descent(100, 0.05, 1), dvae.Descent(100, 0.05), dvae.Descent(100, 0.1), dvae.Descent(200, 0.05)]
+DESCENTS += [dvae.Descent(200, 0.1), dvae.Descent(400, 0.05), dvae.Descent(200, 0.05, 8), dvae.Descent(400, 0.1)]
+
+
+@cache
+def opened(path: Path | None) -> SegmentData:
+    """Segments of a file."""
+    if path is None:
+        sys.exit("something has not been measured yet; name the data and a run")
+    return SegmentData.open(path)
+
+
+def grouped(people: motion.MotionSet) -> motion.MotionSet:
+    """Segments of file group A for training, of B for test."""
+    splits = {"A": "train", "B": "test"}
+    clips = [replace(clip, split=splits.get(clip.labels["file_group"], "unseen")) for clip in people]
+    return replace(people, clips=clips)
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Segments that a model has not seen.
+    """A run, and segments that it has not seen, which are read when they are asked for.
 
     Args:
-        model: of them.
-        segments: as it sees them.
-        known: of those for training.
-    """
-
-    model: Any
-    segments: Segments
-    known: Mapping[str, Tensor]
-
-    @classmethod
-    def of(cls, model: Any, people: motion.MotionSet, budget: Budget) -> Held:
-        """Of segments in the splits train and test."""
-        parts = {split: [clip for clip in people if clip.split == split] for split in ("train", "test")}
-        known = replace(people, clips=thinned(parts["train"], budget.known))
-        return cls(
-            model,
-            Segments(replace(people, clips=parts["test"][:: budget.every]), model.timed),
-            Segments(known, model.timed).all(),
-        )
-
-    @property
-    def takes(self) -> list[str]:
-        """Of each."""
-        return [clip.labels["source"] for clip in self.segments.motion]
-
-    @property
-    def batch(self) -> Mapping[str, Tensor]:
-        """All of them."""
-        return self.segments.all()
-
-    def some(self, many: int) -> Held:
-        """So many, evenly over all."""
-        fewer = replace(self.segments.motion, clips=thinned(self.segments.motion.clips, many))
-        return replace(self, segments=Segments(fewer, self.model.timed))
-
-    def complete(
-        self, seen: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
-    ) -> Completed:
-        """From what was seen."""
-        how: dict[str, Any] = {"deviations": deviations, "descent": descent, "aggregate": aggregate}
-        return complete(self.model, seen, **how, known=self.known)
-
-
-class Source:
-    """Segments of a file, cut when they are asked for."""
-
-    def __init__(self, path: Path | str | None) -> None:
-        self.path = path
-
-    @cached_property
-    def data(self) -> SegmentData:
-        """Opened."""
-        if self.path is None:
-            sys.exit("something has not been measured yet; name the data and a run")
-        return SegmentData.open(self.path)
-
-    @cached_property
-    def grouped(self) -> motion.MotionSet:
-        """Those of file group A for training, of B for test."""
-        found = self.data.segments
-        splits = {"A": "train", "B": "test"}
-        clips = [replace(clip, split=splits.get(clip.labels["file_group"], "unseen")) for clip in found]
-        return replace(found, clips=clips)
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """What is measured of a run.
-
-    Args:
-        path: of it.
-        source: of the segments.
+        path: of the run.
+        data: file of the segments.
         budget: what it may cost.
+        some: those that are completed, in place of those that are predicted.
         grouped: it was fitted on file group A, and is judged on B.
     """
 
     path: Path
-    source: Source
+    data: Path | None
     budget: Budget
+    some: bool = False
     grouped: bool = False
 
     @cached_property
-    def held(self) -> Held:
-        """All segments that are predicted."""
-        people = self.source.grouped if self.grouped else self.source.data.segments
-        return Held.of(dvae.load(self.path).model, people, self.budget)
+    def model(self) -> Any:
+        """That was fitted."""
+        return dvae.load(self.path).model
+
+    def split(self, name: str) -> list[Any]:
+        """Segments of a part."""
+        people = opened(self.data).segments
+        return [clip for clip in (grouped(people) if self.grouped else people) if clip.split == name]
+
+    def seen(self, clips: Sequence[Any]) -> Segments:
+        """Segments as the model sees them."""
+        return Segments(replace(opened(self.data).segments, clips=clips), self.model.timed)
 
     @cached_property
-    def some(self) -> Held:
-        """Those that are completed."""
-        return self.held.some(self.budget.some)
+    def segments(self) -> Segments:
+        """Those of the test, evenly over all."""
+        clips = self.split("test")[:: self.budget.every]
+        return self.seen(thinned(clips, self.budget.some) if self.some else clips)
 
-    def prediction(self) -> dict[str, Any]:
-        """See `prediction`."""
-        return prediction(self.held)
+    @cached_property
+    def batch(self) -> Mapping[str, Tensor]:
+        """All of them."""
+        return self.segments.all()
 
-    def references(self, seed: int, out: Path) -> dict[str, Any]:
-        """Beside which that is, for the same segments."""
-        return references(self.held, recurrent(self.source.data, seed, out, self.budget))
+    def complete(
+        self, seen: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
+    ) -> Completed:
+        """From what was seen, and known segments for training."""
+        known = self.seen(thinned(self.split("train"), self.budget.known)).all()
+        how: dict[str, Any] = {"deviations": deviations, "descent": descent, "aggregate": aggregate}
+        return complete(self.model, seen, **how, known=known)
 
-    def completed(self, sight: Sight) -> dict[str, Any]:
-        """See `completed`."""
-        return completed(self.some, sight, self.budget.dense)
 
-    def certain(self, sight: Any, *how: Any) -> dict[str, Any]:
-        """See `certain`."""
-        return certain(self.some, sight, *how)
+def scored(held: Held, rows: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+    """A measurement of scores by segment, which are of takes."""
+    takes = [clip.labels["source"] for clip in held.segments.motion]
+    return {"clips": takes, "weights": [1] * len(takes), "rows": rows, **more}
 
 
 def millimetres(values: Tensor) -> list[Any]:
@@ -298,14 +241,21 @@ def moments(fps: float) -> tuple[list[float], int]:
     return [n / fps for n in range(int(HORIZON * fps + 1e-3) + 1)], int(SECONDS * fps + 1e-3) + 1
 
 
-def errors(held: Held, made: tuple[Tensor, Tensor], times: Sequence[float]) -> list[Any]:
-    """Of each segment at each time, NaN behind its end."""
-    batch = held.batch
-    found = []
-    for n in range(len(made[0])):
-        ours, theirs = ((x[n : n + 1], shape[n : n + 1]) for x, shape in (made, (batch[WHOLE], batch[SHAPE])))
-        found.append(error_by_time(held.model, ours, theirs, times)[0])
-    return millimetres(torch.stack(found))
+def at(time: float) -> str:
+    """The name of errors at a time."""
+    return f"{time:.3f} s"
+
+
+def by_times(times: Sequence[float], errors: Sequence[Tensor]) -> dict[str, list[Any]]:
+    """Errors by time and segment, of errors (T,) of each segment, NaN behind its end."""
+    return dict(zip(map(at, times), millimetres(torch.stack([*errors], 1)), strict=True))
+
+
+def errors(held: Held, made: tuple[Tensor, Tensor], times: Sequence[float]) -> dict[str, list[Any]]:
+    """Errors by time and segment of frames and bodies."""
+    truth = held.batch[WHOLE], held.batch[SHAPE]
+    pairs = [[tuple(each[n : n + 1] for each in side) for side in (made, truth)] for n in range(len(made[0]))]
+    return by_times(times, [error_by_time(held.model, *pair, times)[0] for pair in pairs])
 
 
 def prediction(held: Held) -> dict[str, Any]:
@@ -319,24 +269,19 @@ def prediction(held: Held) -> dict[str, Any]:
     with torch.no_grad():
         near = model.decode(model.encode(batch), batch[SHAPE])
     found[NEAR] = errors(held, (near, batch[SHAPE]), times)
-    return {"takes": held.takes, "times": times, "errors": found}
+    return scored(held, found, times=times)
 
 
-def recurrent(data: SegmentData, seed: int, out: Path, budget: Budget) -> Any:
+def recurrent(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
     """Residual-sup, fitted, or gone on with where it was stopped."""
     segments = data.segments
     sources = {clip.labels["source"] for clip in segments if clip.split == "train"}
     takes = bodies.fitted(data.motion, bodies.human())
     takes = replace(takes, clips=[clip for clip in takes if clip.split == "train" and clip.name in sources])
-    windows = motion.windows(takes, protocol(takes.skeleton.fps), "train")
+    opened = motion.MotionData(str(data.path), takes, protocol(takes.skeleton.fps))
+    training = {"steps": steps, "validate_every": max(steps // 3, 1), **TRAINING}
     method = dvae.method("mix-and-match", **RESIDUAL)
-    torch.manual_seed(seed)
-    model = method.build(windows)
-    recipe = method.train(windows, None, budget.steps)
-    told: dict[str, Any] = {"config": method.config(), "validate_every": max(budget.steps // 3, 1), **TRAINING}
-    fitted(model, recipe, out=out, seed=seed, **told)
-    load_weights(model, out / LAST)
-    return model.eval()
+    return fitted(method, opened, opened.windows("train"), out=out, seed=seed, **training).model.eval()
 
 
 def protocol(fps: float) -> motion.Protocol:
@@ -383,14 +328,18 @@ def references(held: Held, model: Any) -> dict[str, Any]:
         for name, ahead in ((SUP, made), (STILL, still)):
             whole = torch.cat([truth[:seen], ahead])
             found[name].append(bodies.vertex_error(whole[:, None], truth[:, None]))
-    made_of = {name: millimetres(torch.stack(rows)) for name, rows in found.items()}
-    return {"takes": held.takes, "times": times, "errors": made_of}
+    return scored(held, {name: by_times(times, rows) for name, rows in found.items()}, times=times)
+
+
+def beside(held: Held, seed: int, out: Path) -> dict[str, Any]:
+    """Fits residual-sup, and measures the references."""
+    return references(held, recurrent(opened(held.data), seed, out, held.budget.steps))
 
 
 # Completion
 
 
-def completed(held: Held, sight: Sight, dense: int) -> dict[str, Any]:
+def completed(held: Held, sight: Sight) -> dict[str, Any]:
     """How near completed surfaces are to true ones, in millimetres by segment, and how descents ended."""
     model, batch = held.model, held.batch
     seen = sight.of(model, batch)
@@ -401,19 +350,15 @@ def completed(held: Held, sight: Sight, dense: int) -> dict[str, Any]:
     for n in range(len(batch[WHOLE])):
         one = slice(n, n + 1)
         made, truth = model.vertices(done.x[one], done.shape[one]), model.vertices(batch[WHOLE][one], batch[SHAPE][one])
-        points = scanned(truth, model.body.faces, dense, generator)
+        points = scanned(truth, model.body.faces, held.budget.dense, generator)
         found["chamfer"].append(chamfer(points, made).mean(-1))
         found["floor"].append(chamfer(points, truth).mean(-1))
         found["vertices"].append(bodies.vertex_error(made, truth))
         if sight.points:
             found["seen"].append(chamfer(seen["points"][one], made[:, frames]).mean(-1))
     lasts = model.timed.lasts(done.x) - model.timed.lasts(batch[WHOLE])
-    return {
-        "takes": held.takes,
-        **{name: millimetres(torch.cat(each)) for name, each in found.items() if each},
-        "duration": millimetres(lasts.abs()),
-        **ended(done),
-    }
+    scores = {name: millimetres(torch.cat(each)) for name, each in found.items() if each}
+    return scored(held, {OURS: {**scores, "duration": millimetres(lasts.abs()), **ended(done)}})
 
 
 def ended(done: Completed) -> dict[str, Any]:
@@ -449,174 +394,114 @@ def certain(
         spread = (drawn.var(0) + noise**2).sqrt()
         return ((truth - drawn.mean(0)).abs() <= reach * spread).float().mean(-1)
 
-    found: dict[str, list[Any]] = {"surface": [], "seen": [], "spread": [], "error": []}
-    found |= {} if isinstance(sight, Sight) else {"duration": []}
+    found: dict[str, list[Any]] = {"spread": [], "error": []}
+    told = ("surface", "seen", *(() if isinstance(sight, Sight) else ("duration",)))
+    shares: dict[str, list[Tensor]] = {what: [] for what in told}
     for n in range(len(x[0])):
         drawn, truth = places(x[:, n], shapes[:, n]), places(batch[WHOLE][n], batch[SHAPE][n])
-        if "duration" in found:
+        if "duration" in shares:
             lasts, last = (model.timed.lasts(frames)[..., None] for frames in (x[:, n], batch[WHOLE][n]))
-            found["duration"].append(within(lasts, last, deviations.time).tolist())
-        found["surface"].append(within(drawn, truth).tolist())
-        found["seen"].append(within(drawn, truth, noise).tolist())
+            shares["duration"].append(within(lasts, last, deviations.time))
+        shares["surface"].append(within(drawn, truth))
+        shares["seen"].append(within(drawn, truth, noise))
         found["spread"].append(1000 * float(drawn.var(0).mean().sqrt()))
         found["error"].append(1000 * float((drawn.mean(0) - truth).square().mean().sqrt()))
     made, theirs = (model.vertices(*each) for each in ((done.x, done.shape), (batch[WHOLE], batch[SHAPE])))
+    held_by = {
+        holds(what, level): (100 * share).tolist()
+        for what, each in shares.items()
+        for level, share in zip(LEVELS, torch.stack(each, 1), strict=True)
+    }
     vertices = millimetres(bodies.vertex_error(made, theirs))
-    return {"takes": held.takes, "khat": khat.tolist(), "vertices": vertices, **found, **ended(done)}
+    return scored(held, {OURS: {"khat": khat.tolist(), "vertices": vertices, **found, **held_by, **ended(done)}})
+
+
+def holds(what: str, level: float) -> str:
+    """The name of how much intervals of a level hold, in per cent."""
+    return f"{what}, {100 * level:.0f} % (%)"
 
 
 # Tables
 
 
-def over(rows: Sequence[Mapping[str, Any]], values: Sequence[Any]) -> Crossed | None:
-    """Of values by segment (N,) of several runs, those that are none left out; None where no segment has one."""
-    takes, place = np.unique(rows[0]["takes"], return_inverse=True)
-    given = np.array(values, dtype=float)
-    there = np.isfinite(given).all(0)
-    weights = np.bincount(place[there], minlength=len(takes))
-    some = weights > 0
-    if not some.any():
-        return None
-    sums = np.stack([np.bincount(place[there], one[there], minlength=len(takes)) for one in given])
-    return Crossed.of(sums[:, some] / weights[some], weights[some])
-
-
-def mean(rows: Sequence[Mapping[str, Any]], name: str, digits: int = 1) -> str:
-    """Of what runs measured by segment."""
-    if not rows or any(name not in row for row in rows):
-        return "–"
-    found = over(rows, [row[name] for row in rows])
-    return "–" if found is None else said(found.estimate(), digits)
-
-
-def found_in(out: Path, name: str) -> list[dict[str, Any]]:
-    """What all runs measured of a part."""
-    return [json.loads(file.read_text()) for file in sorted(out.glob(f"*/{folder(name)}.json"))]
-
-
-Curves = dict[str, tuple[list[Mapping[str, Any]], str]]
-"""Row to the measurements that have it, and to its name in them."""
-
-
-def curves(out: Path) -> Curves:
+def curves(out: Path) -> dict[str, Row]:
     """What has errors by time."""
-    ours, others = found_in(out, "prediction"), found_in(out, "references")
-    rows: Curves = {name: (ours, name) for name in (OURS, UNTOLD, NEAR)} if ours else {}
-    return {**rows, **({name: (others, name) for name in (SUP, STILL)} if others else {})}
+    ours, others = (read_all(out, name) for name in ("prediction", "references"))
+    named = {OURS: ours, UNTOLD: ours, NEAR: ours, SUP: others, STILL: others}
+    return {name: replace(row, name=name) for name, row in named.items() if row is not None}
 
 
-def at(rows: Sequence[Mapping[str, Any]], name: str, n: int) -> Crossed | None:
-    """Errors of one time."""
-    return over(rows, [[row[n] for row in one["errors"][name]] for one in rows])
-
-
-def times_of(drawn: Curves) -> list[float]:
-    """Of errors."""
-    return next(rows[0]["times"] for rows, _ in drawn.values())  # type: ignore[no-any-return]
-
-
-def by_time(drawn: Curves) -> str:
+def by_time(drawn: Mapping[str, Row]) -> str:
     """Rows down, time across in tenths of a second; and how much less is off than residual-sup's."""
-    times = times_of(drawn)
-    shown = [n for n, time in enumerate(times) if time > SECONDS and abs(10 * time - round(10 * time)) < 1e-3]
-    lines = []
-    for name, (rows, key) in drawn.items():
-        cells = [at(rows, key, n) for n in shown]
-        lines.append([name, *("–" if cell is None else said(cell.estimate()) for cell in cells)])
+    first = next(iter(drawn.values()))
+    times = [time for time in first.runs[0]["times"] if time > SECONDS and abs(10 * time - round(10 * time)) < 1e-3]
+    lines = [[name, *(row.said(at(time)) for time in times)] for name, row in drawn.items()]
     if {OURS, SUP} <= drawn.keys():
-        pairs = [(at(*drawn[OURS], n), at(*drawn[SUP], n)) for n in shown]
-        less = [None if ours is None or theirs is None else ours.estimate(theirs) for ours, theirs in pairs]
-        lines.append([f"{OURS} minus {SUP}, 95 %", *(interval(cell, alone=True) for cell in less)])
-    rows = next(iter(drawn.values()))[0]
-    many = [sum(row[n] is not None for row in next(iter(rows[0]["errors"].values()))) for n in shown]
-    lines.append(["segments", *map(str, many)])
-    return table(["mm", *(f"{times[n]:.1f} s" for n in shown)], lines)
+        less = [drawn[OURS].estimate(at(time), drawn[SUP]) for time in times]
+        lines.append([f"{OURS} minus {SUP}, 95 %", *(interval(each, alone=True) for each in less)])
+    lines.append(["segments", *(str(int(np.isfinite(first.values(at(time))[0]).sum())) for time in times)])
+    return table(["mm", *(f"{time:.1f} s" for time in times)], lines)
 
 
-def of_sights(out: Path, sights: Iterable[Sight]) -> dict[Sight, list[dict[str, Any]]]:
-    """What was measured of completion, by what was seen."""
-    return {sight: found for sight in sights if (found := found_in(out, str(sight)))}
+def of_sights(out: Path, sights: Iterable[Any], name: str = "{}") -> dict[Any, Row]:
+    """What was measured, by what was seen."""
+    found = {sight: read_all(out, folder(name.format(sight))) for sight in sights}
+    return {sight: row for sight, row in found.items() if row is not None}
 
 
-def completions(found: Mapping[Sight, Sequence[Mapping[str, Any]]]) -> str:
+def completions(found: Mapping[Sight, Row]) -> str:
     """What was seen down, errors across."""
-    header = ["seen", "Chamfer (mm)", "95 %", "more than all frames (%)", "floor (mm)", "to points seen (mm)"]
-    header += ["vertices (mm)", "duration (ms)", "left (nats)"]
-    lines = []
-    for sight, rows in found.items():
+
+    def more(sight: Sight) -> str:
         whole = found.get(replace(sight, frames=ALL))
-        chamfers = over(rows, [row["chamfer"] for row in rows])
-        assert chamfers is not None
-        more = [
-            100 * float(np.mean(few["chamfer"]) / np.mean(every["chamfer"]) - 1)
-            for few, every in zip(rows, whole or [], strict=bool(whole))
-        ]
-        lines.append(
-            [
-                str(sight),
-                said(chamfers.estimate()),
-                interval(chamfers.estimate(), alone=True),
-                f"{np.mean(more):.1f} ({min(more):.1f}, {max(more):.1f})" if more else "–",
-                *(mean(rows, name) for name in ("floor", "seen", "vertices", "duration")),
-                f"{np.median(np.concatenate([row['left'] for row in rows])):.2g}",
-            ]
-        )
-    return table(header, lines)
+        if whole is None:
+            return "–"
+        return spread(100 * (found[sight].by_seed("chamfer") / whole.by_seed("chamfer") - 1), 1)
+
+    columns: dict[str, Callable[[Sight], str]] = {
+        "Chamfer (mm)": lambda sight: found[sight].said("chamfer"),
+        "95 %": lambda sight: interval(found[sight].estimate("chamfer"), alone=True),
+        "more than all frames (%)": more,
+        "floor (mm)": lambda sight: found[sight].said("floor"),
+        "to points seen (mm)": lambda sight: found[sight].said("seen"),
+        "vertices (mm)": lambda sight: found[sight].said("vertices"),
+        "duration (ms)": lambda sight: found[sight].said("duration"),
+        "left (nats)": lambda sight: f"{np.median(found[sight].values('left')):.2g}",
+    }
+    return tabled({str(sight): sight for sight in found}, columns, "seen")
 
 
-def grid(found: Mapping[Sight, Sequence[Mapping[str, Any]]], markers: bool, name: str) -> str:
-    """Points down, frames across."""
-    lines = [
-        [str(points), *(mean(found.get(Sight(points, frames, markers), []), name) for frames in FRAMES)]
-        for points in (*POINTS, *[0] * markers)
-    ]
-    return table(["points", *(f"{frames} frames" for frames in FRAMES)], lines)
-
-
-def sureness(found: Mapping[str, Sequence[Mapping[str, Any]]], levels: Sequence[float] = LEVELS) -> str:
+def sureness(found: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> str:
     """What was seen, or tried, down; what intervals hold and how descents end across."""
-    held = [f"{what}, {100 * level:.0f} % (%)" for what in ("surface", "seen", "duration") for level in levels]
-    header = ["", "vertices (mm)", "off (mm)", "sure to (mm)", *held, "k-hat above 0.7 (%)", "converged (%)"]
-    header += ["starts agree (%)", "bent", "seconds"]
-    lines = []
-    for name, rows in found.items():
-        cells = [
-            over(rows, [[100 * segment[n] for segment in row[what]] for row in rows]) if what in rows[0] else None
-            for what in ("surface", "seen", "duration")
-            for n in map(LEVELS.index, levels)
-        ]
-        both = {key: np.concatenate([np.array(row[key], float) for row in rows]) for key in ("khat", *ENDS)}
-        shares = [both["khat"] > 0.7, np.abs(both["left"]) < CONVERGED, np.abs(both["behind"]) < CONVERGED]
-        lines.append(
-            [
-                name,
-                *(mean(rows, key) for key in ("vertices", "error", "spread")),
-                *("–" if cell is None else said(cell.estimate(), 0) for cell in cells),
-                *(f"{100 * share.mean():.0f}" for share in shares),
-                f"{both['bent'].mean():.1f}",
-                f"{np.mean([row['seconds'] for row in rows]):.0f}",
-            ]
-        )
-    return table(header, lines)
+
+    def share(row: Row, name: str, off: Callable[[np.ndarray], np.ndarray]) -> str:
+        return f"{100 * off(row.values(name)).mean():.0f}"
+
+    held = [holds(what, level) for what in ("surface", "seen", "duration") for level in levels]
+    columns: dict[str, Callable[[Row], str]] = {
+        "vertices (mm)": lambda row: row.said("vertices"),
+        "off (mm)": lambda row: row.said("error"),
+        "sure to (mm)": lambda row: row.said("spread"),
+        **{name: partial(Row.said, score=name, digits=0) for name in held},
+        "k-hat above 0.7 (%)": lambda row: share(row, "khat", lambda khat: khat > 0.7),
+        "converged (%)": lambda row: share(row, "left", lambda left: np.abs(left) < CONVERGED),
+        "starts agree (%)": lambda row: share(row, "behind", lambda behind: np.abs(behind) < CONVERGED),
+        "bent": lambda row: f"{row.values('bent').mean():.1f}",
+        "seconds": lambda row: f"{np.mean([run['seconds'] for run in row.runs]):.0f}",
+    }
+    return tabled({str(name): row for name, row in found.items()}, columns)
 
 
-def sections(out: Path) -> list[str]:
-    """All tables of what is there, with headings."""
-    drawn, crossing = curves(out), [sight for sights in SIGHTS.values() for sight in sights]
+def tables(out: Path) -> list[str]:
+    """All of what is there, with headings."""
     found = []
-    if drawn:
+    if drawn := curves(out):
         found += ["### Prediction\n", by_time(drawn)]
-    if crossed := {name: there for name, sights in SIGHTS.items() if (there := of_sights(out, sights))}:
-        found += ["### Completion\n", *(completions(there) for there in crossed.values())]
-    everything = of_sights(out, [*GRID, *crossing])
-    for markers in (False, True):
-        if any(sight.markers == markers for sight in everything.keys() - {*crossing}):
-            told = "with 16 markers" if markers else "without markers"
-            for name in ("chamfer", "vertices"):
-                found += [f"### All points and frames, {told}: {name} (mm)\n", grid(everything, markers, name)]
-    if sure := {str(sight): rows for sight in SURE if (rows := found_in(out, f"sure of {sight}"))}:
+    if crossed := [there for sights in SIGHTS.values() if (there := of_sights(out, sights))]:
+        found += ["### Completion\n", *map(completions, crossed)]
+    if sure := of_sights(out, SURE, "sure of {}"):
         found += ["### Uncertainty\n", sureness(sure)]
-    if chosen := {name: rows for name in tried() if (rows := found_in(out, name))}:
+    if chosen := of_sights(out, tried()):
         found += ["### Tuning\n", sureness(chosen, levels=LEVELS[1:2])]
     return found
 
@@ -629,45 +514,36 @@ def draw(out: Path, file: Path) -> None:
     figure = canvas(14, 3.4)
     first, *panels = figure.subplots(1, 3)
     highest = 0.0  # of all but the last frame held, which leaves the picture
-    for place, (name, (rows, key)) in enumerate(drawn.items()):
-        points = [(time, cell.estimate()) for n, time in enumerate(times_of(drawn)) if (cell := at(rows, key, n))]
-        means = [estimate.mean for _, estimate in points]
+    for name, row in drawn.items():
+        known = {time: row.estimate(at(time)) for time in row.runs[0]["times"]}
+        points = {time: each for time, each in known.items() if each is not None}
+        means = [each.mean for each in points.values()]
         highest = max(highest, *means) if name != STILL else highest
-        first.plot([time for time, _ in points], means, color=f"C{place}", label=name)
-        lows, highs = zip(*(estimate.interval(error="sequences") for _, estimate in points), strict=True)
-        first.fill_between([time for time, _ in points], lows, highs, color=f"C{place}", alpha=0.15, lw=0)
+        (line,) = first.plot([*points], means, label=name)
+        ends = zip(*(each.interval(error="sequences") for each in points.values()), strict=True)
+        first.fill_between([*points], *ends, color=line.get_color(), alpha=0.15, lw=0)
     first.axvline(SECONDS, color="grey", lw=0.8, ls="--")
     first.set(xlabel="time (s)", title="vertex error (mm)", ylim=(0, 1.2 * highest or None))
     first.legend(fontsize=7, frameon=False)
-    ways = [("points", False), ("points and markers", True)]
-    for panel, axis, across in ((panels[0], "points", POINTS), (panels[1], "frames", FRAMES)):
-        for place, (label, markers) in enumerate([*ways, ("markers alone", True)]):
-            alone = label == "markers alone"
-            sights = [
-                Sight(0 if alone else value, ALL, markers)
-                if axis == "points"
-                else Sight(0 if alone else FEW, value, markers)
-                for value in (across[:1] if alone and axis == "points" else across)
-            ]
-            boxes = {
-                n: np.concatenate([np.array(row["chamfer"], float) for row in crossed[sight]])
-                for n, sight in enumerate(sights)
-                if sight in crossed
-            }
-            if boxes:
-                drawn_boxes = panel.boxplot(
-                    list(boxes.values()),
-                    positions=[n + 0.25 * (place - 1) for n in boxes],
-                    widths=0.2,
-                    flierprops={"markersize": 2},
-                    manage_ticks=False,
-                )
-                for line in [line for lines in drawn_boxes.values() for line in lines]:
+
+    def boxes(panel: Any, across: Sequence[int], label: str, ways: Mapping[str, Sequence[Sight]]) -> None:
+        for place, (way, sights) in enumerate(ways.items()):
+            found = {n: np.concatenate(crossed[s].values("chamfer")) for n, s in enumerate(sights) if s in crossed}
+            if found:
+                where = {"positions": [n + 0.25 * (place - 1) for n in found], "widths": 0.2, "manage_ticks": False}
+                made = panel.boxplot(list(found.values()), flierprops={"markersize": 2}, **where)
+                for line in itertools.chain(*made.values()):
                     line.set_color(f"C{place}")
-                panel.plot([], [], color=f"C{place}", label=label)
+                panel.plot([], [], color=f"C{place}", label=way)
         panel.set_xticks(range(len(across)), [str(value) for value in across])
-        told = f"points a frame, {ALL} frames" if axis == "points" else f"frames, {FEW} points in each"
-        panel.set(xlabel=told, title="Chamfer distance (mm)", ylim=(0, None))
+        panel.set(xlabel=label, title="Chamfer distance (mm)", ylim=(0, None))
+
+    ways = {"points": False, "points and markers": True}
+    points = {way: [Sight(many, ALL, markers) for many in POINTS] for way, markers in ways.items()}
+    frames = {way: [Sight(FEW, many, markers) for many in FRAMES] for way, markers in ways.items()}
+    alone = [Sight(0, many, True) for many in FRAMES]
+    boxes(panels[0], POINTS, f"points a frame, {ALL} frames", {**points, "markers alone": [Sight(0, ALL, True)]})
+    boxes(panels[1], FRAMES, f"frames, {FEW} points in each", {**frames, "markers alone": alone})
     if panels[1].get_legend_handles_labels()[1]:
         panels[1].legend(fontsize=7, frameon=False)
     figure.savefig(file, dpi=110)
@@ -706,29 +582,26 @@ def main(
         out: where measurements are kept, under the name of each run.
         page: where the tables stand; they are printed where none is named.
         picture: of errors by time, and of completion.
-        parts: prediction, completion, grid, uncertainty, tuning.
+        parts: prediction, completion, uncertainty, tuning.
         budget: what it may cost.
     """
     torch.set_num_threads(1)
-    if unknown := set(parts) - set(PARTS):
-        sys.exit(f"no part {', '.join(sorted(unknown))}; parts are {', '.join(PARTS)}")
-    source = Source(data)
+    refuse_unknown("part", parts, PARTS)
     for seed, path in enumerate(runs):
-        here, run = out / path.name, Run(path, source, budget)
+        here, sup, all_of_it = out / path.name, out / f"{SUP}-{seed}", Held(path, data, budget)
         if "prediction" in parts:
-            kept(here / "prediction.json", run.prediction)
-            kept(out / f"{SUP}-{seed}" / "references.json", partial(run.references, seed, out / f"{SUP}-{seed}"))
-        sights = [sight for some in SIGHTS.values() for sight in some] if "completion" in parts else []
-        for sight in dict.fromkeys([*sights, *(GRID if "grid" in parts else [])]):
-            kept(here / f"{folder(sight)}.json", partial(run.completed, sight))
-        for sight in SURE if "uncertainty" in parts else []:
-            kept(here / f"{folder(f'sure of {sight}')}.json", partial(run.certain, sight, DEVIATIONS, DESCENT))
-    if tuned is not None:
-        run = Run(tuned, source, budget, grouped=True)
-        for name, choice in tried().items() if "tuning" in parts else ():
-            kept(out / TUNING / f"{folder(name)}.json", partial(run.certain, *choice))
-    found = sections(out)
-    write(page, *found, name=MARKS)
+            kept(here / "prediction.json", partial(prediction, all_of_it))
+            kept(sup / "references.json", partial(beside, all_of_it, seed, sup))
+        some = replace(all_of_it, some=True)
+        for sight in dict.fromkeys(itertools.chain(*SIGHTS.values())) if "completion" in parts else ():
+            kept(here / f"{folder(sight)}.json", partial(completed, some, sight))
+        for sight in SURE if "uncertainty" in parts else ():
+            kept(here / f"{folder(f'sure of {sight}')}.json", partial(certain, some, sight, DEVIATIONS, DESCENT))
+    if tuned is not None and "tuning" in parts:
+        held = Held(tuned, data, budget, some=True, grouped=True)
+        for name, choice in tried().items():
+            kept(out / TUNING / f"{folder(name)}.json", partial(certain, held, *choice))
+    write(page, *tables(out), name=MARKS)
     draw(out, picture)
 
 

@@ -7,12 +7,9 @@ chosen with `--part validation`, seed 0; `--part test` scores the runs of three 
 
 from __future__ import annotations
 
-import itertools
-import json
-import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,27 +19,21 @@ import tyro
 from torch import Tensor
 
 import dvae
-from dvae.inference.evaluation.estimates import Crossed, Estimate
-from dvae.inference.evaluation.evaluation import Row
+from dvae.data.sequences import each
 from dvae.inference.evaluation.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
-from dvae.inference.evaluation.uncertainty import decimals
-from dvae.options import tuples
-from dvae.runs.directory import Config
 from dvae.tables.dataset import PanelData
 from dvae.tables.domains import speech
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 
-from . import engine
-from .pages import DOCS, table, write
+from .engine import OURS, Row, cell, fitted, measure, read, scores_of, settings
+from .pages import DOCS, ordered, table, tabled, write
 
 FORECASTS = 100
-PARTS = ("validation", "test")
 BASELINE = "autoregressive"
 AT_ONCE, HELD = 2**14, 2**17
 """Steps of sequences, padding included, to score at once, and to hold times particles."""
 BOUND, ELBO, FIVO, SDR, KHAT = "importance bound", "ELBO", "FIVO", "SI-SDR", "k-hat"
-FORECAST = "forecasts.json"
 UNFILTERED = ("rvae-noncausal",)
 """Whose observations read latents after them, so that no filter can run."""
 REVIEW = {
@@ -60,24 +51,11 @@ SHOWN = ("CRPS", "energy score", "coverage 50 %", "coverage 80 %", "coverage 90 
 
 
 @dataclass(frozen=True)
-class Case:
-    """One model.
-
-    Args:
-        options: of the method that it is named after.
-        training: of the run, beside those of the section.
-    """
-
-    options: Mapping[str, Any] = field(default_factory=dict)
-    training: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Section:
     """What is compared on one domain.
 
     Args:
-        cases: method to model; the one without latents is among them.
+        cases: method to `options` of it and of its `training`; the one without latents is among them.
         training: of all runs.
         forecast: of which steps, from which.
         cut: of the sequences, for training and its validations; bounds are of whole sequences.
@@ -86,7 +64,7 @@ class Section:
         particles: of bounds.
     """
 
-    cases: Mapping[str, Case]
+    cases: Mapping[str, Mapping[str, Any]]
     training: Mapping[str, Any]
     forecast: Cut
     cut: Cut = field(default_factory=Cut)
@@ -95,19 +73,12 @@ class Section:
     particles: int = 100
 
 
-def sections(file: Path) -> dict[str, Section]:
-    """What is compared, by domain, from a file of TOML."""
-    found = {}
-    for name, told in tomllib.loads(file.read_text(encoding="utf-8")).items():
-        cases = {
-            case: Case(tuples(each["options"]), each.get("training", {})) for case, each in told.pop("cases").items()
-        }
-        cuts = {which: Cut(**told.pop(which)) for which in ("forecast", "cut") if which in told}
-        found[name] = Section(cases, **cuts, **told)
-    return found
+def section(told: Mapping[str, Any]) -> Section:
+    """What is compared on a domain, as the file has it."""
+    return Section(**{**told, **{name: Cut(**told[name]) for name in ("forecast", "cut") if name in told}})
 
 
-SECTIONS = sections(Path(__file__).with_suffix(".toml"))
+SECTIONS = {name: section(told) for name, told in settings(__file__).items()}
 
 
 @dataclass(frozen=True)
@@ -182,57 +153,34 @@ def pieces(batch: Mapping[str, Any]) -> Iterator[tuple[Tensor, dict[str, Any]]]:
 
 
 def measured(model: Any, case: str, data: Data, part: str, seed: int) -> dict[str, Any]:
-    """Scores of every sequence, bounds in nats of all of it, and how many steps it has."""
+    """Scores of every sequence: bounds in nats a step, and how speech sounds that is made from its latents."""
     windows, particles = data.whole.windows(part), SECTIONS[data.name].particles
     batch = windows.all()
     count, steps = len(batch["x"]), batch["x"].shape[1]
     lengths = batch.get("lengths", torch.full((count,), steps))
     names = [BOUND, ELBO, KHAT, *(f"KL {latent}" for latent in model.latents)]
+    names += [FIVO] if data.name != "speech" and case not in UNFILTERED and model.latents else []
     scores = {name: torch.zeros(count, dtype=torch.float64) for name in names}
-    if data.name == "speech":
-        scores[SDR] = torch.zeros(count, dtype=torch.float64)
-    elif case not in UNFILTERED and model.latents:
-        scores[FIVO] = torch.zeros(count, dtype=torch.float64)
+    sound, clips = np.zeros(count), [key[1] for key in windows.keys]
     torch.manual_seed(seed)
-    keys = windows.keys
     for rows, some in pieces(batch):
         bound = dvae.importance_bound(model, some, particles=particles, chunk=HELD // some["x"].shape[1])
         with torch.no_grad():
             terms = dvae.SequenceELBO(num_particles=10 if model.latents else 1).terms(model, some)
-        scores[BOUND][rows], scores[KHAT][rows] = bound.bound.double(), bound.khat.double()
-        scores[ELBO][rows] = terms.bound.double()
-        for latent in model.latents:
-            scores[f"KL {latent}"][rows] = terms.kl[latent].double()
+        found = {BOUND: bound.bound, KHAT: bound.khat, ELBO: terms.bound}
+        found |= {f"KL {latent}": terms.kl[latent] for latent in model.latents}
         if FIVO in scores:
-            scores[FIVO][rows] = dvae.particle_bound(model, some, particles, chunk=AT_ONCE).bound.double()
-        if SDR in scores:
+            found[FIVO] = dvae.particle_bound(model, some, particles, chunk=AT_ONCE).bound
+        for name, values in found.items():
+            scores[name][rows] = values.double() / (1 if name == KHAT else lengths[rows])
+        if data.name == "speech":
             made = model.reconstruct(some, samples=1)["x"][0].double().numpy()
             for row, own in zip(rows.tolist(), made, strict=True):
-                sound = data.sounds[keys[row][1]]
-                scores[SDR][row] = speech.si_sdr(sound, speech.resynthesised(own[: int(lengths[row])], sound))
-    return {
-        "steps": lengths.tolist(),
-        "clips": [key[1] for key in keys],
-        "scores": {name: own.tolist() for name, own in scores.items()},
-    }
-
-
-def fitted(section: Section, data: Data, case: str, seed: int, out: Path) -> Any:
-    """The model of a case, fitted if it is not there yet, and the seconds that this took."""
-    chosen, file = section.cases[case], out / "fitted.json"
-    if not file.exists():
-        options = {**section.training, **chosen.training}
-        method = dvae.method(case, **{"self_feeding": 0.0, **chosen.options})
-        training = dvae.Training(seed=seed, progress=False, **options)
-        torch.manual_seed(seed)
-        model = method.build(data.training.schema)
-        windows = data.training.windows("train")
-        source = Alike(windows) if "lengths" in windows.all() else windows
-        recipe = method.train(source, data.training.windows("validation"), training.steps)
-        kept = Config(method, data.training.schema, data.training.kind, data.training.recorded(), training).written()
-        seconds = engine.fitted(model, recipe, out=out, config=kept, seed=seed, **options)
-        file.write_text(json.dumps({"seconds": seconds}))
-    return dvae.load(out).model, json.loads(file.read_text())["seconds"]
+                truth = data.sounds[clips[row]]
+                sound[row] = speech.si_sdr(truth, speech.resynthesised(own[: int(lengths[row])], truth))
+    alike = {"clips": clips, "weights": [1] * count, "rows": {OURS: {SDR: sound.tolist()}}}
+    bounds = {"clips": clips, "weights": lengths.tolist(), "rows": {OURS: {n: s.tolist() for n, s in scores.items()}}}
+    return {"bounds": bounds, **({"sound": alike} if data.name == "speech" else {})}
 
 
 def shown(windows: Any) -> list[Measure]:
@@ -240,174 +188,106 @@ def shown(windows: Any) -> list[Measure]:
     return [CRPS, ENERGY, *map(coverage_at, LEVELS)]
 
 
-def forecasts(section: Section, case: str, seed: int, model: Any, data: Data) -> dvae.Evaluation:
-    """Of test windows; the references stand beside the first run of the model without latents."""
+def forecasts(case: str, seed: int, model: Any, data: Data) -> dict[str, Any]:
+    """Scores of test windows; the references stand beside the first run of the model without latents."""
+    section = SECTIONS[data.name]
     windows = data.cut(section.forecast).windows
-    return dvae.evaluate(
-        {case: model},
-        windows("test"),
-        scores=shown,
-        samples=FORECASTS,
-        seed=seed,
-        draw_emission=True,
-        references=case == BASELINE and seed == 0,
-        training_windows=windows("train"),
-        season=section.season,
-        progress=False,
-    )
+    told: dict[str, Any] = {"samples": FORECASTS, "seed": seed, "draw_emission": True, "progress": False}
+    told |= {"references": case == BASELINE and seed == 0, "season": section.season}
+    found = dvae.evaluate({OURS: model}, windows("test"), scores=shown, training_windows=windows("train"), **told)
+    return scores_of(found.clips, {name: row.clip_means for name, row in found.rows.items()})
 
 
-def run(name: str, case: str, seed: int, out: Path, data: Data, part: str) -> None:
-    """Fits and scores what is not there yet."""
-    file, section = out / f"{part}.json", SECTIONS[name]
-    if file.exists():
-        return
-    model, seconds = fitted(section, data, case, seed, out)
+def run(data: Data, part: str, case: str, seed: int, out: Path) -> dict[str, Any]:
+    """Fits and scores a case."""
+    section, opened = SECTIONS[data.name], data.training
+    chosen = section.cases[case]
+    method = dvae.method(case, **{"self_feeding": 0.0, **chosen["options"]})
+    training = {**section.training, **chosen.get("training", {})}
+    windows, validation = opened.windows("train"), opened.windows("validation")
+    source = Alike(windows) if "lengths" in windows.all() else windows
+    fit = fitted(method, opened, source, validation, out=out, seed=seed, **training)
+    model = fit.model.eval()
     weights = sum(parameter.numel() for parameter in model.parameters())
-    found = {"seconds": seconds, "parameters": weights, **measured(model, case, data, part, seed)}
-    if part == "test":
-        forecasts(section, case, seed, model, data).save(out / FORECAST)
-    file.write_text(json.dumps(found))
-    steps = sum(found["steps"])
-    said = ", ".join(f"{score} {np.nansum(found['scores'][score]) / steps:.3f}" for score in (BOUND, ELBO))
-    print(f"{out} {part}: {said}", flush=True)
+    found = {"seconds": fit.processor_seconds, "parameters": weights, **measured(model, case, data, part, seed)}
+    return found | ({"forecasts": forecasts(case, seed, model, data)} if part == "test" else {})
 
 
-@dataclass(frozen=True)
-class Read:
-    """Scores of one case over seeds.
-
-    Args:
-        runs: what `measured` found, and how long fits took.
-        forecasts: rows of evaluations, each of one run, and the windows of every sequence.
-    """
-
-    runs: list[dict[str, Any]]
-    forecasts: list[Row] = field(default_factory=list)
-    windows: np.ndarray = field(default_factory=lambda: np.zeros(0))
-
-    @classmethod
-    def of(cls, case: str, folders: Sequence[Path], part: str) -> Read:
-        """From the directories of its runs."""
-        runs = [json.loads((folder / f"{part}.json").read_text()) for folder in folders]
-        if part != "test":
-            return cls(runs)
-        evaluations = [dvae.Evaluation.load(folder / FORECAST) for folder in folders]
-        return cls(runs, [own.rows[case] for own in evaluations], np.array(list(evaluations[0].clips.values())))
-
-    @cached_property
-    def clips(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of every row the place of its sequence, which windows share, and the steps of every sequence."""
-        _, places = np.unique(self.runs[0]["clips"], return_inverse=True)
-        return places, np.bincount(places, self.runs[0]["steps"])
-
-    def crossed(self, score: str) -> Crossed:
-        """Of a score a step, by seeds and sequences; SI-SDR is of a sequence, and scores of forecasts of a window."""
-        if score in SHOWN:
-            return Crossed.of(np.array([row.clip_means[score] for row in self.forecasts]), self.windows)
-        places, steps = self.clips
-        values = np.array([run["scores"][score] for run in self.runs], float)
-        if score == SDR:
-            return Crossed.of(values, np.ones(values.shape[1]))
-        sums = np.stack([np.bincount(places, own) for own in values])
-        return Crossed.of(sums / steps, steps)
-
-    def said(self, score: str, other: Read | None = None) -> str:
-        """A score, or the paired difference to that of another case; "–" where there is none."""
-        if not all(score in (*own.runs[0]["scores"], *SHOWN) for own in (self, other or self)):
-            return "–"
-        return said(self.crossed(score).estimate(None if other is None else other.crossed(score)))
-
-    @property
-    def latents(self) -> list[str]:
-        """Names of the KL terms."""
-        return [score for score in self.runs[0]["scores"] if score.startswith("KL ")]
-
-    @property
-    def seconds(self) -> str:
-        """Of processor time, the mean fit."""
-        found = [run["seconds"] for run in self.runs if run["seconds"]]
-        return f"{np.mean(found):.0f}" if found else "–"
-
-    def unreliable(self) -> str:
-        """Share of sequences whose k-hat is above 0.7; few particles have none."""
-        khat = np.array([run["scores"][KHAT] for run in self.runs], float)
-        return f"{100 * float((khat > 0.7).mean()):.0f} %" if self.latents and np.isfinite(khat).all() else "–"
+def said(row: Row, part: str, score: str, other: Row | None = None) -> str:
+    """A score, or the paired difference to that of another case."""
+    return cell(row.of(part).estimate(score, None if other is None else other.of(part)))
 
 
-def said(estimate: Estimate) -> str:
-    """Mean, and its errors over sequences and over seeds, those that there are."""
-    errors = [error for error in (estimate.sequences, estimate.seeds) if not np.isnan(error)]
-    places = decimals(estimate.mean, *errors)
-    return " ± ".join(f"{value:.{places}f}" for value in (estimate.mean, *errors))
+def mean(row: Row, part: str, score: str) -> float:
+    """Of a score, by which rows stand in order."""
+    found = row.of(part).estimate(score)
+    assert found is not None
+    return found.mean
 
 
-def bounds(cases: Mapping[str, Read], section: Section) -> str:
+def latents(row: Row) -> list[str]:
+    """Names of the KL terms."""
+    return [score for score in row.runs[0]["bounds"]["rows"][OURS] if score.startswith("KL ")]
+
+
+def unreliable(row: Row) -> str:
+    """Share of sequences whose k-hat is above 0.7; few particles have none."""
+    khat = row.of("bounds").values(KHAT)
+    return f"{100 * float((khat > 0.7).mean()):.0f} %" if latents(row) and np.isfinite(khat).all() else "–"
+
+
+def bounds(cases: Mapping[str, Row], section: Section) -> str:
     """Cases down, best first, bounds across."""
-    order = sorted(cases, key=lambda name: -cases[name].crossed(BOUND).mean)
-    header = [
-        "",
-        f"nats a {section.unit}, K = {section.particles}",
-        f"minus {BASELINE}",
-        "ELBO",
-        FIVO,
-        "KL",
-        "k-hat > 0.7",
-    ]
-    header += ["weights", "s a fit"]
-    rows = []
-    for name in order:
-        case = cases[name]
-        less = "–" if name == BASELINE or BASELINE not in cases else case.said(BOUND, cases[BASELINE])
-        row = [name, case.said(BOUND), less, *(case.said(score) for score in (ELBO, FIVO))]
-        row += [", ".join(f"{case.crossed(score).mean:.2f}" for score in case.latents) or "–", case.unreliable()]
-        rows.append([*row, f"{case.runs[0]['parameters']:,}", case.seconds])
-    return table(header, rows)
+    baseline = cases.get(BASELINE)
+    columns: dict[str, Callable[[Row], str]] = {
+        f"nats a {section.unit}, K = {section.particles}": lambda row: said(row, "bounds", BOUND),
+        f"minus {BASELINE}": lambda row: "–" if baseline in (None, row) else said(row, "bounds", BOUND, baseline),
+        "ELBO": lambda row: said(row, "bounds", ELBO),
+        FIVO: lambda row: said(row, "bounds", FIVO),
+        "KL": lambda row: ", ".join(f"{mean(row, 'bounds', score):.2f}" for score in latents(row)) or "–",
+        "k-hat > 0.7": unreliable,
+        "weights": lambda row: f"{row.runs[0]['parameters']:,}",
+        "s a fit": lambda row: f"{np.mean([run['seconds'] for run in row.runs]):.0f}",
+    }
+    return tabled(ordered(cases, lambda row: -mean(row, "bounds", BOUND)), columns)
 
 
-def of_forecasts(cases: Mapping[str, Read], references: Mapping[str, Row]) -> str:
+def of_forecasts(cases: Mapping[str, Row]) -> str:
     """Cases and references down, the best CRPS first, scores of forecasts across; only draws have intervals."""
-    windows = next(iter(cases.values())).windows
-    found = {**cases, **{name: Read([{"scores": {}}], [row], windows) for name, row in references.items()}}
-    order = sorted(found, key=lambda name: found[name].crossed("CRPS").mean)
-    rows = []
-    for name in order:
-        there = [score for score in SHOWN if score in found[name].forecasts[0].clip_means]
-        rows.append([name, *(found[name].said(score) if score in there else "–" for score in SHOWN)])
-    return table(["", *SHOWN], rows)
+    first = [run for row in cases.values() for run in row.runs if len(run["forecasts"]["rows"]) > 1]
+    beside = {name: Row(first, name, trained=False) for run in first for name in run["forecasts"]["rows"]}
+    found = {**cases, **{name: row for name, row in beside.items() if name != OURS}}
+    columns = {score: partial(said, part="forecasts", score=score) for score in SHOWN}
+    return tabled(ordered(found, lambda row: mean(row, "forecasts", "CRPS")), columns)
 
 
-def sound(cases: Mapping[str, Read]) -> str:
+def sound(cases: Mapping[str, Row]) -> str:
     """Cases by how well their resynthesis sounds."""
-    order = sorted(cases, key=lambda name: -cases[name].crossed(SDR).mean)
-    rows = [[name, cases[name].said(SDR), f"{REVIEW[name]:.1f}"] for name in order if cases[name].latents]
-    return table(["", "SI-SDR, dB", "the review's, of other speech"], rows)
+    order = ordered(cases, lambda row: -mean(row, "sound", SDR))
+    lines = [[name, said(row, "sound", SDR), f"{REVIEW[name]:.1f}"] for name, row in order.items() if latents(row)]
+    return table(["", "SI-SDR, dB", "the review's, of other speech"], lines)
 
 
 def tables(runs: Path, part: str) -> list[str]:
     """Of what was scored on a part."""
     parts = []
     for name, section in SECTIONS.items():
-        found = {case: sorted((runs / name).glob(f"{case}-[0-9]*/{part}.json")) for case in section.cases}
-        cases = {case: Read.of(case, [file.parent for file in files], part) for case, files in found.items() if files}
+        cases = read(runs / name, section.cases, f"{part}.json")
         if not cases:
             continue
-        first = next(iter(cases.values()))
-        seconds = sum(run["seconds"] or 0 for case in cases.values() for run in case.runs)
-        parts += [f"### {name.capitalize()}, {part}\n"]
+        first, cut = next(iter(cases.values())).runs, section.forecast
+        own, minutes = first[0]["bounds"], sum(run["seconds"] for row in cases.values() for run in row.runs) / 60
         parts += [
-            f"{len(first.clips[1])} sequences, {sum(first.clips[1]):.0f} steps; {len(first.runs)} seeds; all fits took "
-            f"{seconds / 60:.0f} minutes of processor time.\n"
+            f"### {name.capitalize()}, {part}\n",
+            f"{len({*own['clips']})} sequences, {sum(own['weights'])} steps; {len(first)} seeds; all fits took "
+            f"{minutes:.0f} minutes of processor time.\n",
+            bounds(cases, section),
         ]
-        parts += [bounds(cases, section)]
-        if SDR in first.runs[0]["scores"]:
+        if "sound" in first[0]:
             parts += ["Resynthesis from the posterior:\n", sound(cases)]
-        if first.forecasts:
-            cut, told = section.forecast, runs / name / f"{BASELINE}-0" / FORECAST
-            rows = dvae.Evaluation.load(told).rows if told.exists() else {}
-            references = {name: row for name, row in rows.items() if name != BASELINE}
-            parts += [f"Forecasts of {cut.horizon} steps from {cut.observed}, {FORECASTS} draws:\n"]
-            parts += [of_forecasts(cases, references)]
+        if "forecasts" in first[0]:
+            made = f"Forecasts of {cut.horizon} steps from {cut.observed}, {FORECASTS} draws:\n"
+            parts += [made, of_forecasts(cases)]
     return parts
 
 
@@ -431,11 +311,8 @@ def main(
     """
     torch.set_num_threads(1)
     for name in domains:
-        data = Data(name)
-        for seed, case in itertools.product(seeds, cases or SECTIONS[name].cases):
-            run(name, case, seed, runs / name / f"{case}-{seed}", data, part)
-    found = tables(runs, part)
-    write(page, *found)
+        measure(runs / name, cases or SECTIONS[name].cases, seeds, partial(run, Data(name), part), f"{part}.json")
+    write(page, *tables(runs, part))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,54 @@
-"""What the studies share: names of directories, fits and measurements that are made once, and estimates in print."""
+"""What the studies share: settings, fits and measurements that are made once, and rows of seeds with their errors.
+
+A measurement is a dictionary, kept as JSON in the directory of its run. It, or each part of it that has a name, holds
+scores by row and sequence, the clip of each sequence, and its weight:
+
+    {"clips": ["walk 1", "walk 2"], "weights": [3, 1], "rows": {"ours": {"ADE": [0.31, 0.28]}}}
+
+A `Row` is one row of what several seeds measured; scripts say in a dictionary which columns a table of rows has.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
+import sys
 import time
-from collections.abc import Callable, Mapping
+import tomllib
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 import dvae
-from dvae.inference.evaluation.estimates import Estimate
+from dvae import files
+from dvae.inference.evaluation.estimates import Crossed, Estimate
 from dvae.inference.evaluation.record import plain
 from dvae.inference.training.checkpoints import Run
+from dvae.inference.training.fit import Fit
+from dvae.runs.directory import Config
+from dvae.runs.sweep import sweep
+
+OURS, MEASURED = "ours", "measured.json"
+
+
+def settings(script: str) -> dict[str, Any]:
+    """What a script says in the TOML file of its name, with tuples in place of lists."""
+
+    def fixed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: fixed(each) for name, each in value.items()}
+        return tuple(map(fixed, value)) if isinstance(value, list) else value
+
+    return {
+        name: fixed(each)
+        for name, each in tomllib.loads(Path(script).with_suffix(".toml").read_text(encoding="utf-8")).items()
+    }
 
 
 def folder(name: Any) -> str:
@@ -25,19 +60,178 @@ def kept(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]
     """What is in a file; or what `measure` returns, which is written to it with the seconds of processor time."""
     if not file.exists():
         begun = time.process_time()
-        found = {**measure(), "seconds": time.process_time() - begun}
+        found = measure()
+        spent = time.process_time() - begun
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(plain(found)))
-        print(f"{file}: {found['seconds']:.0f} s of processor time", flush=True)
+        file.write_text(json.dumps(plain({"seconds": spent, **found})))
+        print(f"{file}: {spent:.0f} s of processor time", flush=True)
     read: dict[str, Any] = json.loads(file.read_text())
     return read
 
 
-def fitted(model: Any, train: Any, *validation: Any, out: Path, **options: Any) -> float | None:
-    """Fit a model, or continue its run; return seconds of processor time, None of a run that was stopped before."""
-    begun, resumed = time.process_time(), Run(out).exists
-    dvae.fit(model, train, *validation, out=out, resume=resumed, progress=False, **options)
-    return None if resumed else time.process_time() - begun
+def measure(
+    path: Path, cases: Iterable[str], seeds: Iterable[int], run: Callable[[str, int, Path], Any], file: str = MEASURED
+) -> None:
+    """Fit and measure what is not there yet, seed by seed: `run` of a case, a seed and its directory."""
+    for seed, case in itertools.product(seeds, cases):
+        out = path / f"{folder(case)}-{seed}"
+        kept(out / file, partial(run, case, seed, out))
+
+
+def fitted(
+    method: Any, data: Any, train: Any, validation: Any = None, *, out: Path, seed: int, steps: int, **options: Any
+) -> Fit:
+    """Fit a method, or continue its run, which may have ended.
+
+    Args:
+        method: with its options.
+        data: what the run records.
+        train: windows, of these data or others that are drawn from them.
+        validation: windows by which the best weights are chosen; the last ones without.
+        out: directory of the run.
+        seed: of weights and batches.
+        steps: of training.
+        options: further ones of training, or of `dvae.fit`.
+    """
+    torch.manual_seed(seed)
+    model, recipe = method.build(data.schema), method.train(train, validation, steps)
+    config = Config(method, data.schema, data.kind, data.recorded(), dvae.Training()).written()
+    told = {"resume": Run(out).exists, "config": config, "seed": seed, "steps": steps, "progress": False}
+    return dvae.fit(model, recipe, out=out, **told, **options)
+
+
+def swept(
+    row: str, method: Any, data: Any, runs: Path, seeds: Sequence[int], training: Any, jobs: int = 1
+) -> list[Path]:
+    """The run directories of a method, by seed, each fitted once.
+
+    Raises:
+        RuntimeError: a run failed.
+    """
+    outcomes = sweep({folder(row): method}, data, runs, seeds, training, jobs)
+    for outcome in outcomes:
+        if outcome.status == "failed":
+            raise RuntimeError(str(outcome))
+    return [outcome.path for outcome in outcomes]
+
+
+def scores_of(clips: Mapping[str, float], rows: Mapping[str, Any]) -> dict[str, Any]:
+    """A measurement of scores by clip, and how many windows each clip has."""
+    return {"clips": [*clips], "weights": [*clips.values()], "rows": rows}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of measurements, one for each seed.
+
+    Args:
+        runs: the measurements.
+        name: of the row in them.
+        part: of them that has it; the whole without.
+        trained: whether seeds differ, as those of a reference do not.
+    """
+
+    runs: Sequence[Mapping[str, Any]]
+    name: str = OURS
+    part: str = ""
+    trained: bool = True
+
+    def of(self, part: str) -> Row:
+        """The same row of a part."""
+        return replace(self, part=part)
+
+    @property
+    def parts(self) -> list[Mapping[str, Any]]:
+        """Of each seed."""
+        return [run[self.part] if self.part else run for run in self.runs]
+
+    def values(self, score: str) -> np.ndarray | None:
+        """(S, N), by seed and sequence; None where a seed does not have the score."""
+        rows = [part["rows"].get(self.name, {}) for part in self.parts]
+        return np.array([row[score] for row in rows], float) if all(score in row for row in rows) else None
+
+    def by_seed(self, score: str) -> np.ndarray:
+        """(S,), means of a score that all have."""
+        return np.average(self.values(score), 1, self.parts[0]["weights"])
+
+    def crossed(self, score: str, minus: Row | None = None) -> Crossed | None:
+        """A score by seed and clip, or what it is more than that of the same runs in another row; None without one."""
+        values, others = self.values(score), 0.0 if minus is None else minus.values(score)
+        if values is None or others is None:
+            return None
+        values, first = values - others, self.parts[0]
+        there = ~np.isnan(values).any(0)
+        if not there.any():
+            return None
+        values, clips, weights = values[:, there], np.array(first["clips"])[there], np.array(first["weights"])[there]
+        order = {clip: place for place, clip in enumerate(dict.fromkeys(clips))}
+        if len(order) == len(clips):  # no sum that is divided again, so that equal seeds have no error
+            found = Crossed.of(values, weights)
+        else:
+            found = Crossed.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))
+        return found if self.trained else replace(found, seeds=0.0, rest=0.0, count=sys.maxsize)
+
+    def estimate(self, score: str, other: Row | None = None) -> Estimate | None:
+        """The mean, or its paired difference to another row of other runs; None where one does not have the score."""
+        own, theirs = self.crossed(score), None if other is None else other.crossed(score)
+        return None if own is None or (other is not None and theirs is None) else own.estimate(theirs)
+
+    def said(self, score: str, digits: int = 1) -> str:
+        """The mean with its errors over clips and over seeds."""
+        return said(self.estimate(score), digits)
+
+    def numbers(self, name: str) -> str:
+        """One number of each run; see `spread`."""
+        return spread([run.get(name) for run in self.runs])
+
+
+class Archive:
+    """Measurements by name, in one compressed file that is the same for the same ones."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    @property
+    def names(self) -> list[str]:
+        """Of what is in it, sorted; none before the first."""
+        if not self.file.exists():
+            return []
+        with zipfile.ZipFile(self.file) as opened:
+            return sorted(opened.namelist())
+
+    def read(self, names: Iterable[str]) -> list[dict[str, Any]]:
+        """Measurements, whose clips are stored with their windows."""
+        with zipfile.ZipFile(self.file) as opened:
+            found = [json.loads(opened.read(name)) for name in names]
+        return [each | {"clips": [*each["clips"]], "weights": [*each["clips"].values()]} for each in found]
+
+    def add(self, name: str, measurement: Mapping[str, Any]) -> None:
+        """Beside what there is; `clips` are of the form clip: windows."""
+        contents = {name: json.dumps(measurement, separators=(",", ":")).encode()}
+        if self.file.exists():
+            with zipfile.ZipFile(self.file) as opened:
+                contents = {name: opened.read(name) for name in opened.namelist()} | contents
+        with files.written(self.file) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as out:
+            for name in sorted(contents):
+                out.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_DEFLATED, 9)
+
+
+def read(path: Path, cases: Iterable[str], file: str = MEASURED) -> dict[str, Row]:
+    """Cases of which there are measurements, each of all its seeds."""
+    files = {case: sorted(path.glob(f"{folder(case)}-[0-9]*/{file}")) for case in cases}
+    return {case: Row([json.loads(each.read_text()) for each in found]) for case, found in files.items() if found}
+
+
+def read_all(path: Path, name: str) -> Row | None:
+    """What all runs measured under one name; None where none did."""
+    found = [json.loads(file.read_text()) for file in sorted(path.glob(f"*/{name}.json"))]
+    return Row(found) if found else None
+
+
+def budget(rows: Iterable[Row], steps: int) -> str:
+    """What the fits took, in a sentence."""
+    seconds = [run["seconds"] for row in rows for run in row.runs]
+    return f"{steps} steps of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
 
 
 def said(found: Estimate | None, digits: int = 1) -> str:
@@ -46,9 +240,23 @@ def said(found: Estimate | None, digits: int = 1) -> str:
     return " ± ".join("–" if np.isnan(value) else f"{value:.{digits}f}" for value in values) or "–"
 
 
+def cell(found: Estimate | None) -> str:
+    """The same with as many digits as the errors have, and without that over seeds of what is not trained."""
+    text = "–" if found is None else str(found)
+    return text.rpartition(" ± ")[0] if found is not None and not found.seeds else text
+
+
 def interval(found: Estimate | None, digits: int = 1, *, alone: bool = False) -> str:
     """The interval of 95 % from both errors, or, with `alone`, from that over clips where there is one seed."""
     if found is None or (np.isnan(found.total) and not alone):
         return "–"
     low, high = found.interval(error="sequences" if np.isnan(found.total) else "total")
     return "–" if np.isnan(low) else f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def spread(values: Sequence[float | None], digits: int = 2) -> str:
+    """The mean, and in brackets the least and the greatest; a dash where one is unknown."""
+    known = [value for value in values if value is not None]
+    if len(known) < len(values) or not known:
+        return "–"
+    return f"{np.mean(known):.{digits}f} ({min(known):.{digits}f}, {max(known):.{digits}f})"

@@ -3,54 +3,48 @@
 The page says how a comparison is made; several of other models on the same windows are joined.
 """
 
+from collections.abc import Callable
 from functools import reduce
 from pathlib import Path
 
 import tyro
 
 import dvae
-from dvae.inference.evaluation.estimates import Estimate
 
-from .pages import DOCS, table, write
+from .engine import said
+from .pages import DOCS, ordered, tabled, write
 
-
-def with_errors(estimate: Estimate, decimals: int) -> str:
-    """Mean ± over sequences ± over seeds."""
-    return " ± ".join(f"{v:.{decimals}f}" for v in (estimate.mean, estimate.sequences, estimate.seeds))
+DIGITS = {"ADE": 3, "FDE": 3, "MMADE": 3, "MMFDE": 3, "APD": 2, "energy score": 2}
+ARROWS = {"ADE": " ↓", "FDE": " ↓", "MMADE": " ↓", "MMFDE": " ↓", "energy score": " ↓"}
 
 
 def tables(comparison: dvae.Comparison) -> list[str]:
     """Teacher-forced scores in the order of the ranking, then free-running ones in that of the energy score."""
-    ranking = comparison.ranking
-    forced, free = [], []
-    for name in ranking:
-        row, scores = comparison.rows[name], comparison[name]
-        difference = comparison.difference(name, ranking[0])
-        latents = [
-            f"{latent} {scores[f'KL {latent}'].mean:.2f}, {row.active_units[latent].mean():.3g}"
-            for latent in row.latents
-        ]
-        forced.append(
-            [
-                name,
-                with_errors(scores["importance bound"], 2),
-                "–" if name == ranking[0] else with_errors(difference, 2),
-                f"{scores['ELBO'].mean:.2f}",
-                f"{100 * row.unreliable:.0f} %",
-                "; ".join(latents),
-            ]
+    best, *_ = ranking = comparison.ranking
+
+    def latents(name: str) -> str:
+        units, scores = comparison.rows[name].active_units, comparison[name]
+        return "; ".join(
+            f"{z} {scores[f'KL {z}'].mean:.2f}, {units[z].mean():.3g}" for z in comparison.rows[name].latents
         )
-    for name in sorted(ranking, key=lambda name: comparison[name]["energy score"].mean):
-        scores = comparison[name]
-        metrics = {"ADE": 3, "FDE": 3, "MMADE": 3, "MMFDE": 3, "APD": 2, "energy score": 2}
-        free.append([name, *(with_errors(scores[metric], decimals) for metric, decimals in metrics.items())])
-    bound = f"importance bound, K = {comparison.particles}"
-    latents = "KL in nats a frame, active units"
+
+    forced: dict[str, Callable[[str], str]] = {
+        f"importance bound, K = {comparison.particles}": lambda name: said(comparison[name]["importance bound"], 2),
+        "difference to the best": lambda name: said(None if name == best else comparison.difference(name, best), 2),
+        "ELBO": lambda name: f"{comparison[name]['ELBO'].mean:.2f}",
+        "k-hat > 0.7": lambda name: f"{100 * comparison.rows[name].unreliable:.0f} %",
+        "KL in nats a frame, active units": latents,
+    }
+    free = {
+        score + ARROWS.get(score, ""): lambda name, score=score, digits=digits: said(comparison[name][score], digits)
+        for score, digits in DIGITS.items()
+    }
+    order = ordered({name: name for name in ranking}, lambda name: comparison[name]["energy score"].mean)
     return [
         f"Teacher-forced, nats a frame ({len(comparison.keys)} windows):\n",
-        table(["", bound, "difference to the best", "ELBO", "k-hat > 0.7", latents], forced),
+        tabled({name: name for name in ranking}, forced),
         f"Free-running, {comparison.samples} forecasts a window, metres:\n",
-        table(["", "ADE ↓", "FDE ↓", "MMADE ↓", "MMFDE ↓", "APD", "energy score ↓"], free),
+        tabled(order, free),
     ]
 
 

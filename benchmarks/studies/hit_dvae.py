@@ -1,11 +1,12 @@
 """Writes the table of long forecasts of docs/results/hit_dvae.md, of a run fitted on poses."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 import tyro
 
-from .pages import DOCS, loaded, table, write
+from .pages import DOCS, loaded, tabled, write
 
 
 @torch.no_grad()
@@ -25,32 +26,22 @@ def long_run(path: Path, count: int, seconds: float) -> str:
     lengths, true = test.skeleton.bone_lengths(ours), test.skeleton.bone_lengths(real).mean(1)
     error = (lengths / true[:, None] - 1).abs()  # (S, B, T, bones)
     moving = real.diff(dim=1).norm(dim=-1).mean() * fps
-    rows = []
-    for end in range(fps, frames + 1, fps):
-        now = slice(end - fps, end)
-        speed = ours[:, :, now].diff(dim=2).norm(dim=-1).mean() * fps
-        bones = error[:, :, now].mean((0, 1, 2))
-        worst = test.skeleton.names[test.skeleton.edges[int(bones.argmax())][1]]
-        beyond = (error[:, :, now] > 0.1).float().mean()
-        rows.append(
-            [
-                f"{end // fps}",
-                f"{100 * bones.mean():.1f} %",
-                f"{100 * bones.max():.1f} % ({worst})",
-                f"{100 * beyond:.1f} %",
-                f"{speed:.3f}",
-                f"{speed / moving:.2f}",
-            ]
-        )
-    header = [
-        "second",
-        "bone-length error",
-        "worst bone",
-        "lengths off by > 10 %",
-        "joint speed, m/s",
-        "of real motion's",
-    ]
-    return table(header, rows)
+    spans = {str(second): slice((second - 1) * fps, second * fps) for second in range(1, frames // fps + 1)}
+    bones = {second: error[:, :, now].mean((0, 1, 2)) for second, now in spans.items()}
+    speeds = {second: ours[:, :, now].diff(dim=2).norm(dim=-1).mean() * fps for second, now in spans.items()}
+
+    def worst(second: str) -> str:
+        name = test.skeleton.names[test.skeleton.edges[int(bones[second].argmax())][1]]
+        return f"{100 * bones[second].max():.1f} % ({name})"
+
+    columns: dict[str, Callable[[str], str]] = {
+        "bone-length error": lambda second: f"{100 * bones[second].mean():.1f} %",
+        "worst bone": worst,
+        "lengths off by > 10 %": lambda second: f"{100 * (error[:, :, spans[second]] > 0.1).float().mean():.1f} %",
+        "joint speed, m/s": lambda second: f"{speeds[second]:.3f}",
+        "of real motion's": lambda second: f"{speeds[second] / moving:.2f}",
+    }
+    return tabled({second: second for second in spans}, columns, "second")
 
 
 def main(

@@ -7,9 +7,8 @@ the runs of three seeds.
 
 from __future__ import annotations
 
-import itertools
-import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,14 +20,12 @@ import dvae
 from dvae import distributions
 from dvae.data.sequences import gaps
 from dvae.data.units import Coordinate
-from dvae.inference.evaluation.estimates import Crossed
-from dvae.inference.training.checkpoints import load_weights
+from dvae.inference.training.checkpoints import Run
 from dvae.networks import Dense, LinearSDE, LinearSDEGuide, Recurrent
 from dvae.networks.base import share_modules
 from dvae.tables.domains import domain
 
-from . import engine
-from .domains import said
+from .engine import OURS, cell, measure, read
 from .pages import DOCS, table, write
 
 PARTICLES = 100
@@ -41,12 +38,7 @@ STEPS = {8: 1000, 16: 1500}
 SIZE: dict[str, Any] = {"width": 64, "decoder": (64,)}
 TIMES = (1.0, 30.0)
 """Frames, over which the prior forgets."""
-TRAINING: dict[str, Any] = {
-    "batch_size": 64,
-    "learning_rate": 3e-3,
-    "decay": 0.2,
-    "validate_every": 50,
-}
+TRAINING: dict[str, Any] = {"batch_size": 64, "learning_rate": 3e-3, "decay": 0.2, "validate_every": 50}
 
 Utterances = Sequence[np.ndarray]
 
@@ -99,34 +91,20 @@ def built(train: Mapping[str, torch.Tensor], latent: int) -> dvae.DynamicalVAE:
     return model
 
 
-def run(fitted_on: str, latent: int, seed: int, out: Path, part: str) -> None:
-    """Fits and scores what is not there yet."""
-    file = out / f"{part}.json"
-    if file.exists():
-        return
+def run(latent: int, part: str, fitted_on: str, seed: int, out: Path) -> dict[str, Any]:
+    """Fits and scores a model."""
     train, validation = (batch_of(utterances(each), KEPT[fitted_on], seed) for each in ("train", "validation"))
     torch.manual_seed(seed)
-    model = built(train, latent)
-    if (out / "fitted.json").exists():
-        load_weights(model, out)
-        seconds = json.loads((out / "fitted.json").read_text())["seconds"]
-    else:
-        how = {"steps": STEPS[latent], "seed": seed, **TRAINING}
-        seconds = engine.fitted(model, train, validation, out=out, **how)
-        (out / "fitted.json").write_text(json.dumps({"seconds": seconds}))
-    found: dict[str, Any] = {"seconds": seconds}
+    model, how = built(train, latent), {"steps": STEPS[latent], "seed": seed, "resume": Run(out).exists, **TRAINING}
+    fit = dvae.fit(model, train, validation, out=out, progress=False, **how)
     torch.manual_seed(seed)
+    found: dict[str, Any] = {"seconds": fit.processor_seconds}
     for judged_on, share in KEPT.items():
         batch = batch_of(utterances(part), share, JUDGED)
-        bound = dvae.particle_bound(model, batch, particles=PARTICLES).bound.double()
-        found[judged_on] = {"steps": batch["lengths"].tolist(), "scores": (bound / batch["lengths"]).tolist()}
-    file.write_text(json.dumps(found))
-    print(f"{out} {part}: {', '.join(f'{name} {mean(found[name]):.3f}' for name in KEPT)}", flush=True)
-
-
-def mean(scores: Mapping[str, Any]) -> float:
-    """A frame."""
-    return float(np.average(scores["scores"], weights=scores["steps"]))
+        bound = dvae.particle_bound(model, batch, particles=PARTICLES).bound.double() / batch["lengths"]
+        weights, rows = batch["lengths"].tolist(), {OURS: {"bound": bound.tolist()}}
+        found[judged_on] = {"clips": [*range(len(weights))], "weights": weights, "rows": rows}
+    return found
 
 
 def apart(part: str) -> dict[str, float]:
@@ -139,39 +117,21 @@ def apart(part: str) -> dict[str, float]:
     }
 
 
-def tabled(runs: Path, part: str) -> str:
+def tables(runs: Path, part: str) -> str:
     """What was scored on a part, and what dropping frames from training costs."""
-    found = {
-        name: [json.loads(f.read_text()) for f in sorted(runs.glob(f"{name}-[0-9]*/{part}.json"))] for name in KEPT
-    }
-    lines, crossed = [], {}
-    for fitted_on, read in found.items():
-        for judged_on in KEPT if read else ():
-            scores = np.array([each[judged_on]["scores"] for each in read])
-            crossed[fitted_on, judged_on] = Crossed.of(scores, np.array(read[0][judged_on]["steps"], float))
-    free = apart(part)
+    found, free, lines = read(runs, KEPT, f"{part}.json"), apart(part), []
     for judged_on in KEPT:
-        for fitted_on in KEPT:
-            if (fitted_on, judged_on) not in crossed:
-                continue
-            own, whole = crossed[fitted_on, judged_on], crossed.get(("whole", judged_on))
-            line = [f"{fitted_on}, judged on {judged_on}", said(own.estimate())]
-            if fitted_on == "whole" or whole is None:
-                line += ["–"] * 3
-            else:
-                less = own.estimate(whole)
-                line += [said(less), f"{100 * less.mean / abs(whole.mean):.1f} %"]
-                line += [f"{100 * less.mean / (whole.mean - free[judged_on]):.1f} %"]
-            lines.append(line)
+        rows = {fitted_on: row.of(judged_on) for fitted_on, row in found.items()}
+        for fitted_on, row in rows.items():
+            line, costs = [f"{fitted_on}, judged on {judged_on}", cell(row.estimate("bound"))], ["–"] * 3
+            if fitted_on != "whole" and "whole" in rows:
+                less, whole = row.estimate("bound", rows["whole"]), rows["whole"].estimate("bound").mean
+                shares = less.mean / abs(whole), less.mean / (whole - free[judged_on])
+                costs = [cell(less), *(f"{100 * share:.1f} %" for share in shares)]
+            lines.append([*line, *costs])
         lines.append([f"frames apart, judged on {judged_on}", f"{free[judged_on]:.3f}", "–", "–", "–"])
-    header = [
-        f"fitted on …, {part}",
-        "nats a frame",
-        "minus fitted on whole",
-        "of its bound",
-        "of its gain over frames apart",
-    ]
-    return table(header, lines)
+    header = [f"fitted on …, {part}", "nats a frame", "minus fitted on whole"]
+    return table([*header, "of its bound", "of its gain over frames apart"], lines)
 
 
 def main(
@@ -191,13 +151,11 @@ def main(
         latents: sizes of their latent.
     """
     torch.set_num_threads(1)
-    for latent, seed, fitted_on in itertools.product(latents, seeds, KEPT):
-        run(fitted_on, latent, seed, runs / str(latent) / f"{fitted_on}-{seed}", part)
-    found = []
-    for latent in STEPS:
-        if (runs / str(latent)).exists():
-            found += [f"Latent of {latent} numbers, {STEPS[latent]} steps:\n", tabled(runs / str(latent), part)]
-    write(page, *found)
+    for latent in latents:
+        measure(runs / str(latent), KEPT, seeds, partial(run, latent, part), f"{part}.json")
+    found = {latent: runs / str(latent) for latent in STEPS if (runs / str(latent)).exists()}
+    heads = {latent: f"Latent of {latent} numbers, {STEPS[latent]} steps:\n" for latent in found}
+    write(page, *(each for latent, own in found.items() for each in (heads[latent], tables(own, part))))
 
 
 if __name__ == "__main__":

@@ -7,10 +7,9 @@ is there, and two of it may work on other cases or seeds at once. Tables and pic
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cache
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +19,15 @@ import tyro
 
 import dvae
 from dvae import motion
-from dvae.inference.evaluation.estimates import Crossed, Estimate
-from dvae.inference.evaluation.held import clip_places
-from dvae.inference.evaluation.record import plain
+from dvae.data.sequences import each
 from dvae.inference.evaluation.result import canvas
-from dvae.inference.evaluation.scores import clip_means
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
-from dvae.runs.directory import Config
 
-from .engine import fitted, folder, interval, said
-from .pages import DOCS, table, write
+from .engine import OURS, Row, budget, fitted, folder, interval, measure, read, settings
+from .pages import DOCS, tabled, write
 
 TUNING, HELD = "tuning", "held out"
 SAME, OTHER = "same source", "other source"
@@ -42,40 +37,10 @@ TRAINING: dict[str, Any] = {"batch_size": 64, "validate_every": 250}
 PAIRS, STEPS = 200, 9
 """Of walks and runs that are interpolated, and the steps of each, both ends included."""
 FALLS = ("falls", "falls where the run is shorter")
-OURS, MEASURED = "ours", "measured.json"
 ERROR, DURATION = "vertex error", "duration error"
-
-
-@dataclass(frozen=True)
-class Case:
-    """One way to make a latent space.
-
-    Args:
-        method: options of motion-latent.
-        data: of segments.
-    """
-
-    method: Mapping[str, Any] = field(default_factory=dict)
-    data: Mapping[str, Any] = field(default_factory=dict)
-
-
 FULL, FIRST, SHAPED = "both phases", "first phase alone", "guide with beta"
-NAMED = {FULL: Case(), FIRST: Case({"finish": 0.0}), SHAPED: Case({"shaped": True})}
-WAYS = {
-    "second phase alone": Case({"finish": 1.0}),
-    "weights of 1": Case({"pace": 0.0}),
-    "turns scaled": Case(data={"scaling": "deviation"}),
-    "time warped": Case(data={"warped": True}),
-    "own bodies": Case(data={"bodies": 0.0}),
-    "two layers": Case({"widths": (512, 256)}),
-    "three layers": Case({"widths": (1024, 512, 256)}),
-}
-SIZES = {f"z of {size}": Case({"latent": size}) for size in (16, 32, 128)}
-WEIGHTS = {f"KL {weight:g}": Case({"kl": weight}) for weight in (0.001, 0.1, 1.0)}
-SECTIONS = {TUNING: NAMED | WAYS | SIZES | WEIGHTS, HELD: NAMED}
-SWEPT = {"numbers of z": {16: "z of 16", 32: "z of 32", 64: FULL, 128: "z of 128"}}
-SWEPT["weight of the KL"] = {0.001: "KL 0.001", 0.01: FULL, 0.1: "KL 0.1", 1: "KL 1"}
-"""What figure 3 of the paper varies, and the cases that have it."""
+CASES = settings(__file__)
+SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD: CASES["named"]}
 
 
 @cache
@@ -94,18 +59,13 @@ def elsewhere(file: Path, timed: motion.TimedFrames) -> Segments:
 
 
 def measured(model: Any, tests: Mapping[str, Segments], training: Segments, seed: int) -> dict[str, Any]:
-    """Scores of a model by test set, row and take; and how walks become runs."""
+    """Scores of a model by test set, row and segment; and how walks become runs."""
     found: dict[str, Any] = {}
     for name, test in tests.items():
         scored = reconstruct_segments({OURS: model}, test, training, bound_particles=20, seed=seed, progress=False)
-        places = clip_places([(split, take, 0) for split, _, take in scored.segments])
-        rows = {
-            row: {score: clip_means(torch.from_numpy(values), places) for score, values in scores.items()}
-            for row, scores in scored.rows.items()
-        }
-        errors = {row: scores[ERROR] for row, scores in scored.rows.items()}
-        found[name] = {"rows": rows, "takes": places.bincount().tolist(), "errors": errors}
-    return {"scores": found, "interpolation": interpolated(model, next(iter(tests.values())), seed)}
+        takes = [f"{split}/{take}" for split, _, take in scored.segments]
+        found[name] = {"clips": takes, "weights": [1] * len(takes), "rows": scored.rows}
+    return {"tests": [*tests], **found, "interpolation": interpolated(model, next(iter(tests.values())), seed)}
 
 
 def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
@@ -128,103 +88,77 @@ def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
     }
 
 
-def run(section: str, case: str, seed: int, out: Path, file: Path, other: Path | None, steps: int) -> None:
-    """Fits and measures what is not there yet."""
-    if (out / MEASURED).exists():
-        return
-    chosen = SECTIONS[section][case]
-    data = segments(section, file, **chosen.data)
-    method = dvae.method("motion-latent", **chosen.method)
-    training = dvae.Training(steps=steps, seed=seed, progress=False, **TRAINING)
-    config = Config(method, data.schema, data.kind, data.recorded(), training).written()
-    torch.manual_seed(seed)
-    model = method.build(data.schema)
-    recipe = method.train(data.windows("train"), data.windows("validation"), steps)
-    seconds = fitted(model, recipe, out=out, config=config, steps=steps, seed=seed, **TRAINING)
+def run(section: str, file: Path, other: Path | None, steps: int, case: str, seed: int, out: Path) -> dict[str, Any]:
+    """Fits and measures a case."""
+    options = SECTIONS[section][case]
+    data = segments(section, file, **options.get("data", {}))
+    train, method = data.windows("train"), dvae.method("motion-latent", **options.get("method", {}))
+    fit = fitted(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **TRAINING)
     tests = {SAME: data.windows("test")}
     if other is not None and section == HELD:
         tests[OTHER] = elsewhere(other, data.timed)
-    found = measured(model.eval(), tests, data.windows("train"), seed)
-    (out / MEASURED).write_text(json.dumps(plain({"seconds": seconds, "steps": steps, **found})))
-    print(f"{out}: measured", flush=True)
+    found = measured(fit.model.eval(), tests, train, seed)
+    return {"seconds": fit.processor_seconds, "steps": steps, **found}
 
 
-@dataclass(frozen=True)
-class Read:
-    """The runs of one case over seeds, or what principal components score beside them."""
-
-    runs: list[dict[str, Any]]
-    row: str = OURS
-
-    @classmethod
-    def all(cls, path: Path, cases: Iterable[str]) -> dict[str, Read]:
-        """Those that are there, by name, and what is linear beside the first of one size."""
-        found: dict[str, Read] = {}
-        linear: dict[str, Read] = {}
-        for case in cases:
-            files = sorted(path.glob(f"{folder(case)}-[0-9]*/{MEASURED}"))
-            if files:
-                found[case] = cls([json.loads(file.read_text()) for file in files])
-                (row,) = found[case].scores(SAME)["rows"].keys() - {OURS}
-                linear.setdefault(row, cls(found[case].runs, row))
-        return found | linear
-
-    def scores(self, test: str) -> dict[str, Any]:
-        """Of the first seed."""
-        found: dict[str, Any] = self.runs[0]["scores"][test]
-        return found
-
-    def crossed(self, test: str, score: str) -> Crossed:
-        """By seeds and takes."""
-        means = np.array([run["scores"][test]["rows"][self.row][score] for run in self.runs])
-        return Crossed.of(means, np.array(self.scores(test)["takes"]))
-
-    def estimate(self, test: str, score: str) -> Estimate | None:
-        """Mean over segments and seeds, with errors over takes and seeds; nothing of what it does not have."""
-        return self.crossed(test, score).estimate() if score in self.scores(test)["rows"][self.row] else None
-
-    def said(self, test: str, score: str, digits: int = 1) -> str:
-        """Mean, and its errors over takes and over seeds."""
-        return said(self.estimate(test, score), digits)
-
-    def errors(self, test: str) -> np.ndarray:
-        """Vertex errors of all segments and seeds, in millimetres."""
-        return np.concatenate([run["scores"][test]["errors"][self.row] for run in self.runs])
-
-    def falling(self, name: str) -> str:
-        """Share of pairs whose durations fall at each step, of each seed."""
-        return ", ".join(f"{run['interpolation'][name]:.2f}" for run in self.runs) if self.row == OURS else "–"
+def rows_of(path: Path, section: str) -> dict[str, Row]:
+    """Cases that are there, and behind them what is linear beside the first of one size."""
+    found, linear = read(path, SECTIONS[section]), dict[str, Row]()
+    for row in found.values():
+        (name,) = row.runs[0][SAME]["rows"].keys() - {OURS}
+        linear.setdefault(name, replace(row, name=name))
+    return found | linear
 
 
-def scored(cases: Mapping[str, Read], test: str) -> str:
-    """Cases down, scores across; walks and runs are of the first test set alone."""
-    falls = FALLS if test == SAME else ()
-    header = ["", "vertex error (mm)", "95 %", "median (mm)", "duration error (ms)", "ELBO (nats/frame)", *falls]
-    lines = []
-    for name, case in cases.items():
-        found = case.estimate(test, ERROR)
-        median = f"{np.median(case.errors(test)):.1f}"
-        lines.append([name, case.said(test, ERROR), interval(found), median, case.said(test, DURATION)])
-        lines[-1] += [case.said(test, "ELBO"), *map(case.falling, falls)]
-    return table(header, lines)
+def errors(row: Row) -> np.ndarray:
+    """Vertex errors of all segments and seeds, in millimetres."""
+    return np.concatenate(row.values(ERROR))
 
 
-def against(cases: Mapping[str, Read], test: str) -> str:
+def falling(name: str, row: Row) -> str:
+    """Share of pairs whose durations fall at each step, of each seed."""
+    return ", ".join(f"{run['interpolation'][name]:.2f}" for run in row.runs) if row.name == OURS else "–"
+
+
+SCORED: dict[str, Callable[[Row], str]] = {
+    "vertex error (mm)": lambda row: row.said(ERROR),
+    "95 %": lambda row: interval(row.estimate(ERROR)),
+    "median (mm)": lambda row: f"{np.median(errors(row)):.1f}",
+    "duration error (ms)": lambda row: row.said(DURATION),
+    "ELBO (nats/frame)": lambda row: row.said("ELBO"),
+}
+INTERPOLATED = {name: partial(falling, name) for name in FALLS}
+
+
+def against(cases: Mapping[str, Row]) -> str:
     """Paired differences of vertex errors that should be below zero, with their intervals."""
-    linear = next(name for name in cases if cases[name].row != OURS)
-    lines = []
-    for first, second in ((FULL, FIRST), (FULL, linear), (FIRST, linear), (SHAPED, FULL)):
-        if {first, second} <= cases.keys():
-            estimate = cases[first].crossed(test, ERROR).estimate(cases[second].crossed(test, ERROR))
-            lines.append([f"{first} minus {second}", f"{estimate.mean:.1f}", interval(estimate)])
-    return table(["", "vertex error (mm)", "95 %"], lines)
+    linear = next(name for name in cases if cases[name].name != OURS)
+    pairs = ((FULL, FIRST), (FULL, linear), (FIRST, linear), (SHAPED, FULL))
+    found = {
+        f"{first} minus {second}": cases[first].estimate(ERROR, cases[second])
+        for first, second in pairs
+        if {first, second} <= cases.keys()
+    }
+    return tabled(found, {"vertex error (mm)": lambda each: f"{each.mean:.1f}", "95 %": interval})
 
 
-def draw(held: Mapping[str, Read], tuned: Mapping[str, Read], file: Path) -> None:
+def tables(section: str, cases: Mapping[str, Row]) -> list[str]:
+    """Of a section: what was done, and two tables for each test set; walks and runs are of the first one alone."""
+    first, parts = next(iter(cases.values())).runs[0], []
+    for test in first["tests"]:
+        takes, own = first[test]["clips"], {name: row.of(test) for name, row in cases.items()}
+        spent = budget(cases.values(), first["steps"])
+        done = f"{len(takes)} segments of {len({*takes})} takes. {spent}\n"
+        scored = tabled(own, SCORED | (INTERPOLATED if test == SAME else {}))
+        parts += [f"## {section.capitalize()}, {test}\n", done, scored, against(own)]
+    return parts
+
+
+def draw(held: Mapping[str, Row], tuned: Mapping[str, Row], file: Path) -> None:
     """Boxes by Tukey of both test sets and of what is varied; and how long steps from walks to runs last."""
-    tests = list(next(iter(held.values())).runs[0]["scores"]) if held else []
-    figure = canvas(3.2 * (len(tests) + len(SWEPT) + 1), 3.4)
-    panels = iter(figure.subplots(1, len(tests) + len(SWEPT) + 1))
+    tests, swept = next(iter(held.values())).runs[0]["tests"] if held else [], CASES["swept"]
+    figure = canvas(3.2 * (len(tests) + len(swept) + 1), 3.4)
+    panels = iter(figure.subplots(1, len(tests) + len(swept) + 1))
 
     def boxes(title: str, rows: Mapping[str, np.ndarray]) -> None:
         panel = next(panels)
@@ -235,10 +169,10 @@ def draw(held: Mapping[str, Read], tuned: Mapping[str, Read], file: Path) -> Non
         panel.grid(axis="y", alpha=0.3)
 
     for test in tests:
-        rows = {name.replace(" ", "\n"): case.errors(test) for name, case in held.items() if name != SHAPED}
+        rows = {name.replace(" ", "\n"): errors(row.of(test)) for name, row in held.items() if name != SHAPED}
         boxes(f"{test}: vertex error (mm)", rows)
-    for title, names in SWEPT.items():
-        there = {str(value): tuned[name].errors(SAME) for value, name in names.items() if name in tuned}
+    for title, names in swept.items():
+        there = {value: errors(tuned[name].of(SAME)) for value, name in names.items() if name in tuned}
         boxes(f"{title}, {TUNING} (mm)", there)
     panel = next(panels)
     for number, run in enumerate(held[FULL].runs if FULL in held else []):
@@ -274,20 +208,10 @@ def main(
         steps: of training.
     """
     torch.set_num_threads(1)
-    for seed, section in itertools.product(seeds, sections if data else ()):
-        for case in cases or SECTIONS[section]:
-            run(section, case, seed, runs / folder(section) / f"{folder(case)}-{seed}", data, other, steps)
-    there = {name: Read.all(runs / folder(name), cases) for name, cases in SECTIONS.items()}
-    parts = []
-    for name, read in ((name, read) for name, read in there.items() if read):
-        first = next(iter(read.values())).runs[0]
-        seconds = [run["seconds"] or np.nan for case in read.values() for run in case.runs]
-        for test, found in first["scores"].items():
-            count, takes = sum(found["takes"]), len(found["takes"])
-            said = f"{count} segments of {takes} takes. {first['steps']} steps of training, {np.nanmin(seconds):.0f} "
-            said += f"to {np.nanmax(seconds):.0f} s of processor time."
-            parts += [f"## {name.capitalize()}, {test}\n", f"{said}\n", scored(read, test), against(read, test)]
-    write(page, *parts)
+    for section in sections if data else ():
+        measure(runs / folder(section), cases or SECTIONS[section], seeds, partial(run, section, data, other, steps))
+    there = {name: rows_of(runs / folder(name), name) for name in SECTIONS}
+    write(page, *itertools.chain(*(tables(name, rows) for name, rows in there.items() if rows)))
     draw(there[HELD], there[TUNING], picture)
 
 

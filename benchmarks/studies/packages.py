@@ -71,12 +71,9 @@ def imports() -> nx.DiGraph:
 
 def storeys(graph: nx.DiGraph) -> list[list[str]]:
     """Packages from the ground up, each on the lowest floor that is above all that it imports; circles share one."""
-    floors: dict[str, int] = {}
     circles = nx.condensation(graph)
-    for circle in reversed(list(nx.topological_sort(circles))):
-        below = (floors[name] for each in circles.successors(circle) for name in circles.nodes[each]["members"])
-        floors |= dict.fromkeys(circles.nodes[circle]["members"], 1 + max(below, default=-1))
-    return [sorted(name for name in floors if floors[name] == floor) for floor in range(1 + max(floors.values()))]
+    floors = nx.topological_generations(circles.reverse())
+    return [sorted(name for circle in floor for name in circles.nodes[circle]["members"]) for floor in floors]
 
 
 def draw(graph: nx.DiGraph, ax: Axes) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,26 @@ DOCS = Path(__file__).parents[2] / "docs"
 BEGIN, END = "<!-- tables -->\n", "<!-- end of tables -->\n"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, numbers to the right."""
-    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], rule: str = "") -> str:
+    """A Markdown table, numbers to the right, or by another rule below its head."""
+    head, *lines = [f"| {' | '.join(line)} |" for line in (header, *rows)]
+    head = head.replace("|  |", "| |") if rule else head
+    return "\n".join([head, rule or f"| --- |{' ---: |' * (len(header) - 1)}", *lines]) + "\n"
+
+
+def words(*header: str, rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table of words, to the left."""
+    return table(header, rows, "|---" * len(header) + "|")
+
+
+def tabled(rows: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]], head: str = "") -> str:
+    """A table of rows by their names, and of columns by what they say of a row."""
+    return table([head, *columns], [[name, *(cell(row) for cell in columns.values())] for name, row in rows.items()])
+
+
+def ordered(rows: Mapping[str, Any], key: Callable[[Any], float]) -> dict[str, Any]:
+    """Rows in the order of a number of theirs, the least first."""
+    return dict(sorted(rows.items(), key=lambda item: key(item[1])))
 
 
 def code(text: str) -> str:

@@ -13,10 +13,10 @@ list of predictors that GSPS's has, on Human3.6M).
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,36 +25,29 @@ from matplotlib.figure import Figure
 
 from dvae.inference.evaluation.result import canvas
 
+from .engine import Row, cell, settings
 from .pages import DOCS, refuse_unknown, table, write
 from .ranking import (
     FUTURES,
-    GROUPED,
     JOINTS,
     LEVEL,
     NEIGHBOURS,
-    PARTED,
     PATHS,
     SCORES,
     TRAINED,
     Accelerator,
-    Entry,
     View,
-    cell,
     entries,
     titled,
     trained,
     work,
 )
 
-ERRORS = ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "FDEm", "MMADEm", "MMFDEm")
-REAL = ("APDE", "CMD", "limb stretch", "limb jitter", "pose NLL")
-
 
 def published() -> dict[str, dict[str, dict[str, str]]]:
     """Tables of the papers by name: rows by their names, cells by columns."""
-    told = tomllib.loads(Path(__file__).with_name("published.toml").read_text(encoding="utf-8"))
     found: dict[str, dict[str, dict[str, str]]] = {}
-    for name, printed in told.items():
+    for name, printed in settings(str(Path(__file__).with_name("published"))).items():
         lines = (line.split("|") for line in printed["rows"].splitlines())
         columns = printed["columns"].split(",")
         found[name] = {row.strip(): dict(zip(columns, cells.split(), strict=True)) for row, cells in lines}
@@ -118,151 +111,25 @@ class Paper:
         return list(dict.fromkeys([*self.views, *(view for each in self.further for view in each.views_of(row))]))
 
 
-HIT, COPYING = "hit-dvae", {"nearest": False, "residual": 0.0}
-SHORT: dict[str, dict[str, dict[str, Any]]] = {
-    "hit-dvae": {"1,200 steps": {"method": "hit-dvae", "steps": 1200}},
-    "gsps": {"3,000 steps": {"method": "gsps", "steps": 3000}},
-    "trajevae": {"6,000 steps": {"method": "trajevae", "steps": 6000}},
-}
-"""What ablations are beside: as long as what was tuned."""
-WITHOUT: dict[str, dict[str, Any]] = {
-    "no scheduled sampling": {"self_feeding": 0.0},
-    "no attention": {"attention": False},
-    "no w": {"static": 0},
-    "neither": {"attention": False, "static": 0},
-    "no copies": COPYING,
-    "no copies, no attention": {**COPYING, "attention": False},
-    "observed frames fed": {"feed_observed": True},
-    "KL weights read literally": {"kl_local": 0.0067, "kl_static": 0.1},
-}
-"""Ablations of HiT-DVAE: the paper's, then ours."""
-TERMS: dict[str, dict[str, Any]] = {
-    "no pose prior": {"pose_prior": 0.0},
-    "no angles": {"angles": 0.0},
-    "no diversity": {"diversity": (0.0,)},
-    "no reconstruction": {"reconstruction": 0.0},
-    "no multimodal": {"multimodal": 0.0},
-    "diversity 2 and 4": {"diversity": (2.0, 4.0)},
-    "20 coefficients": {"coefficients": 20},
-}
-"""Of GSPS's loss, each left out by itself; and what else was asked."""
-BASELINES = ("erd", "aclstm", "pose-knows", "mt-vae", "rhp", "bom", "bom-parts", "gmvae", "dsf", "dlow")
-LOWER = "dlow, lower held"
-FULL, WHOLE, TIME, STANDARD = "trajevae", "whole poses", "in time", "standard prior"
-AGAIN = "trajevae, again"
-"""Seed 0 of the full method, and 1 and 2 on another processor: their first runs were lost before all was scored."""
-SIMPLER: dict[str, dict[str, Any]] = {
-    WHOLE: {"complement": False},
-    TIME: {"complement": False, "cosine": False, "latent": 8},
-    STANDARD: {"complement": False, "cosine": False, "latent": 8, "learned_prior": False, "beta": 0.1},
-}
-"""TrajeVAE without what it adds, one after the other; latents of all have 480 numbers."""
-EXCHANGES: dict[str, dict[str, Any]] = {
-    "Another's pose, whose joints are within 1 cm, and the paths' motion as the truth": {},
-    "Own poses, of the same windows": {"own": True},
-    "Another's pose, and its motion as the truth, as in the public code": {"truth": "pose"},
-}
-ANOTHERS = PUBLISHED["trajevae, another's pose"]
-PAPERS = {
-    "hit-dvae": Paper(
-        "bandai2-by-style",
-        {
-            HIT: {},
-            **SHORT[HIT],
-            **{name: {**SHORT[HIT]["1,200 steps"], **options} for name, options in WITHOUT.items()},
-            **{row: FUTURES[row] for row in ("gsps", "dlow", "srnn")},
-        },
-        (("ACC content", "FID content", "APD", "energy score", *REAL), ERRORS),
-        [
-            *((name, "1,200 steps") for name in WITHOUT),
-            ("no copies, no attention", "no copies"),
-            *((name, HIT) for name in ("1,200 steps", "neither", "gsps", "dlow", "srnn")),
-        ],
-        ("ACC content", "FID content", "APD", "APDE", "energy score", *ERRORS[:4], "ADEm", "limb jitter"),
-        PUBLISHED["hit-dvae"],
-        further=(
-            Further("Other lengths of what is observed, in frames", (View(observed=5), View(observed=30)), (HIT,)),
-            Further(
-                "Contents in groups, by a judge of their own",
-                (View(judges="content+group"),),
-                (HIT, "gsps", "dlow"),
-                (*GROUPED, "ACC content", "FID content"),
-                PUBLISHED["hit-dvae, groups"],
-            ),
-        ),
-    ),
-    "gsps": Paper(
-        "bandai2-by-style",
-        {
-            "gsps": {},
-            **SHORT["gsps"],
-            **{name: {**SHORT["gsps"]["3,000 steps"], **options} for name, options in TERMS.items()},
-            **{row: FUTURES[row] for row in BASELINES},
-            LOWER: {"method": "dlow", "held": ("lower",)},
-        },
-        (("APD", "energy score", *ERRORS[:4], *REAL),),
-        [(name, "3,000 steps") for name in TERMS],
-        ("APD", "energy score", *ERRORS[:4], "pose NLL"),
-        PUBLISHED["gsps"],
-        further=(
-            Further(
-                "How far futures are apart, by parts of the body",
-                (View(parts="free"),),
-                ("gsps", "bom-parts", "dlow"),
-                ("APD", *PARTED),
-            ),
-            Further(
-                "The same where the lower body is held",
-                (View(parts="held"),),
-                ("gsps", "bom-parts"),
-                ("APD", *PARTED),
-                PUBLISHED["gsps, parts"],
-                {
-                    LOWER: (LOWER, View(parts="free")),  # has learned to hold it
-                    "dlow, 50 of 1,000": ("dlow", View(parts="nearest")),
-                },
-            ),
-        ),
-    ),
-    "trajevae": Paper(
-        "bandai2-trajectories",
-        {
-            FULL: {},
-            AGAIN: {"method": FULL},
-            **SHORT[FULL],
-            **{name: {**SHORT[FULL]["6,000 steps"], **options} for name, options in SIMPLER.items()},
-            "cvae-rnn": {},
-            "motion-infilling": PATHS["motion-infilling"],
-        },
-        (("APD", "energy score", *ERRORS[:4], "path error", "global ADE", *REAL[:4]),),
-        [("6,000 steps", WHOLE), (WHOLE, TIME), (TIME, STANDARD), (FULL, "cvae-rnn")],
-        ("ADE", "FDE", "MMFDE", "path error", "global ADE", "energy score", "APD"),
-        PUBLISHED["trajevae"],
-        tuple(map(View, range(5))),
-        (
-            Further("More paths", tuple(map(View, (6, 8, 10, 13, 16, 19, 21))), (AGAIN,)),
-            Further(
-                "One motion, at the mean of the prior",
-                tuple(View(count, single=True) for count in range(5)),
-                (AGAIN, "6,000 steps", WHOLE, TIME, STANDARD),
-                printed=PUBLISHED["trajevae, one motion"],
-            ),
-            *(
-                Further(
-                    caption,
-                    tuple(View(count, exchanged=0.01, **how) for count in range(1, 5)),
-                    (AGAIN,),
-                    printed={} if how else ANOTHERS,
-                )
-                for caption, how in EXCHANGES.items()
-            ),
-        ),
-    ),
-}
-"""By the pages of docs/results on which their tables stand."""
+def further(
+    views: Sequence[Mapping[str, Any]], printed: str = "", apart: Mapping[str, Any] = MappingProxyType({}), **told: Any
+) -> Further:
+    """Views of some rows, as the file has them."""
+    own = {called: (row, View(**view)) for called, (row, view) in apart.items()}
+    return Further(views=[View(**view) for view in views], printed=PUBLISHED.get(printed, {}), apart=own, **told)
 
 
-Found = Mapping[View, Mapping[str, Entry]]
+def paper(name: str, told: Mapping[str, Any]) -> Paper:
+    """A paper's tables, as the file has them."""
+    rows = {row: {**(FUTURES | PATHS).get(row, {}), **options} for row, options in told["rows"].items()}
+    own = {"views": [View(**view) for view in told["views"]], "further": [further(**each) for each in told["further"]]}
+    return Paper(printed=PUBLISHED[name], **{**told, **own, "rows": rows})
+
+
+PAPERS = {name: paper(name, told) for name, told in settings(__file__).items()}
+
+
+Found = Mapping[View, Mapping[str, Row]]
 
 
 def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[str, str]]) -> str:
@@ -272,11 +139,10 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
     what = "given" if views[0].given is not None else "observed" if views[0].observed else ""
     for row in dict.fromkeys(row for each in found.values() for row in each):
         seen = [view for view in views if row in found[view]]
-        for view in seen[:1] if what == "given" and not found[seen[0]][row].fitted else seen:
+        for view in seen[:1] if what == "given" and not found[seen[0]][row].trained else seen:
             entry = found[view][row]
-            means = [None if crossed is None else crossed.estimate() for crossed in map(entry.crossed, columns)]
-            told = [str(vars(view)[what]) if entry.fitted or what != "given" else ""] if what else []
-            lines.append([titled(row, entry), *told, *trained(entry), *map(cell, means)])
+            told = [str(vars(view)[what]) if entry.trained or what != "given" else ""] if what else []
+            lines.append([titled(row, entry), *told, *trained(entry), *map(cell, map(entry.estimate, columns))])
     for row, cells in beside.items():
         if all(cells.get(column, "–") == "–" for column in columns):
             continue
@@ -289,8 +155,9 @@ def changes(found: Found, paper: Paper) -> str:
     """What each change does, paired: columns across, or, where there are several views, these."""
 
     def change(view: View, pair: tuple[str, str], column: str) -> str:
-        having, lacking = (found[view][row].crossed(column) if row in found[view] else None for row in pair)
-        return "–" if having is None or lacking is None else str(having.estimate(lacking))
+        having, lacking = (found[view].get(row) for row in pair)
+        change = having.estimate(column, lacking) if having is not None and lacking is not None else None
+        return "–" if change is None else str(change)
 
     pairs = [pair for pair in paper.changes if all(pair[0] in each for each in found.values())]
     if len(found) == 1:
@@ -326,9 +193,9 @@ def drawn(found: Found, paper: Paper) -> Figure:
     for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
         for row in (NEIGHBOURS, *paper.rows):
             own = {view.given: rows[row] for view, rows in found.items() if row in rows}
-            common = min((len(entry.seeds) for entry in own.values()), default=0)
-            seen = {given: replace(entry, seeds=entry.seeds[:common]).crossed(column) for given, entry in own.items()}
-            scores = {given: crossed.estimate() for given, crossed in seen.items() if crossed is not None}
+            common = min((len(entry.runs) for entry in own.values()), default=0)
+            seen = {given: replace(each, runs=each.runs[:common]).estimate(column) for given, each in own.items()}
+            scores = {given: score for given, score in seen.items() if score is not None}
             means = [score.mean for score in scores.values()]
             if row == NEIGHBOURS:
                 panel.axhline(means[0], color="0.5", lw=1, ls="--", label=row)

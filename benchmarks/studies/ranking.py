@@ -9,25 +9,22 @@ same judges, and without `--data` nothing is fitted.
 from __future__ import annotations
 
 import fnmatch
+import itertools
 import json
 import statistics
-import sys
-import tomllib
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
-import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from torch import nn
 
 import dvae
 from dvae import Evaluation, Training, files, motion
-from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.estimates import Crossed
 from dvae.inference.evaluation.metrics import average_pairwise_distance
 from dvae.inference.evaluation.result import canvas
 from dvae.inference.evaluation.scores import Measure
@@ -37,15 +34,14 @@ from dvae.models import registry
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.geometry.parts import UNIONS, body_parts
 from dvae.runs.directory import load
-from dvae.runs.sweep import sweep
 
-from .engine import folder
+from .engine import Archive, Row, cell, folder, settings, swept
 from .pages import DOCS, refuse_unknown, require_gpu, same, table, write
 
 SCORES = Path(__file__).parents[1] / "scores"
 Accelerator = Literal["cpu", "cuda"]
 
-_TOLD = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_TOLD = settings(__file__)
 FUTURES: dict[str, dict[str, Any]] = _TOLD["futures"]
 PATHS: dict[str, dict[str, Any]] = _TOLD["paths"]
 STEPS: dict[str, int] = _TOLD["steps"]
@@ -97,10 +93,10 @@ class View:
         """Arguments of `dvae.evaluate`."""
         return {"samples": 1, "options": {"temperature": 0}} if self.single else {"samples": samples}
 
-    def __str__(self) -> str:
-        """The end of the names of its evaluations."""
+    def member(self, run: str) -> str:
+        """The name of the scores of a run in an archive."""
         told = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
-        return "-".join(["", *told])
+        return f"{run}/{'-'.join(['scores', *told])}.json"
 
 
 @dataclass(frozen=True)
@@ -158,61 +154,28 @@ LEVEL = 0.9
 """Of intervals, and of the set of those that may be the best."""
 
 
-@dataclass(frozen=True)
-class Scored:
-    """Scores of a run by clip, or of all reference rows.
+def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
+    """What is kept of an evaluation: scores by clip of a run, or of all reference rows.
 
-    Attributes:
-        basis: windows, draws and judges, which all rows of a table share.
-        clips: windows of each.
-        rows: `{row: {score: means by clip}}`, of four digits.
-        minutes: of processor time that the fit took.
-        config: method and training of the run, without paths to others.
+    Returns:
+        `basis`, windows, draws and judges, which all rows of a table share; windows by clip; scores, of four digits, by
+        row and clip; `minutes` of processor time that the fit took; and `config`, method and training, without paths.
     """
-
-    basis: Sequence[Any]
-    clips: Mapping[str, int]
-    rows: Mapping[str, Mapping[str, Sequence[float]]]
-    minutes: float = 0.0
-    config: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, evaluation: Evaluation, run: Path | None) -> Self:
-        """What tables show of an evaluation, and what was fitted."""
-        rows = {
-            name: {
-                score: [float(f"{value:.4g}") for value in values]
-                for score, values in row.clip_means.items()
-                if score in SHOWN
-            }
-            for name, row in evaluation.rows.items()
+    rows = {
+        name: {
+            score: [float(f"{value:.4g}") for value in values]
+            for score, values in row.clip_means.items()
+            if score in SHOWN
         }
-        basis = json.loads(json.dumps(same(evaluation)))
-        if run is None:
-            return cls(basis, evaluation.clips, rows)
+        for name, row in evaluation.rows.items()
+    }
+    found = {"basis": same(evaluation), "clips": evaluation.clips, "rows": rows, "minutes": 0.0, "config": {}}
+    if run is not None:
         fitted = Run(run)
         options = {name: value for name, value in fitted.config["method"].items() if not name.endswith("_run")}
-        config = {"method": options, "training": fitted.config["training"]}
-        return cls(basis, evaluation.clips, rows, fitted.state.get("processor_seconds", 0.0) / 60, config)
-
-    @classmethod
-    def load(cls, kept: Kept) -> Self:
-        """As saved."""
-        with zipfile.ZipFile(kept.archive) as archive:
-            return cls(**json.loads(archive.read(kept.name)))
-
-    def save(self, kept: Kept) -> None:
-        """As compressed JSON, the same bytes for the same scores."""
-        contents = {kept.name: json.dumps(vars(self), separators=(",", ":")).encode()}
-        if kept.archive.exists():
-            with zipfile.ZipFile(kept.archive) as archive:
-                contents = {name: archive.read(name) for name in archive.namelist()} | contents
-        with (
-            files.written(kept.archive) as new,
-            zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
-        ):
-            for name in sorted(contents):
-                archive.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_DEFLATED, 9)
+        found["config"] = {"method": options, "training": fitted.config["training"]}
+        found["minutes"] = fitted.state.get("processor_seconds", 0.0) / 60
+    return found
 
 
 def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
@@ -220,8 +183,8 @@ def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior",
     for name in names:
         method, options, training = JUDGES[name]
         clips = grouped(data) if options.get("label") == "group" else data
-        (judge,) = sweep({name: registry.judges()[method](**options)}, clips, runs / "judges", (0,), training, jobs=1)
-        config = judge.path / "config.json"  # is kept, and says nothing of this machine
+        (judge,) = swept(name, registry.judges()[method](**options), clips, runs / "judges", (0,), training)
+        config = judge / "config.json"  # is kept, and says nothing of this machine
         text = config.read_text(encoding="utf-8")
         if (placeless := text.replace(json.dumps(data.path), json.dumps(Path(data.path).name))) != text:
             with files.written(config) as new:  # whole at any time, as other processes may read it
@@ -256,21 +219,15 @@ def fit(
     prior: Path | None,
     accelerator: Accelerator = "cpu",
 ) -> Path:
-    """The run directory of a method, fitted once; second stages stand on the first of the same seed.
-
-    Raises:
-        RuntimeError: the run failed.
-    """
+    """The run directory of a method, fitted once; second stages stand on the first of the same seed."""
     told, training = parted({**methods[row], "accelerator": accelerator})
     method = told.pop("method", row)
     if method in ("gsps", "hit-dvae") and prior is not None and told.get("pose_prior") != 0:
         told["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
         told["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
-    (outcome,) = sweep({folder(row): dvae.method(method, **told)}, data, runs, (seed,), training, jobs=1)
-    if outcome.status == "failed":
-        raise RuntimeError(str(outcome))
-    return runs / f"{folder(row)}-seed{seed}"
+    (path,) = swept(row, dvae.method(method, **told), data, runs, (seed,), training)
+    return path
 
 
 def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -309,14 +266,14 @@ def work(
     """
     if accelerator == "cuda":
         require_gpu("accelerator")
-    own, like = stored / name, stored / (SETS[name].like or name)
-    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like.name])
-    judged = fitted_judges(opened, like, SETS[name].judges)
+    own, like = archive(stored, name), SETS[name].like or name
+    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like])
+    judged = fitted_judges(opened, stored / like, SETS[name].judges)
 
-    def score(path: Path | None, row: str, view: View, file: Kept) -> None:
+    def score(path: Path | None, row: str, view: View) -> dict[str, Any]:
         data, by = opened, judged
         if view.judges:
-            data, by = grouped(opened), fitted_judges(opened, like, view.judges.split("+"))
+            data, by = grouped(opened), fitted_judges(opened, stored / like, view.judges.split("+"))
         elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
             by = {judge: run for judge, run in judged.items() if judge != "prior"}
         models = {} if path is None else {row: load(path).model.to(accelerator)}
@@ -327,21 +284,20 @@ def work(
             ways: dict[str, Any] = {"held": Held, "nearest": partial(Nearest, lower=places(windows)["lower"])}
             models = {name: ways.get(view.parts, lambda free: free)(model) for name, model in models.items()}
         scores = diversities if view.parts else judging(by)
-        found = dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told)
-        Scored.of(found, path).save(file)
+        return scored(dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told), path)
 
+    references = archive(stored, like)
     for view in dict.fromkeys(view for each in views.values() for view in each):
-        file = kept(like, REFERENCES, view)
-        if not (view.single or view.exchanged or view.parts in ("held", "nearest") or file.exists()):
-            score(None, REFERENCES, view, file)
+        member = view.member(REFERENCES)
+        if not (view.single or view.exchanged or view.parts in ("held", "nearest") or member in references.names):
+            references.add(member, score(None, REFERENCES, view))
     every = {**SETS[name].methods, **methods}  # what a second stage stands on has the set's options, chosen or not
-    for seed in seeds:
-        for row in methods:
-            files = {view: kept(own, f"{folder(row)}-seed{seed}", view) for view in views[row]}
-            if missing := {view: file for view, file in files.items() if not file.exists()}:
-                path = fit(opened, row, every, seed, runs / name, judged.get("prior"), accelerator)
-                for view, file in missing.items():
-                    score(path, row, view, file)
+    for seed, row in itertools.product(seeds, methods):
+        members = {view: view.member(f"{folder(row)}-seed{seed}") for view in views[row]}
+        if missing := {view: member for view, member in members.items() if member not in own.names}:
+            path = fit(opened, row, every, seed, runs / name, judged.get("prior"), accelerator)
+            for view, member in missing.items():
+                own.add(member, score(path, row, view))
 
 
 class Wrapped(nn.Module):
@@ -402,95 +358,38 @@ def diversities(windows: Any) -> list[Measure]:
 REFERENCES = "references"
 
 
-@dataclass(frozen=True)
-class Kept:
-    """Scores of a run in one view, or of the reference rows of a set: a member of the archive of the set.
-
-    Args:
-        archive: `SET.zip`.
-        name: of the member, `RUN/scoresVIEW.json`.
-    """
-
-    archive: Path
-    name: str
-
-    def exists(self) -> bool:
-        """Whether it has been saved."""
-        return self.name in members(self.archive)
+def archive(stored: Path, name: str) -> Archive:
+    """The scores of a set."""
+    return Archive(stored / f"{name}.zip")
 
 
-def kept(path: Path, name: str, view: View) -> Kept:
-    """Scores of a run, or of the reference rows of a set, which is named by a path."""
-    return Kept(path.with_name(f"{path.name}.zip"), f"{name}/scores{view}.json")
-
-
-def members(archive: Path) -> list[str]:
-    """Names in an archive of scores, sorted."""
-    if not archive.exists():
-        return []
-    with zipfile.ZipFile(archive) as opened:
-        return sorted(opened.namelist())
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A row of a ranking: the scores of its seeds."""
-
-    seeds: Sequence[Scored]
-
-    @property
-    def fitted(self) -> bool:
-        """Whether there were runs; a reference is not trained."""
-        return bool(self.seeds[0].config)
-
-    def means(self, metric: str) -> np.ndarray | None:
-        """(S, C), by seed and clip, where all have the score."""
-        (name,) = {name for each in self.seeds for name in each.rows}
-        rows = [each.rows[name] for each in self.seeds]
-        return np.array([row[metric] for row in rows]) if all(metric in row for row in rows) else None
-
-    def by_seed(self, metric: str) -> np.ndarray:
-        """(S,), means over clips of a score that all have."""
-        return np.average(self.means(metric), 1, [*self.seeds[0].clips.values()])
-
-    def crossed(self, metric: str, minus: Entry | None = None) -> Crossed | None:
-        """A score, or what it is more than that of the same runs in another view of the same windows."""
-        means, others = self.means(metric), 0.0 if minus is None else minus.means(metric)
-        if means is None or others is None:
-            return None
-        means, weights = means - others, np.array([*self.seeds[0].clips.values()])
-        known = ~np.isnan(means).any(0)
-        crossed = Crossed.of(means[:, known], weights[known])
-        # no seed of a reference differs from another
-        return crossed if self.fitted else replace(crossed, seeds=0.0, rest=0.0, count=sys.maxsize)
-
-
-def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Entry]:
+def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Row]:
     """What has been scored on a set: the reference rows, and methods with their seeds.
 
     Raises:
         ValueError: scores of other windows, samples, or judges.
     """
-    found, basis = {}, None
-    file = kept(stored / (SETS[name].like or name), REFERENCES, view)
-    if file.exists():
-        references = Scored.load(file)
-        basis = references.basis
-        found = {row: Entry([replace(references, rows={row: value})]) for row, value in references.rows.items()}
+    found, basis = dict[str, Row](), None
+    own, like = archive(stored, name), archive(stored, SETS[name].like or name)
+    if view.member(REFERENCES) in like.names:
+        references = like.read([view.member(REFERENCES)])
+        basis = references[0]["basis"]
+        found = {row: Row(references, row, trained=False) for row in references[0]["rows"]}
+    names = own.names
     for row in methods:
-        own = kept(stored / name, f"{folder(row)}-seed*", view)
-        if scored := [Scored.load(replace(own, name=name)) for name in fnmatch.filter(members(own.archive), own.name)]:
-            basis = basis or scored[0].basis
-            if any(alike(each.basis) != alike(basis) for each in scored):
-                raise ValueError(f"scores of {row} in {own.archive} are of other windows, samples, seed or judges")
-            found[row] = Entry(scored)
+        if chosen := fnmatch.filter(names, view.member(f"{folder(row)}-seed*")):
+            scored = own.read(chosen)
+            basis = basis or scored[0]["basis"]
+            if any(alike(each["basis"]) != alike(basis) for each in scored):
+                raise ValueError(f"scores of {row} in {own.file} are of other windows, samples, seed or judges")
+            found[row] = Row(scored, row)
     return found
 
 
-def rows_of(stored: Path, name: str, view: View) -> dict[str, Entry]:
+def rows_of(stored: Path, name: str, view: View) -> dict[str, Row]:
     """What has been scored of a set's own rows, with the reference rows; nothing where no method has been."""
     found = entries(stored, name, view, SETS[name].methods)
-    return found if any(entry.fitted for entry in found.values()) else {}
+    return found if any(entry.trained for entry in found.values()) else {}
 
 
 EMISSION = 3
@@ -502,40 +401,33 @@ def alike(basis: Sequence[Any]) -> list[Any]:
     return [*basis[:EMISSION], *basis[EMISSION + 1 :]]
 
 
-def titled(name: str, entry: Entry) -> str:
+def titled(name: str, entry: Row) -> str:
     """A row as it is called, with what sets it apart."""
-    first = entry.seeds[0]
-    modes = first.config.get("method", {}).get("modes")
-    apart = ["drawn"] * (first.basis[EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
+    first = entry.runs[0]
+    modes = first["config"].get("method", {}).get("modes")
+    apart = ["drawn"] * (first["basis"][EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
     return f"{name} ({', '.join(apart)})" if apart else name
-
-
-def cell(estimate: Estimate | None) -> str:
-    """A mean with its standard error over clips, and over seeds of what is trained."""
-    if estimate is None:
-        return "–"
-    return str(estimate) if estimate.seeds else str(estimate).rpartition(" ± ")[0]
 
 
 TRAINED = ("seeds", "CPU minutes")
 
 
-def trained(entry: Entry) -> tuple[str, str]:
+def trained(entry: Row) -> tuple[str, str]:
     """How many seeds were trained, and how long each took of those that were trained on a processor."""
-    if not entry.fitted:
+    if not entry.trained:
         return "–", "–"
-    here = [each.minutes for each in entry.seeds if each.config["training"]["accelerator"] != "cuda"]
-    return str(len(entry.seeds)), f"{statistics.fmean(here):.1f}" if here else "GPU"
+    here = [run["minutes"] for run in entry.runs if run["config"]["training"]["accelerator"] != "cuda"]
+    return str(len(entry.runs)), f"{statistics.fmean(here):.1f}" if here else "GPU"
 
 
-def ranked(found: Mapping[str, Entry]) -> dict[str, Crossed]:
+def ranked(found: Mapping[str, Row]) -> dict[str, Crossed]:
     """The energy score of all but the truth, the best first."""
     scores = {name: entry.crossed(RANKED) for name, entry in found.items() if name != "real motion"}
     known = {name: score for name, score in scores.items() if score is not None}  # all motion has it
     return dict(sorted(known.items(), key=lambda item: item[1].mean))
 
 
-def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
+def ranking(found: Mapping[str, Row], columns: Sequence[str]) -> str:
     """Rows in order of the energy score, each with what it has more than the neighbours and than the next better.
 
     And below, the model confidence set.
@@ -547,16 +439,15 @@ def ranking(found: Mapping[str, Entry], columns: Sequence[str]) -> str:
         own = found[name]
         minus = [None if name == NEIGHBOURS else NEIGHBOURS, above]
         behind = [None if other is None else scores[name].estimate(scores[other]) for other in minus]
-        means = [None if crossed is None else crossed.estimate() for crossed in map(own.crossed, columns)]
-        lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *means])])
+        lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *map(own.estimate, columns)])])
     known = {name: score for name, score in scores.items() if score.count >= ENOUGH}
-    if not any(found[name].fitted for name in known):
+    if not any(found[name].trained for name in known):
         return table(header, lines)
     best = f"May be the best, at {100 * LEVEL:.0f} % over clips and seeds, of rows with {ENOUGH} seeds or more"
     return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(known, level=LEVEL).members)}.\n"
 
 
-def drawn(sets: Mapping[str, Mapping[str, Entry]]) -> Figure:
+def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
     """How far above the neighbours' the energy scores of each set are; rows of all in the first one's order."""
     ranks = {name: ranked(found) for name, found in sets.items()}
     order = list(dict.fromkeys(row for scores in ranks.values() for row in scores if row != NEIGHBOURS))

@@ -22,8 +22,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dvae.inference.diagnostics.checks import decode
+from dvae.inference.evaluation.estimates import Crossed
 from dvae.inference.evaluation.held import clip_places, on_device_of, reproducibly
-from dvae.inference.evaluation.uncertainty import clustered_variance, linearised
 from dvae.motion import Windows
 from dvae.program.batch import rows
 
@@ -118,10 +118,9 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
 
 def share(right: Tensor, places: Tensor) -> str:
     """A mean over windows with its standard error, clustered by clip."""
-    _, inverse = np.unique(places.numpy(), return_inverse=True)
-    weights = np.bincount(inverse).astype(float)
-    mean, deviations = linearised(np.bincount(inverse, right.numpy()) / weights, weights)
-    return f"{float(mean):.3f} ± {clustered_variance(deviations) ** 0.5:.3f}"
+    _, clips = np.unique(places.numpy(), return_inverse=True)
+    found = Crossed.by_clip(right.numpy()[None], np.ones(len(clips)), clips).estimate()
+    return f"{found.mean:.3f} ± {found.sequences:.3f}"
 
 
 def swaps(model: Any, windows: Windows, label: str, count: int, seed: int) -> list[list[str]]:

@@ -8,9 +8,9 @@ section, in `benchmarks/scores/tuning`: the script goes on where it was stopped,
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import isnan, nan, sqrt
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,11 @@ from dvae import Training, motion
 from dvae.models import registry
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.scoring.energies import pose_prior_energy
-from dvae.options import tuples
 from dvae.runs.directory import load
-from dvae.runs.sweep import sweep
 
-from .pages import refuse_unknown, table, write
-from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, folder, judging, parted
+from .engine import settings, swept
+from .pages import refuse_unknown, table, tabled, write
+from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
@@ -81,18 +80,12 @@ class Section:
 PATHS = replace(motion.PROTOCOLS["bandai2-trajectories"], name="bandai2-paths-tuning", train=("A",), test=("B",))
 
 
-def sections(file: Path) -> dict[str, Section]:
-    """What was tried, by method, from a file of TOML."""
-    found = {}
-    for name, told in tomllib.loads(file.read_text(encoding="utf-8")).items():
-        protocol = PATHS if told.pop("paths", False) else TUNING
-        training, options = Training(**told.pop("training")), tuples(told.pop("options", {}))
-        cases = {case: tuples(each) for case, each in told.pop("cases").items()}
-        found[name] = Section(training=training, cases=cases, options=options, protocol=protocol, **told)
-    return found
-
-
-SECTIONS = sections(Path(__file__).with_suffix(".toml"))
+SECTIONS = {
+    name: Section(
+        training=Training(**told.pop("training")), protocol=PATHS if told.pop("paths", False) else TUNING, **told
+    )
+    for name, told in settings(__file__).items()
+}
 
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
@@ -110,22 +103,20 @@ class Store:
 
     def __init__(self, file: Path, section: str) -> None:
         self.file, self.section = file, section
-
-    def _all(self) -> dict[str, Kept]:
-        return json.loads(self.file.read_text(encoding="utf-8")) if self.file.exists() else {}
+        self.all: dict[str, Kept] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
     @property
     def found(self) -> Kept:
         """By case and seed; none before the first."""
-        return self._all().get(self.section, {})
+        return self.all.get(self.section, {})
 
     def add(self, case: str, seed: int, scores: Mapping[str, float]) -> None:
         """Beside what there is."""
-        every = self._all()
-        cases = every.setdefault(self.section, {})
+        self.all = Store(self.file, self.section).all
+        cases = self.all.setdefault(self.section, {})
         cases.setdefault(case, {})[str(seed)] = {name: round(value, 4) for name, value in scores.items()}
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        self.file.write_text(json.dumps(every, indent=1) + "\n", encoding="utf-8")
+        self.file.write_text(json.dumps(self.all, indent=1) + "\n", encoding="utf-8")
 
     def lacks(self, case: str, seed: int) -> bool:
         """Whether it has not been scored."""
@@ -134,18 +125,13 @@ class Store:
 
 def of_judges(data: MotionData, runs: Path, store: Store) -> None:
     """Fits judges for other numbers of steps, and scores real motion of the judging group by each."""
-    windows = seen(data)
-    for name, tried in STEPS.items():
+    for row in OF_JUDGES:
+        name, steps, _ = row.split()
         method, options, training = JUDGES[name]
-        for steps in tried:
-            row, told = f"{name} {steps} steps", replace(training, steps=steps)
-            for seed in SEEDS_OF[name]:
-                if store.lacks(row, seed):
-                    judge = registry.judges()[method](**options)
-                    (outcome,) = sweep({folder(row): judge}, data, runs, (seed,), told, jobs=1)
-                    if outcome.status == "failed":
-                        raise RuntimeError(str(outcome))
-                    store.add(row, seed, of_judge(name, outcome.path, windows))
+        for seed in [seed for seed in SEEDS_OF[name] if store.lacks(row, seed)]:
+            told = replace(training, steps=int(steps))
+            (path,) = swept(row, registry.judges()[method](**options), data, runs, (seed,), told)
+            store.add(row, seed, of_judge(name, path, seen(data)))
 
 
 def of_judge(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
@@ -200,7 +186,7 @@ def evaluated(model: Any, windows: Any, scores: Any, **told: Any) -> dict[str, f
     return {name: each.mean for name, each in found["model"].items()}
 
 
-def shown(scores: Sequence[Mapping[str, float]], name: str) -> str:
+def shown(name: str, scores: Sequence[Mapping[str, float]]) -> str:
     """The mean over seeds, with that of each where there are several."""
     values = [each.get(name, nan) for each in scores]
     if any(map(isnan, values)):
@@ -242,11 +228,9 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
         for case in section.cases:
             if seeds := [seed for seed in section.seeds if store.lacks(case, seed)]:
                 method, training = section.of(case, prior)
-                outcomes = sweep({folder(case): method}, own, runs / name, seeds, training, jobs)
-                for seed, outcome in zip(seeds, outcomes, strict=True):
-                    if outcome.status == "failed":
-                        raise RuntimeError(str(outcome))
-                    store.add(case, seed, score(outcome.path, own, judged))
+                paths = swept(case, method, own, runs / name, seeds, training, jobs)
+                for seed, path in zip(seeds, paths, strict=True):
+                    store.add(case, seed, score(path, own, judged))
 
 
 def main(
@@ -273,17 +257,18 @@ def main(
         work(data, runs, stored, tried, jobs)
     if SEEDS in sections:
         write(page, spread(), name=SEEDS)
+    known = Store(stored, "references").found
     for name in tried:
-        columns = COLUMNS_OF_JUDGES if name == "judges" else SECTIONS[name].columns
-        found = Store(stored, name).found
-        cases = OF_JUDGES if name == "judges" else SECTIONS[name].cases
-        scored = {case: [*found[case].values()] for case in cases if case in found}
+        columns, cases, beside = COLUMNS_OF_JUDGES, OF_JUDGES, {}
         if name != "judges":
-            known, on = Store(stored, "references").found, SECTIONS[name].protocol.name
-            beside = {row: [*known[f"{on}: {row}"].values()] for row in REFERENCES if f"{on}: {row}" in known}
-            scored = beside | scored
-        lines = [[case, *(shown(found, column) for column in columns)] for case, found in scored.items()]
-        write(page, table([name, *columns], lines), name=name)
+            section = SECTIONS[name]
+            columns, cases = section.columns, [*section.cases]
+            beside = {row: known.get(f"{section.protocol.name}: {row}") for row in REFERENCES}
+        found = Store(stored, name).found
+        scored = {
+            row: [*seeds.values()] for row, seeds in {**beside, **{c: found.get(c) for c in cases}}.items() if seeds
+        }
+        write(page, tabled(scored, {column: partial(shown, column) for column in columns}, name), name=name)
 
 
 if __name__ == "__main__":

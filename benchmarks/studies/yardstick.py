@@ -13,12 +13,12 @@ import tyro
 
 import dvae
 
+from . import bounds
 from .pages import DOCS, code, table, write
 
 LENGTH = 6
 """Steps of the sequences that neural models are fitted to."""
-MODEL = "p(z_t | z_{t-1}) p(x_t | z_t)"
-GUIDES = {"exact": "q(z_t | z_{t-1}, x_{t:T})", "mean-field": "q(z_t | x_{1:T})", "filtering": "q(z_t | z_{t-1}, x_t)"}
+GUIDES = {name: bounds.GUIDES[name] for name in ("exact", "mean-field", "filtering")}
 
 
 def root_mean_square(values: np.ndarray) -> float:
@@ -48,14 +48,6 @@ def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
 COLUMNS = ["bias (rms)", "deviation ratio", "correlations", "the guide’s", "told by KSD at 5 %", "p, together"]
 
 
-def twin(inference: str, steps: int, count: int) -> tuple[dvae.DynamicalVAE, torch.Tensor]:
-    """The best guide of a factorization, and sequences."""
-    model = dvae.twin(MODEL, inference, {"z": 1, "x": 1}, steps, scale=0.9)
-    dvae.Oracle(model, steps).fit_guide(300)
-    torch.manual_seed(0)
-    return model.requires_grad_(False), model.sample(count, steps)["x"]
-
-
 def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
     """The posterior as a guide: right, or without correlations, or with z_T too narrow by a third given all else."""
 
@@ -75,7 +67,7 @@ def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
 
 def power(steps: int, sequences: int) -> list[str]:
     """Of the discrepancy: the share of sequences that are told."""
-    model = dvae.twin(MODEL, GUIDES["exact"], {"z": 1, "x": 1}, steps, scale=0.9).requires_grad_(False)
+    model = dvae.twin(bounds.MODEL, GUIDES["exact"], {"z": 1, "x": 1}, steps, scale=0.9).requires_grad_(False)
     torch.manual_seed(0)
     x, cells = model.sample(sequences, steps)["x"], [str(steps)]
     for wrong, draws in (("", 500), ("correlations", 100), ("correlations", 500), ("a deviation", 500)):
@@ -88,7 +80,7 @@ def power(steps: int, sequences: int) -> list[str]:
 def neural(inference: str, x: torch.Tensor, fitting: int) -> dvae.DynamicalVAE:
     """A small model that was fitted to sequences."""
     torch.manual_seed(0)
-    model = dvae.DynamicalVAE(MODEL, inference, {"z": 2, "x": 4}, dvae.networks.Recurrent(16))
+    model = dvae.DynamicalVAE(bounds.MODEL, inference, {"z": 2, "x": 4}, dvae.networks.Recurrent(16))
     dvae.fit(model, dvae.ArrayWindows(x, observed=LENGTH - 1), steps=fitting, progress=False)
     return model
 
@@ -111,7 +103,10 @@ def main(
         fitting: steps of the neural models.
         draws: of each chain of NUTS, and the warm-up's.
     """
-    rows = [[f"{code(text)}, {name}", *said(*twin(text, steps, sequences))] for name, text in GUIDES.items()]
+    rows = []
+    for name, text in GUIDES.items():
+        model, _ = bounds.fitted(text, steps, 300, scale=0.9)
+        rows.append([f"{code(text)}, {name}", *said(model, model.sample(sequences, steps)["x"])])
     write(page, table(["best guide", *COLUMNS], rows), name="yardstick")
     guides = ["the posterior, 500 draws", "mean-field, 100 draws", "500 draws", "z_T too narrow, 500 draws"]
     head = ["T", *guides, f"{powers} of these together (p)"]

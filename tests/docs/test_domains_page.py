@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.studies import domains
+from benchmarks.studies import domains, engine
 from dvae import tables
 from dvae.tables import Column, Columns, Panel, Series, reading
 from dvae.tables.protocol import Cut
 
 CASES = {
-    domains.BASELINE: domains.Case({"width": 4, "hidden": ()}),
-    "dkf": domains.Case({"latent": 2, "width": 4, "warm_up": 1}),
+    domains.BASELINE: {"options": {"width": 4, "hidden": ()}},
+    "dkf": {"options": {"latent": 2, "width": 4, "warm_up": 1}},
 }
 SMALL = {"steps": 2, "batch_size": 4, "validate_every": 2}
 
@@ -58,3 +58,17 @@ def test_the_page_of_the_domains_is_of_the_runs_that_are_there(page, tmp_path, c
         assert "3 sequences, 54 steps; 1 seeds" in page.read_text()
         assert page.read_text().count("| dkf |") == 2
         assert ("climatology" in page.read_text()) == there
+
+
+def test_bounds_are_by_step_and_their_errors_over_sequences(page, tmp_path):
+    domains.main(("tiny",), tmp_path, page, "validation", (domains.BASELINE,), (0, 1))
+    folders = [tmp_path / "tiny" / f"{domains.BASELINE}-{seed}" for seed in (0, 1)]
+    found = [json.loads((folder / "validation.json").read_text())["bounds"] for folder in folders]
+    steps = np.array([15.0, 16.0])
+    assert found[0]["weights"] == steps.tolist()
+    bounds = np.array([own["rows"][engine.OURS][domains.BOUND] for own in found])
+    expected = Crossed.of(bounds, steps).estimate()
+    read = engine.read(tmp_path / "tiny", [domains.BASELINE], "validation.json")[domains.BASELINE]
+    assert read.of("bounds").estimate(domains.BOUND) == expected
+    assert expected.mean == pytest.approx((bounds * steps).sum() / 62)
+    assert domains.said(read, "bounds", domains.BOUND) == str(expected)

@@ -7,7 +7,7 @@ import zipfile
 import pytest
 
 import dvae
-from benchmarks.studies import papers, ranking, tuning
+from benchmarks.studies import engine, papers, ranking, tuning
 from dvae.models.motion.poses import PoseMethod
 from dvae.motion import WALKER
 
@@ -15,7 +15,7 @@ SETS = sorted(file.stem for file in ranking.SCORES.glob("*.zip"))
 RUNS = [
     (of, run)
     for of in SETS
-    for run in dict.fromkeys(name.partition("/")[0] for name in ranking.members(ranking.SCORES / f"{of}.zip"))
+    for run in dict.fromkeys(name.partition("/")[0] for name in ranking.archive(ranking.SCORES, of).names)
 ]
 
 
@@ -47,17 +47,17 @@ def test_judges_name_no_place(file):
 @pytest.mark.parametrize(("of", "run"), [(of, run) for of, run in RUNS if "seed" in run])
 def test_scores_are_of_the_presets(of, run):
     """With the options of their rows, as if fitted now; where a preset changes, its rows are to be made again."""
-    archive, row = ranking.SCORES / f"{of}.zip", run.rpartition("-seed")[0]
+    archive, row = ranking.archive(ranking.SCORES, of), run.rpartition("-seed")[0]
     (options,) = {
         json.dumps(options): options
         for methods in (ranking.SETS[of].methods, *(paper.rows for paper in papers.PAPERS.values() if paper.set == of))
         for name, options in methods.items()
-        if ranking.folder(name) == row
+        if engine.folder(name) == row
     }.values()
     told, training = ranking.parted(options)
     method = dvae.method(told.pop("method", row), **told)
-    kept = [ranking.Kept(archive, name) for name in ranking.members(archive) if name.startswith(f"{run}/")]
-    (stored,) = {json.dumps(ranking.Scored.load(each).config) for each in kept}
+    kept = archive.read(name for name in archive.names if name.startswith(f"{run}/"))
+    (stored,) = {json.dumps(each["config"]) for each in kept}
     stored = json.loads(stored)
     now = {name: value for name, value in method.config().items() if value is not None and not name.endswith("_run")}
     preset = method.preset(WALKER) if isinstance(method, PoseMethod) else {}
@@ -88,8 +88,8 @@ def test_what_another_seed_does_is_that_of_the_rows_on_test_windows():
     rows = ranking.SETS["bandai2-by-style"].methods
     for row, entry in ranking.entries(ranking.SCORES, "bandai2-by-style", ranking.View(), rows).items():
         if row in rows:
-            error = entry.crossed("energy score").estimate().seeds
-            assert told[row] == pytest.approx(error * len(entry.seeds) ** 0.5, abs=6e-4)
+            error = entry.estimate("energy score").seeds
+            assert told[row] == pytest.approx(error * len(entry.runs) ** 0.5, abs=6e-4)
 
 
 def cells(line):

@@ -7,6 +7,7 @@ import subprocess
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import networkx as nx
 import numpy as np
@@ -20,6 +21,7 @@ from benchmarks.studies import (
     bounds,
     bracket,
     completion,
+    engine,
     family,
     hit_dvae,
     irregular,
@@ -238,21 +240,33 @@ def test_probes_tell_what_is_there_and_nothing_else():
 
 def test_mix_and_match(tmp_path, page, monkeypatch):
     """Fitted and scored once, whatever is asked again; two alphas make a curve."""
-    few = {"OPTIONS": {"width": 8}, "JUDGED": {"width": 4}, "TUNING": mix_and_match.RAW}
-    patched(monkeypatch, mix_and_match, BODY=motion.WALKER.names, **few)
+    monkeypatch.setattr(mix_and_match, "BODY", motion.WALKER.names)
+    little = {"STEPS": 2, "EVERY": 20, "SAMPLES": 3, "WATCHED": 3, "FUTURES": 5, "THINNED": 2}
+    little |= {"OPTIONS": {"width": 8}, "JUDGED": {"width": 4}, "TUNING": mix_and_match.RAW}
+    little |= {"JUDGE": {**mix_and_match.JUDGE, "examples": 8, "steps": 2}}
+    for name, value in little.items():
+        monkeypatch.setattr(mix_and_match, name, value)
     named = {name: mix_and_match.NAMED[name] for name in ("mix", "mix, velocity", "no noise")}
-    alphas = {name: mix_and_match.SWEEP[name] for name in ("alpha 0.1", "alpha 0.3")}
-    cases = {mix_and_match.RAW: named, "alpha": alphas}
-    sections = {name: mix_and_match.Section(mix_and_match.RAW, each) for name, each in cases.items()}
+    alphas = {name: mix_and_match.CASES["sweep"][name] for name in ("alpha 0.1", "alpha 0.3")}
+    sections = {
+        name: mix_and_match.Section(mix_and_match.RAW, c)
+        for name, c in {mix_and_match.RAW: named, "alpha": alphas}.items()
+    }
     monkeypatch.setattr(mix_and_match, "SECTIONS", sections)
     motion.write_motion(tmp_path / "bvh", motion.simulate(clips=2, frames=240, seed=1), "bvh")
-    budget = mix_and_match.Budget(2, 20, 3, 8, 2, 3, 5, 2)
-    places = {"raw": tmp_path / "bvh", "runs": tmp_path / "runs", "picture": tmp_path / "a.png"}
-    options = {**places, "page": page, "budget": budget}
+    options = {
+        "raw": tmp_path / "bvh",
+        "runs": tmp_path / "runs",
+        "page": page,
+        "picture": tmp_path / "a.png",
+    }
     mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
-    with nothing_new(page, tmp_path / "runs"):
-        mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
-    (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / mix_and_match.MEASURED).unlink()
+    first, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
+    times = [file.stat().st_mtime_ns for file in files]
+    mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
+    assert page.read_text() == first
+    assert [file.stat().st_mtime_ns for file in files] == times
+    (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / engine.MEASURED).unlink()
     mix_and_match.main(sections=(mix_and_match.RAW,), cases=("mix",), seeds=(0, 1), **options)
     ways, noise, angles, swept, _ = tables(page)
     assert [row[0] for row in ways[1:]] == ["zero velocity", "mix", "mix, velocity", "no noise"]
@@ -270,14 +284,19 @@ def short(monkeypatch):
     """Completion of simulated people, from little and for half a second."""
     few = motion.simulate(clips=10, frames=90, seed=1)
     monkeypatch.setattr(dataset, "simulate", lambda: few)
-    monkeypatch.setattr(completion.Source, "grouped", property(lambda source: source.data.segments))
-    few_steps = {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}
-    few_points = {"POINTS": (5, 10), "FRAMES": (4, 100), "FEW": 5, "RESIDUAL": completion.RESIDUAL | {"width": 4}}
-    patched(monkeypatch, completion, **few_steps, **few_points)
+    monkeypatch.setattr(completion, "grouped", lambda people: people)
+    for name, value in {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}.items():
+        monkeypatch.setattr(completion, name, value)
+    for name, value in {
+        "POINTS": (5, 10),
+        "FRAMES": (4, 100),
+        "FEW": 5,
+        "RESIDUAL": completion.RESIDUAL | {"width": 4},
+    }.items():
+        monkeypatch.setattr(completion, name, value)
     sights = {(5, 4): False, (5, 100): False, (10, 100): True, (0, 4): True}
     found = [completion.Sight(*sight, markers) for sight, markers in sights.items()]
     monkeypatch.setattr(completion, "SIGHTS", {"few": found})
-    monkeypatch.setattr(completion, "GRID", [completion.Sight(n, k) for n in (5, 10) for k in (4, 100)])
     return completion.Budget(some=2, known=2, steps=2, dense=20)
 
 
@@ -292,16 +311,20 @@ def test_motion_latent(tmp_path, page, monkeypatch):
     monkeypatch.setattr(motion_latent, "PAIRS", 4)
     for cases in motion_latent.SECTIONS.values():
         for name, case in cases.items():
-            small = replace(case, method={"widths": (8,), **case.method, "latent": case.method.get("latent", 64) // 16})
-            monkeypatch.setitem(cases, name, small)
+            options = {"widths": (8,), **case.get("method", {})}
+            small = {**options, "latent": options.get("latent", 64) // 16}
+            monkeypatch.setitem(cases, name, {**case, "method": small})
     options = {"runs": tmp_path / "runs", "page": page, "picture": tmp_path / "a.png", "steps": 3}
     data = {"data": tmp_path / "people.npz", "other": tmp_path / "people.npz"}
     main, tuning = motion_latent.main, ("both phases", "turns scaled", "z of 16")
     main(**data, sections=("held out",), cases=("both phases", "first phase alone"), seeds=(0, 1), **options)
     main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
-    with nothing_new(page, tmp_path / "runs"):
-        main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
-    (tmp_path / "runs" / "tuning" / "z-of-16-0" / motion_latent.MEASURED).unlink()
+    text, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
+    times = [file.stat().st_mtime_ns for file in files]
+    main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
+    assert page.read_text() == text
+    assert [file.stat().st_mtime_ns for file in files] == times
+    (tmp_path / "runs" / "tuning" / "z-of-16-0" / engine.MEASURED).unlink()
     main(**data, sections=("tuning",), cases=("z of 16",), seeds=(0,), **options)
     assert page.read_text().count("| z of 16 |") == 1
     varied, _, same, against, other, _ = tables(page)
@@ -319,12 +342,15 @@ def test_completion(tmp_path, page, short, monkeypatch):
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     options = {"out": tmp_path / "out", "picture": tmp_path / "a.png", "budget": short, "page": page}
     runs = tmp_path / "a", tmp_path / "b"
-    with marked(page, "completion"):
-        completion.main("simulated", runs, parts=("prediction",), **options)
-        completion.main("simulated", runs[:1], parts=("completion", "grid", "uncertainty"), **options)
-        with nothing_new(page, tmp_path / "out"):
-            completion.main(None, runs, parts=("prediction",), **options)
-            completion.main(None, runs[:1], **options)
+    completion.main("simulated", runs, parts=("prediction",), **options)
+    completion.main("simulated", runs[:1], parts=("completion", "uncertainty"), **options)
+    text, files = page.read_text(), sorted((tmp_path / "out").rglob("*.json"))
+    times = [file.stat().st_mtime_ns for file in files]
+    completion.main(None, runs, parts=("prediction",), **options)
+    completion.main(None, runs[:1], **options)
+    assert page.read_text() == text
+    assert [file.stat().st_mtime_ns for file in files] == times
+    page.write_text(text.replace("completion -->", "tables -->").replace("end of completion", "end of tables"))
     curves, seen, *_, sure = tables(page)
     assert [row[0] for row in curves[1:4]] == ["ours", "ours, body unknown", "reconstruction"]
     assert curves[-1][0] == "segments"
@@ -332,23 +358,24 @@ def test_completion(tmp_path, page, short, monkeypatch):
     for row in seen[1:]:
         assert float(row[4].split()[0]) < float(row[1].split()[0])
     assert [row[0] for row in sure[1:]] == [str(sight) for sight in completion.SURE]
-    errors = completion.found_in(tmp_path / "out", "references")[0]["errors"]
-    observed = completion.moments(30.0)[1]
-    for row in errors.values():
-        assert max(each[observed - 1] for each in row) == 0 < min(each[observed] for each in row)
+    errors, _ = engine.read_all(tmp_path / "out", "references").runs
+    last, first = (completion.at(errors["times"][completion.moments(30.0)[1] - ahead]) for ahead in (1, 0))
+    for row in errors["rows"].values():
+        assert max(row[last]) == 0 < min(row[first])
     assert (tmp_path / "a.png").stat().st_size > 10_000
     monkeypatch.setattr(completion, "TRIED", {"surface": (0.01,), "marker": (), "point": ()})
     monkeypatch.setattr(completion, "DESCENTS", [])
     completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "page": None})
     assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2
-    with pytest.raises(SystemExit, match="no part guesses"):
+    with pytest.raises(SystemExit, match="unknown part 'guesses'"):
         completion.main(parts=("guesses",), **options)
 
 
 def test_recurrent_poses_are_put_where_segments_start(short):
     """What knows the future makes the true surfaces, whatever segments face and wherever they are."""
     data = dataset.SegmentData.open()
-    held = completion.Held(MotionSpace(data), data.windows("test"), {})
+    segments = data.windows("test")
+    held = SimpleNamespace(model=MotionSpace(data), segments=segments, batch=segments.all())
     people, cut = held.segments.motion, completion.protocol(30.0)
     windows = motion.windows(people, cut, "test")
     assert len(windows) == len(people)
@@ -362,9 +389,9 @@ def test_recurrent_poses_are_put_where_segments_start(short):
         def model(self, batch, length, mean_emission):
             return {"x": self.turns(windows.all())["x"][:, cut.observed :]}
 
-    errors = completion.references(held, Oracle())["errors"]
-    assert max(max(row) for row in errors[completion.SUP]) < 5  # mm, of which frames of chi lose 2
-    assert min(row[-1] for row in errors[completion.STILL]) > 50
+    errors = completion.references(held, Oracle())["rows"]
+    assert max(max(row) for row in errors[completion.SUP].values()) < 5  # mm, of which frames of chi lose 2
+    assert min([*errors[completion.STILL].values()][-1]) > 50
 
 
 class MotionSpace:
@@ -484,14 +511,14 @@ def test_ranking(folder, page, monkeypatch):
         ranking.main(runs, folder, accelerator="cuda", **options)
     ranking.main(runs, folder, seeds=(0,), accelerator="cpu", **options)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)
-    archive = scores / "simulated.zip"
-    before = archive.stat().st_mtime_ns
-    assert len(ranking.members(archive)) == 4  # of three runs, and of the references
+    archive = ranking.archive(scores, "simulated")
+    before = archive.file.stat().st_mtime_ns
+    assert len(archive.names) == 4  # of three runs, and of the references
     shutil.rmtree(runs)
     ranking.main(runs, folder, seeds=(0, 1), methods=("srnn",), **options)  # scored, which is enough
     assert not runs.exists()
     ranking.main(runs, **options)
-    assert before == archive.stat().st_mtime_ns
+    assert before == archive.file.stat().st_mtime_ns
     page.write_text(page.read_text().replace("simulated", "tables"))
     (best,) = re.findall(r"^May be the best, .* with 2 seeds or more: (.*)\.$", page.read_text(), re.MULTILINE)
     assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # of the other there is one seed
@@ -518,8 +545,8 @@ def test_a_page_without_both_marks_is_left_as_it_is(tmp_path, text):
 
 def test_minutes_are_told_of_processors():
     def told(**minutes):
-        runs = [ranking.Scored([], {}, {}, n, {"training": {"accelerator": where}}) for where, n in minutes.items()]
-        return ranking.trained(ranking.Entry(runs))
+        found = [{"minutes": n, "config": {"training": {"accelerator": where}}} for where, n in minutes.items()]
+        return ranking.trained(engine.Row(found))
 
     assert told(auto=4.0, cuda=1.0) == ("2", "4.0")
     assert told(auto=4.0, cpu=6.0) == ("2", "5.0")
@@ -554,12 +581,12 @@ def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
     free, held, nearest = (ranking.entries(folder / "parts", "simulated", view, ["gsps"]) for view in views)
     assert "nearest neighbours" in free
     assert held.keys() == nearest.keys() == {"gsps"}
-    assert (held["gsps"].means("APD lower") == 0).all()
-    assert (held["gsps"].means("APD upper") > 0).all()
-    whole, *parts = (free["gsps"].means(f"APD{part}") for part in ("", " lower", " upper"))
+    assert (held["gsps"].values("APD lower") == 0).all()
+    assert (held["gsps"].values("APD upper") > 0).all()
+    whole, *parts = (free["gsps"].values(f"APD{part}") for part in ("", " lower", " upper"))
     assert (np.minimum(*parts) > 0).all()
-    assert (nearest["gsps"].means("APD lower") > 0).all()
-    assert (nearest["gsps"].means("APD lower") < parts[0]).all()
+    assert (nearest["gsps"].values("APD lower") > 0).all()
+    assert (nearest["gsps"].values("APD lower") < parts[0]).all()
     assert (np.maximum(*parts) < whole).all()
     assert (whole < sum(parts)).all()
 
@@ -578,7 +605,7 @@ def test_every_row_has_a_folder_of_its_own():
     """By a name that a sweep takes."""
     sets = [each.methods for each in ranking.SETS.values()]
     for rows in [*sets, *(each.rows for each in papers.PAPERS.values()), *(s.cases for s in tuning.SECTIONS.values())]:
-        folders = [ranking.folder(row) for row in rows]
+        folders = [engine.folder(row) for row in rows]
         assert len({*folders}) == len(rows)
         assert all(re.fullmatch(r"[\w.=+-]+", name) for name in folders), folders
 
@@ -611,7 +638,7 @@ def test_a_second_stage_alone_stands_on_the_first_of_its_set(folder, tmp_path, m
     monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
     ranking.main(tmp_path, folder, ("simulated",), ("dlow",), (0,), 2, tmp_path / "scores")
     assert Run(tmp_path / "simulated" / "cvae-seed0").config["training"]["steps"] == 3
-    assert not any(name.startswith("cvae-") for name in ranking.members(tmp_path / "scores" / "simulated.zip"))
+    assert not any(name.startswith("cvae-") for name in ranking.archive(tmp_path / "scores", "simulated").names)
 
 
 def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, capsys, monkeypatch):
@@ -626,7 +653,7 @@ def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, 
         assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # reference rows alone are no table
         ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=(name,), scores=tmp_path / "scores")
     assert judged == ["simulated", "simulated"]
-    names = ranking.members(tmp_path / "scores" / "longer.zip")
+    names = ranking.archive(tmp_path / "scores", "longer").names
     assert names
     assert not any(name.startswith(f"{ranking.REFERENCES}/") for name in names)
     assert [Run(tmp_path / name / "srnn-seed0").config["training"]["steps"] for name in ranking.SETS] == [2, 3]
