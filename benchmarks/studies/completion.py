@@ -29,7 +29,7 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.data.views import WHOLE
+from dvae.data.batch import WHOLE
 from dvae.inference.evaluation.result import canvas
 from dvae.motion import bodies
 from dvae.motion.geometry.rotations import to_matrix

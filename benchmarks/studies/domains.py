@@ -19,7 +19,6 @@ import tyro
 from torch import Tensor
 
 import dvae
-from dvae.data.sequences import each
 from dvae.inference.evaluation.scores import CRPS, ENERGY, LEVELS, Measure, coverage_at
 from dvae.tables.dataset import PanelData
 from dvae.tables.domains import speech

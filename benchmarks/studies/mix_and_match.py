@@ -30,7 +30,6 @@ from dvae.inference.evaluation.scores import Measure
 from dvae.models.motion.codes import CodeDiversity, code_diversity
 from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.judges.quality import STILL, RealOrMade, quality
-from dvae.program.batch import rows
 
 from .engine import OURS, Row, budget, fitted, folder, measure, read, scores_of, settings, spread
 from .pages import DOCS, table, tabled, write
@@ -123,7 +122,7 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
     train, test = data.windows("train"), data.windows("test")
     fewer = test.with_protocol(replace(test.protocol, test_stride=THINNED * test.protocol.test_stride))
     some = torch.linspace(0, len(test) - 1, min(WATCHED, len(test))).long()
-    past = rows(past_of(test.all(), test.protocol.observed), some)
+    past = test.all().past(test.protocol.observed).rows(some)
     watch = CodeDiversity(past, every=max(steps // 15, 1))
     training = {**TRAINING, "steps": steps, "validate_every": max(steps // 3, 1), "callbacks": [watch]}
     fit = fitted(method, data, train, out=out, seed=seed, **training)

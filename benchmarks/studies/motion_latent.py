@@ -19,7 +19,6 @@ import tyro
 
 import dvae
 from dvae import motion
-from dvae.data.sequences import each
 from dvae.inference.evaluation.result import canvas
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import Segments

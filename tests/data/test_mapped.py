@@ -20,7 +20,7 @@ from dvae.cli.tables import is_table
 from dvae.data import npy
 from dvae.data.blocks import ColumnSummary, hash_list, hash_values, row_blocks
 from dvae.data.npy import is_mapped, mapped
-from dvae.data.sequences import Sequences, leaves, sequences
+from dvae.data.sequences import Sequences, sequences
 from dvae.tables import Column, Columns, Cut, Panel, PanelData, Series
 
 CUT = Cut(6, 4, split="time")

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 import dvae
-from dvae.data.views import LOG_DET, History, Parts, Past, View, Views
+from dvae.data.batch import Batch
+from dvae.data.views import History, Parts, Past, View, Views
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.models.motion.trajectories import Rest
 from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
@@ -299,11 +300,11 @@ def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
     knee = [i for i in range(D) if i // 3 in (1, 2)]  # of the joints without the root: RKnee, RFoot
     rest = [i for i in range(D) if i not in knee]
     view, x = Bones(WALKER, 4, {"shank": knee, "rest": rest}), rigid(4, D)
-    seen = view({"x": x, "shank": x[..., knee]})
+    seen = view(Batch({"x": x, "shank": x[..., knee]}))
     assert torch.equal(seen["shank"], seen["x"][..., knee])
-    assert torch.equal(view({"rest": x[..., rest]}, seen)["rest"], seen["x"][..., rest])
+    assert torch.equal(view(Batch({"rest": x[..., rest]}), seen)["rest"], seen["x"][..., rest])
     with pytest.raises(ValueError, match="shank alone does not tell that of RKnee, which hangs from RHip"):
-        view({"shank": x[..., knee]}, seen)
+        view(Batch({"shank": x[..., knee]}), seen)
 
 
 def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
@@ -442,7 +443,7 @@ def test_views_in_a_row_add_their_volumes():
     assert Views(parts, History("h")).keeps_volume
     with pytest.raises(ValueError, match="changes the volume of frames that nothing scores"):
         Views(Scaled(), Past("s"))
-    assert Views(Past("s"), Scaled()).log_det({"x": x}).shape == (B,)
+    assert Views(Past("s"), Scaled()).log_det(Batch({"x": x})).shape == (B,)
 
 
 def test_what_a_scaled_model_makes_goes_back_and_it_is_fitted_by_the_bound_of_the_data():

@@ -1,11 +1,14 @@
 """What makes the page of the domains, on little: it goes on where it was, and its tables are of what is there."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.studies import domains, engine
 from dvae import tables
+from dvae.inference.evaluation.estimates import Crossed
 from dvae.tables import Column, Columns, Panel, Series, reading
 from dvae.tables.protocol import Cut
 

@@ -267,6 +267,7 @@ def wait_for(condition, process, seconds=120):
     while not condition() and time.monotonic() < deadline:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
+    assert condition(), f"nothing after {seconds} s"
 
 
 def alive(group):

@@ -17,7 +17,6 @@ from dvae.cli import main
 from dvae.cli.app import COMMANDS, command
 from dvae.cli.console import Missing
 from dvae.cli.help import Expert
-from dvae.data.sequences import gapped, past_of
 from dvae.inference.diagnostics.checks import STATISTICS
 from dvae.inference.evaluation import metrics
 from dvae.inference.evaluation.held import clip_places
@@ -120,7 +119,7 @@ def test_turns_of_joints_need_whole_bodies(tmp_path):
     found = replace(PEOPLE.with_rotations(), missing=True)
     batch = motion.windows(found, turned, "test").all()
     with pytest.raises(ValueError, match="leaves the turns of others open"):
-        motion.windows(found, turned, "test").schema.view({**batch, "mask": {"x": batch["mask"]}})
+        motion.windows(found, turned, "test").schema.view(batch | {"mask": {"x": batch["mask"]}})
     for format in ("bvh", "amass"):
         with pytest.raises(ValueError, match=f"lacks joints, and {format} has no gaps; fill them first.*or write npz"):
             motion.write_motion(tmp_path / "folder", GAPS, format)
@@ -261,8 +260,8 @@ def test_a_diversity_with_gaps_is_that_of_what_pairs_share():
 
 def test_what_is_forecast_in_gaps_changes_no_score_and_the_truth_errs_in_nothing():
     whole, windows = (motion.windows(each, motion.PROTOCOLS["simulated"], "test") for each in (PEOPLE, GAPS))
-    observed, x, index = windows.protocol.observed, gapped(windows.all()), torch.arange(len(windows))
-    past, truth, clips = past_of(windows.all(), observed), x[:, observed:], clip_places(windows.keys)
+    observed, x, index = windows.protocol.observed, windows.all().mask_to_nan(), torch.arange(len(windows))
+    past, truth, clips = windows.all().past(observed), x[:, observed:], clip_places(windows.keys)
     forecasts, real = torch.randn(len(x), 3, *truth.shape[1:]), whole.all()["x"][:, None, observed:]
     anywhere = torch.where(truth[:, None].isnan(), 9.0, forecasts)
     measures = {measure.name: measure for measure in motion.scores(windows)}

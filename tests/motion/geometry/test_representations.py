@@ -10,7 +10,6 @@ from dvae import motion
 from dvae.cli.futures import draw_futures
 from dvae.data.batch import Batch
 from dvae.data.schema import SchemaError
-from dvae.data.sequences import leaves, past_of
 from dvae.inference.evaluation.held import clip_places
 from dvae.motion.geometry import kinematics, rotations
 from dvae.motion.geometry.views import LENGTHS, TURNS, Rotations
