@@ -1,18 +1,19 @@
-"""The evidence from both sides: annealed importance sampling from guide to posterior, and the same run backward.
+"""Bounds on the evidence from both sides: annealed importance sampling from guide to posterior, and in reverse.
 
     f_b(z) = q(z | x)^(1 - b) p(x, z)^b,    0 = b_0 < ... < b_L = 1,
     log w  = sum_l (b_l - b_{l-1}) (log p(x, z_l) - log q(z_l | x)),   z_1 ~ q,   z_{l+1} by a step that leaves f_{b_l}
 
-The mean weight is unbiased for p(x) (Neal, 2001), so that its logarithm is a lower bound on average, and one that the
-guide's shortcomings reach less and less as L grows; with L = 1 it is the importance-weighted bound. Where data are
-simulated from the model, its own latents are an exact draw from their posterior. Chains that start there and go back to
-the guide give weights whose mean inverse is unbiased for 1 / p(x): an upper bound (bidirectional Monte Carlo: Grosse,
-Ghahramani and Adams, 2015, arXiv 1511.02543). The evidence lies between the two, on average, and their gap on simulated
-data tells how far the lower bound is to be trusted on real ones from a model like it.
+The mean weight is unbiased for p(x) (Neal, 2001), so its logarithm is a lower bound on average. The larger L, the less
+the bound depends on the quality of the guide; with L = 1 it is the IWAE bound.
 
-Transitions are Hamiltonian, of all chains of all sequences as the rows of one batch. Coordinates are measured in the
-guide's own deviations. Lengths of steps are found by chains of their own, for each sequence and temperature, and then
-held: chains that choose their steps by where they are would not leave f_b as it is.
+If data are simulated from the model, the simulated latents are an exact draw from their posterior. Chains that start
+there and run back to the guide give weights whose mean inverse is unbiased for 1 / p(x): an upper bound (bidirectional
+Monte Carlo: Grosse, Ghahramani and Adams, 2015, arXiv 1511.02543). On average the evidence lies between the two. Their
+gap on simulated data shows how reliable the lower bound is on real data for a similar model.
+
+Transitions are Hamiltonian, with all chains of all sequences as the rows of one batch. Coordinates are in the guide's
+standard deviations. Separate chains tune the step sizes for each sequence and temperature, which then stay fixed.
+Chains that adapt their own step sizes would not leave f_b invariant.
 """
 
 from __future__ import annotations
@@ -34,32 +35,32 @@ from ..evaluation.result import progress_bar
 from .elbo import joint_and_guide, require_data, require_latents, require_likelihood
 
 ACCEPTED = 0.8
-"""Share of Hamiltonian proposals that lengths of steps are made for."""
+"""Target acceptance rate of Hamiltonian proposals."""
 TRIED = 4
-"""Chains that find lengths of steps."""
+"""Number of chains that tune the step sizes."""
 DRAWS = 32
-"""From the guide, at least, of which its deviations are told."""
+"""Fewest draws from the guide for its standard deviations."""
 FIRST, LEAST, MOST = 0.2, 1e-4, 2.0
-"""Length of a step, in the guide's deviations: of the first, and what it stays between."""
+"""Initial, smallest and largest step size, in the guide's standard deviations."""
 
 
 @dataclass(frozen=True)
 class AnnealedBound:
-    """Bounds of every sequence by annealed importance sampling, and how the chains fared.
+    """Bounds of every sequence by annealed importance sampling, with statistics of the chains.
 
     Args:
-        bound: (B,) log of the estimated evidence, in nats; below it on average, or above it where chains ran backward.
-        error: (B,) standard error of that, by the spread of the weights, with K - 1 degrees of freedom for an interval
-            by Student's t. It is the error of the modes that the chains visit: where they all stay in one of two equal
+        bound: log of the estimated evidence, in nats, (B,); on average below it, or above it for reverse chains.
+        error: standard error of the bound, (B,), from the spread of the weights, with K - 1 degrees of freedom for an
+            interval by Student's t. It covers only the modes that the chains visit: if all stay in one of two equal
             modes, the bound is log 2 too low, whatever `error` and `effective` are. The upper bound on simulated data
-            shows such a deficit. With few effective chains the error is too small. NaN of chains that ran backward:
-            those of a sequence start at one draw, and their spread does not include the chance of that draw. The error
-            of a mean over sequences is by the spread of their bounds.
-        effective: (B,) effective number of chains, between 1 and K, or NaN, likewise. It does not see a mode that no
-            chain visits.
-        accepted: (B,) share of the proposals that were accepted.
-        chains: K.
-        temperatures: L.
+            reveals such a deficit. With few effective chains the error is too small. NaN for reverse chains: those of a
+            sequence start at one draw, and their spread does not include the randomness of that draw. For the error of
+            a mean over sequences, use the spread of their bounds.
+        effective: effective number of chains, between 1 and K, (B,); NaN for reverse chains. It does not account for a
+            mode that no chain visits.
+        accepted: share of accepted proposals, (B,).
+        chains: K, number of chains.
+        temperatures: L, number of temperatures.
     """
 
     bound: Tensor
@@ -83,26 +84,26 @@ def annealed_bound(
     chunk: int = 4096,
     progress: bool = False,
 ) -> AnnealedBound:
-    """A bound on the log evidence that comes near to it however bad the guide is, at the price of many evaluations.
+    """Return a bound on the log evidence that is tight even with a poor guide, at the cost of many evaluations.
 
     Args:
-        model: the model with its guide.
-        batch: see `DynamicalVAE.model`; ragged batches, missing entries and context included.
-        temperatures: L.
-        chains: K, of each sequence.
-        leaps: leapfrog steps of a transition, each a gradient of model and guide.
-        latents: name to exact draws (B, ...) from the posterior, such as those that the data were simulated with: the
-            chains then go from these to the guide, and the bound is an upper one.
-        seed: of the chains.
-        chunk: sequences times chains to hold at once.
+        model: model with its guide.
+        batch: batch as in `DynamicalVAE.model`, which may be ragged or have missing entries and context.
+        temperatures: L, number of temperatures.
+        chains: K, number of chains per sequence.
+        leaps: number of leapfrog steps of a transition, each a gradient of model and guide.
+        latents: exact draws (B, ...) from the posterior by name, such as the latents of simulated data; the chains then
+            run from these to the guide, and the bound is an upper one.
+        seed: seed of the chains.
+        chunk: largest number of sequences times chains in memory.
         progress: whether to show a bar.
 
     Returns:
-        Bound and what there is to know of it, (B,) each.
+        Bound and its statistics, (B,) each.
 
     Raises:
-        ValueError: a model without latents or likelihood, or whose sequences share latents; numbers below 1; data or
-            latents missing in the batch.
+        ValueError: when the model has no latents or likelihood, sequences share latents, a number is below 1, or data
+            or latents are missing in the batch.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
@@ -138,10 +139,10 @@ def annealed_bound(
 
 
 def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Latents from which chains go back, as the model has them.
+    """Return the latents from which reverse chains start, in the model's dtype and on its device.
 
     Raises:
-        ValueError: one that is missing, or of another shape.
+        ValueError: when a latent is missing, or has another shape.
     """
     if lacking := [name for name in model.latents if name not in latents]:
         raise ValueError(f"chains that go back start from all latents; missing are {', '.join(lacking)}")
@@ -162,7 +163,7 @@ class _Annealing:
     def __init__(self, model: DynamicalVAE, data: AnyBatch, temperatures: int, chains: int, leaps: int):
         self.model, self.chains, self.leaps = model, chains, leaps
         self.data = repeat(data, chains)
-        # slow at both ends, where little of one law is mixed into the other
+        # small steps at both ends, where the mixture has little of one distribution
         self.inverse = (1 - torch.cos(math.pi * torch.arange(temperatures + 1) / temperatures)).double() / 2
         self.levels = range(1, temperatures)
         draws = [model.guide(self.data) for _ in range(math.ceil(DRAWS / chains))]
@@ -171,7 +172,7 @@ class _Annealing:
         self.scale = drawn.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
 
     def lengths(self) -> dict[int, Tensor]:
-        """Of steps at each temperature, (B,), by chains that count for nothing else."""
+        """Return step sizes (B,) at each temperature, tuned by chains that are used for nothing else."""
         points = self._joined(self.model.guide(self.data))
         step, found = points.new_full((len(points) // self.chains,), FIRST), {}
         for level in self.levels:
@@ -183,7 +184,7 @@ class _Annealing:
     def run(
         self, lengths: Mapping[int, Tensor], start: Mapping[str, Tensor] | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Bound, error, effective number and acceptance, (B,) each; with a start, of chains that go back."""
+        """Return bound, error, effective number and acceptance, (B,) each; with a start, of reverse chains."""
         back = start is not None
         points = self._joined(self.model.guide(self.data) if start is None else repeat(start, self.chains))
         weights, rate = points.new_zeros(len(points)), []
@@ -192,7 +193,7 @@ class _Annealing:
             if level in lengths:
                 points, accepted, ratio = self._move(points, float(self.inverse[level]), lengths[level])
                 rate.append(accepted)
-            else:  # the last one, after which nothing moves
+            else:  # at the end, without a transition
                 joint, own = self._densities(points)
                 ratio = joint - own
             weights += gaps[level if back else level - 1] * ratio
@@ -207,15 +208,16 @@ class _Annealing:
         return bound, spread, effective, accepted
 
     def _move(self, points: Tensor, inverse: float, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A Hamiltonian transition that leaves f_b as it is.
+        """Make a Hamiltonian transition that leaves f_b invariant.
 
         Args:
-            points: (R, N).
+            points: points (R, N).
             inverse: b, an inverse temperature.
-            step: (B,), lengths in the guide's deviations.
+            step: step sizes (B,), in the guide's standard deviations.
 
         Returns:
-            Points (R, N); the share that was accepted (B,); and log p(x, z) - log q(z | x), (R,), where they were.
+            Points (R, N); the acceptance rate (B,); and log p(x, z) - log q(z | x), (R,), at the points before the
+            move.
         """
         length = step.repeat(self.chains)[:, None]
         momentum = torch.randn_like(points)
@@ -232,8 +234,8 @@ class _Annealing:
         return points, chance.unflatten(0, (self.chains, -1)).mean(0), weight
 
     def _slope(self, points: Tensor, inverse: float) -> tuple[Tensor, Tensor, Tensor]:
-        """log f_b (R,), its gradient (R, N), and log p(x, z) - log q(z | x), (R,)."""
-        # cuDNN has no gradients of recurrent networks in evaluation
+        """Return log f_b (R,), its gradient (R, N), and log p(x, z) - log q(z | x), (R,)."""
+        # cuDNN has no gradients of recurrent networks in evaluation mode
         with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False):
             points = points.detach().requires_grad_()
             joint, own = self._densities(points)
@@ -242,7 +244,7 @@ class _Annealing:
         return tempered.detach(), slope.nan_to_num(), (joint - own).detach()
 
     def _densities(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """log p(x, z) and log q(z | x), (R,) each."""
+        """Return log p(x, z) and log q(z | x), (R,) each."""
         return joint_and_guide(self.model, self.data, split(points, self.like))
 
     def _joined(self, values: Mapping[str, Tensor]) -> Tensor:

@@ -1,8 +1,8 @@
 """Bounds on the log evidence, as terms per sequence.
 
-`SequenceELBO` is the evidence lower bound with analytic KL terms wherever these are right; `importance_bound` the
-importance-weighted one (Burda et al., 2016, arXiv 1509.00519) with the Pareto diagnosis of its weights (Vehtari et al.,
-2024, arXiv 1507.02646).
+`SequenceELBO` is the evidence lower bound, with analytic KL terms wherever they are correct. `importance_bound` is the
+IWAE bound (Burda et al., 2016, arXiv 1509.00519) with the Pareto diagnostic of its weights (Vehtari et al., 2024, arXiv
+1507.02646).
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ from ...turns import alone
 
 @dataclass
 class Terms:
-    """What a bound is made of, per sequence and in nats.
+    """Terms of a bound, per sequence and in nats.
 
     Args:
-        log_likelihood: data variable to (B,); beside them the log-determinant of a view that changes volume.
-        kl: latent to (B,); summed over the steps of a local one.
-        energies: penalty (a `pyro.factor` site) to (B,), positive where it costs.
-        frames: (B,) number of valid steps.
-        steps: local variable to (B, T): its log-likelihood or KL by step, 0 at padding.
+        log_likelihood: log-likelihood (B,) of each data variable; for a view that changes volume, also the
+            log-determinant.
+        kl: KL (B,) of each latent, summed over the steps of a local one.
+        energies: energy (B,) of each penalty (a `pyro.factor` site), positive if it costs.
+        frames: number of valid steps, (B,).
+        steps: log-likelihood or KL by step (B, T) of each local variable, 0 at padding.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -58,35 +59,36 @@ class Terms:
 
     @property
     def likelihood(self) -> bool:
-        """Whether there is a likelihood. Where energies take its place, `bound` is minus the KL terms alone."""
+        """Whether there is a likelihood; if energies replace it, `bound` is minus the KL terms."""
         return bool(self.log_likelihood)
 
     @property
     def bound(self) -> Tensor:
-        """(B,) the unweighted evidence lower bound; energies are not part of it."""
+        """Unweighted evidence lower bound, (B,), without energies."""
         none = torch.zeros_like(self.frames)
         return sum(self.log_likelihood.values(), none) - sum(self.kl.values(), none)
 
     @property
     def per_frame(self) -> Tensor:
-        """(B,) the bound in nats per frame."""
+        """Bound in nats per frame, (B,)."""
         return self.bound / self.frames
 
 
 class SequenceELBO(ELBO):
-    """The evidence lower bound of a sequence model.
+    """Evidence lower bound of a sequence model.
 
-    A Pyro ELBO, to be used as any other; `terms` gives it by variable and sequence. The KL of a latent is analytic per
-    step where none of its generative parents is its descendant in the guide, and both conditionals are normal; else it
-    is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic form is wrong:
-    it treats parents as fixed that move with the latent.) The parents are those of the program as it is run: where x
-    is missing or fed, the model reads its own mean, which moves with the parents of x.
+    It can be used like any Pyro ELBO; `terms` returns it by variable and sequence. The KL of a latent is analytic per
+    step if both conditionals are normal and no generative parent of the latent is its descendant in the guide.
+    Otherwise it is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic
+    form is wrong: it holds parents fixed that vary with the latent.) The parents are those of the program as it runs:
+    where x is missing or replaced in scheduled sampling, the model reads its own mean, which varies with the parents of
+    x.
 
-    It takes traces as `TraceMeanField_ELBO` does and agrees with it where that is right, but evaluates every
-    conditional once, where that would do so for the trace's own log probability too.
+    It traces like `TraceMeanField_ELBO` and agrees with it where that is correct. It evaluates each conditional only
+    once, as it does not compute the trace's own log probability.
 
     Args:
-        num_particles: draws from the guide to average over.
+        num_particles: number of draws from the guide to average.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -100,33 +102,33 @@ class SequenceELBO(ELBO):
     def terms(
         self, model: Callable[..., Any], batch: AnyBatch, guide: Callable[..., Any] | None = None, **options: Any
     ) -> Terms:
-        """The bound's terms, averaged over the particles.
+        """Return the terms of the bound, averaged over the particles.
 
         Args:
             model: a `DynamicalVAE`, or a Pyro model that wraps its program.
-            batch: see `DynamicalVAE.model`.
-            guide: the model's own, if not given.
-            options: of the program, such as `self_feeding`.
+            batch: batch as in `DynamicalVAE.model`.
+            guide: guide; the model's own by default.
+            options: options of the program, such as `self_feeding`.
 
         Raises:
-            ValueError: sites that are scaled or missing in guide or model.
+            ValueError: when a site is scaled, or missing in guide or model.
         """
         guide = guide or model.guide  # type: ignore[attr-defined]
         draws = [self._terms(model, guide, (batch,), options) for _ in range(self.num_particles)]
         return draws[0] if len(draws) == 1 else _mean(draws)
 
     def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
-        """Minus the bound plus the energies, summed over the batch."""
+        """Return minus the bound plus the energies, summed over the batch."""
         draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
         return sum(sum(t.energies.values()) - t.bound for t in draws).sum() / self.num_particles  # type: ignore[return-value, union-attr]
 
     def loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
-        """`differentiable_loss` as a number."""
+        """Return `differentiable_loss` as a number."""
         with torch.no_grad():
             return self.differentiable_loss(model, guide, *args, **kwargs).item()
 
     def loss_and_grads(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
-        """`differentiable_loss` as a number, its gradient left in the parameters."""
+        """Return `differentiable_loss` as a number, and add its gradient to the parameters."""
         loss = self.differentiable_loss(model, guide, *args, **kwargs)
         loss.backward()
         return loss.item()
@@ -160,7 +162,7 @@ class SequenceELBO(ELBO):
             else:
                 raise ValueError(f"the latent {name} is in the model but not in the guide")
         found = [*terms.log_likelihood.values(), *terms.kl.values(), *terms.energies.values()]
-        if found and not len(terms.frames):  # nothing has steps: a sequence counts once
+        if found and not len(terms.frames):  # no variable has steps, so each sequence counts once
             terms.frames = torch.ones_like(found[0])
         return terms
 
@@ -171,10 +173,10 @@ def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Tra
 
 
 def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
-    """The sample sites of a trace by name, but for what all sequences share, which model and guide draw alike.
+    """Return the sample sites of a trace by name, except variables that all sequences share, drawn alike in both.
 
     Raises:
-        ValueError: a site that a handler has scaled or masked.
+        ValueError: when a handler has scaled or masked a site.
     """
     sites = {
         name: site
@@ -191,23 +193,23 @@ def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
 
 
 def site_log_prob(fn: Any, value: Tensor) -> Tensor:
-    """(B, T) of a local variable, (B,) of a static one."""
+    """Return the log probability, (B, T) for a local variable, (B,) for a static one."""
     return fn.by_step(value) if isinstance(fn, Sequence) else fn.log_prob(value)
 
 
 def log_densities(trace: Any) -> dict[str, Tensor]:
-    """Of the sample sites of a trace, energies apart: see `site_log_prob`."""
+    """Return the log probabilities of the sample sites of a trace, without energies; see `site_log_prob`."""
     sites = sites_of(trace).items()
     return {n: site_log_prob(s["fn"], s["value"]) for n, s in sites if n == "log_det" or not isinstance(s["fn"], Unit)}
 
 
 def total(logs: Mapping[str, Tensor]) -> Tensor:
-    """(B,), the sum over variables and steps."""
+    """Return the sum over variables and steps, (B,)."""
     return sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values())  # type: ignore[return-value]
 
 
 def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """log p(x, z) and log q(z | x) at these latents, (B,) each."""
+    """Return log p(x, z) and log q(z | x) at these latents, (B,) each."""
     traces = (
         poutine.trace(poutine.condition(each, data=dict(latents))).get_trace(batch)
         for each in (model.model, model.guide)
@@ -217,16 +219,16 @@ def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, 
 
 
 def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]) -> set[str]:
-    """The latents whose KL term may be analytic; none for programs whose factorizations are not known."""
-    # In a replayed model the latents' sites carry the guide's notes; those of the data carry its own.
+    """Return the latents whose KL term may be analytic; none for programs whose factorizations are unknown."""
+    # In a replayed model, latent sites have the guide's `infer` dict; data sites have the model's.
     sites = ([site for site in model_sites.values() if site["is_observed"]], guide_sites.values())
     notes = [next((s["infer"] for s in group if "program" in s["infer"]), None) for group in sites]
     if None in notes:
         return set()
     pair, run = [note["program"] for note in notes], notes[0]["run"]  # type: ignore[index]
-    # Data that are missing, fed, or a function of their parents are read as what these make of them.
+    # Data that are missing, fed back, or a function of their parents vary with these parents.
     hidden = frozenset(run.hidden) | {name for name, s in model_sites.items() if s["infer"].get("_deterministic")}
-    depends = hidden or any(equations.masks for equations in pair)  # on the length
+    depends = hidden or any(equations.masks for equations in pair)  # whether it depends on the length
     right = _analytic(*pair, hidden, run.length if depends else None)
     return {name for name, analytic in right.items() if analytic}
 
@@ -235,16 +237,16 @@ _analytic = functools.lru_cache(maxsize=256)(analytic_kl)
 
 
 def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
-    """(B, T) or (B,): the divergence of q from p where a closed form is right and known, else the log-ratio."""
+    """Return the KL (B, T) or (B,) of q from p: a closed form if it is correct and known, otherwise the log-ratio."""
     if closed:
         try:
             if isinstance(p, Sequence) and isinstance(q, Sequence):
                 return p.counted(kl_divergence(q.steps(value), p.steps(value)))
             return kl_divergence(q, p)
-        except NotImplementedError:  # no closed form for this pair of families
+        except NotImplementedError:  # this pair of families has no closed form
             pass
     ours, theirs = site_log_prob(q, value), site_log_prob(p, value)
-    if ours.dim() != theirs.dim():  # a guide of the user's own, whose density has no steps
+    if ours.dim() != theirs.dim():  # a custom guide, whose density is not by step
         ours, theirs = (part.sum(-1) if part.dim() == 2 else part for part in (ours, theirs))
     return ours - theirs
 
@@ -253,7 +255,7 @@ def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, ru
     if run is not None and run.draws > 1:
         value = value.unflatten(0, (run.draws, -1)).mean(0)
     if value.dim() == 2:
-        if not len(terms.frames):  # a program of the user's own, that says nothing of its length
+        if not len(terms.frames):  # a custom program that does not give its length
             terms.frames = value.new_full((len(value),), float(value.shape[1]))
         terms.steps[name] = value
         value = value.sum(-1)
@@ -280,7 +282,7 @@ def require_likelihood(model: DynamicalVAE) -> None:
     """Refuse a model whose data are functions of its latents.
 
     Raises:
-        ValueError: it has no likelihood, and so no bound.
+        ValueError: when the model has no likelihood, and so no bound.
     """
     if not model.likelihood:
         raise ValueError(
@@ -290,10 +292,10 @@ def require_likelihood(model: DynamicalVAE) -> None:
 
 
 def require_latents(model: DynamicalVAE) -> None:
-    """Refuse a model in which nothing is drawn.
+    """Refuse a model without sampled latents.
 
     Raises:
-        ValueError: it has no latents but those that are summed out.
+        ValueError: when the model has no latents except those that are summed out.
     """
     if not model.latents:
         summed = f" but {', '.join(model.summed)}, which is summed out" if model.summed else ""
@@ -301,10 +303,10 @@ def require_latents(model: DynamicalVAE) -> None:
 
 
 def require_data(model: DynamicalVAE, data: AnyBatch) -> int:
-    """The number of sequences of a batch that holds all that a bound needs.
+    """Return the number of sequences of a batch, after checking that it has everything that a bound needs.
 
     Raises:
-        ValueError: data or context are missing.
+        ValueError: when data or context are missing.
     """
     needed = (*model.observed, *model.context)
     if missing := [name for name in needed if name not in data]:
@@ -313,19 +315,19 @@ def require_data(model: DynamicalVAE, data: AnyBatch) -> int:
 
 
 KHAT_PARTICLES = 25
-"""Particles below which k-hat is not estimated: arviz_stats fits the tail to a fifth of them, and needs five."""
+"""Fewest particles for k-hat: arviz_stats fits the tail to a fifth of them, and needs five."""
 
 
 @dataclass(frozen=True)
 class ImportanceBound:
-    """The importance-weighted bound of every sequence and what it says of the guide.
+    """IWAE bound of every sequence, with a diagnostic of the guide.
 
     Args:
-        bound: (B,) log mean of the weights, in nats.
-        khat: (B,) Pareto shape of their tail. Above 0.7 the guide misses so much of the posterior that the bound is
-            unreliable at this number of particles. Infinite where a weight of the tail is 0, and NaN with fewer than
-            25 particles alone. With fewer than about 100, k-hat is mostly noise in a single sequence.
-        particles: K.
+        bound: log mean of the weights, in nats, (B,).
+        khat: Pareto shape of the tail of the weights, (B,). Above 0.7 the guide misses so much of the posterior that
+            the bound is unreliable with this number of particles. Infinite if a weight of the tail is 0; NaN with fewer
+            than 25 particles. With fewer than about 100, k-hat of a single sequence is mostly noise.
+        particles: K, number of particles.
     """
 
     bound: Tensor
@@ -337,18 +339,18 @@ class ImportanceBound:
 def importance_bound(
     model: DynamicalVAE, batch: AnyBatch, particles: int = 100, *, chunk: int = 4096, **options: Any
 ) -> ImportanceBound:
-    """The importance-weighted bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
+    """Return the IWAE bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
 
     Its mean rises with the number of particles, from the evidence lower bound at 1 to the log evidence. With fewer than
-    25 particles the tail shape is not estimated (nan). Of a model without latents it is the log-likelihood,
-    with k-hat 0, and evaluated once.
+    25 particles the tail shape is NaN. For a model without latents it is the log-likelihood, evaluated once, with k-hat
+    0.
 
     Args:
-        model: the model with its guide.
-        batch: see `DynamicalVAE.model`.
-        particles: K.
-        chunk: sequences times particles to hold at once.
-        options: of the program.
+        model: model with its guide.
+        batch: batch as in `DynamicalVAE.model`.
+        particles: K, number of particles.
+        chunk: largest number of sequences times particles in memory.
+        options: options of the program.
 
     Returns:
         Bound and tail shape, (B,) each.
@@ -379,16 +381,16 @@ def importance_mean(
     chunk: int = 4096,
     groups: Groups | None = None,
 ) -> ImportanceBound:
-    """The log of the mean weight of every sequence, and the shape of the weights' tail.
+    """Return the log of the mean weight of every sequence, and the tail shape of the weights.
 
-    Sequences that share latents have one weight together, and each an equal share of its logarithm.
+    Sequences that share latents have one joint weight, whose logarithm is divided equally among them.
 
     Args:
-        log_weights_of: from a number n of particles to the logs (n B,) of weights, particle by particle.
-        size: B.
-        particles: K.
-        chunk: sequences times particles to hold at once.
-        groups: of sequences that share latents.
+        log_weights_of: function from a number n of particles to log weights (n B,), particle by particle.
+        size: B, number of sequences.
+        particles: K, number of particles.
+        chunk: largest number of sequences times particles in memory.
+        groups: groups of sequences that share latents.
     """
     at_once = max(1, min(particles, chunk // size))
     counts = [min(at_once, particles - first) for first in range(0, particles, at_once)]
@@ -411,7 +413,7 @@ def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any
 
 
 def _khat(log_weights: Tensor) -> Tensor:
-    """(B,) Pareto tail shape of weights (K, B)."""
+    """Return the Pareto tail shape (B,) of weights (K, B)."""
     if log_weights.shape[0] < KHAT_PARTICLES:
         return log_weights.new_full(log_weights.shape[1:], math.nan)
     khat = [_tail_shape(weights) for weights in log_weights.double().cpu().numpy().T]
@@ -419,15 +421,15 @@ def _khat(log_weights: Tensor) -> Tensor:
 
 
 def _tail_shape(log_weights: np.ndarray) -> float:
-    """The Pareto shape of weights (K,); by Hill's estimate where the tail underflows or is all the same."""
-    from arviz_stats.base import array_stats  # over a second to import
+    """Return the Pareto shape of weights (K,); Hill's estimate if the tail underflows or is constant."""
+    from arviz_stats.base import array_stats  # the import takes over a second
 
     tail = np.sort(log_weights)[-(len(log_weights) // 5) - 1 :]
     if not np.isfinite(tail).all():
         return math.inf
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
-            # psislw is made for leave-one-out: it takes log likelihoods, whose negatives are the log weights.
+            # psislw is for leave-one-out: it takes log-likelihoods, the negatives of the log weights.
             khat = float(array_stats.psislw(-log_weights)[1])
     except (FloatingPointError, ValueError):
         khat = math.nan

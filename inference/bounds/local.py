@@ -1,18 +1,19 @@
-"""Guides of single sequences: the best that a guide's law and arrows allow, were there no network to share.
+"""Semi-amortized guides: the best guide per sequence that the guide's family and edges allow, without amortization.
 
     q_n(v | parents) = N(m + s_0 (b_n + sum_u W_nu (u - c_u) / d_u),  s exp(a_n))
 
-m and s are what the guide's own conditional says, given the data and the latents that it reads. b_n, a_n and W_nu are
-free for every sequence n, every step of v and every step u of the latents that v may read. They begin at 0, where q_n
-is the guide, and go up the evidence lower bound of their sequence. s_0, c_u and d_u are units, from draws of the guide:
-mean deviations given what is read, means and deviations of what is read.
+m and s are the output of the guide's own conditional, given the data and the latents that it reads. b_n, a_n and W_nu
+are free parameters for every sequence n, every step of v and every step u of the latents that v may read. They start at
+0, where q_n is the guide, and maximise the evidence lower bound of their sequence. s_0, c_u and d_u are units computed
+from draws of the guide: mean conditional deviations of v, and means and deviations of u.
 
-So whatever a network could make of the data is within reach, and the guide itself too. What it makes of latents stays,
-up to a linear function of them. A guide that reads none becomes the best product of
-normals for the sequence, as in Cremer, Li and Duvenaud (2018, arXiv 1801.03558); a linear one, the best linear one.
+The corrections can represent any function of the data that a network could compute, including the guide itself. The
+dependence on latents can change only by a linear function. A guide that reads no latents becomes the best product of
+normals for the sequence, as in Cremer, Li and Duvenaud (2018, arXiv 1801.03558); a linear one becomes the best linear
+one.
 
-Gradients are those of the path alone (Roeder, Wu and Duvenaud, 2017, arXiv 1703.09194): they have no noise where the
-guide is the posterior.
+Gradients are path derivatives (Roeder, Wu and Duvenaud, 2017, arXiv 1703.09194), which have no noise if the guide is
+the posterior.
 """
 
 from __future__ import annotations
@@ -39,21 +40,24 @@ from ..evaluation.held import reproducibly
 from .elbo import joint_and_guide, require_data, require_latents, require_likelihood, sites_of
 
 UNITS = 32
-"""Draws from the guide of which units are taken."""
+"""Number of draws from the guide for the units."""
 NAT = 1.0
-"""Slopes well below it, in nats a deviation, are followed in proportion, as by gradient ascent, those above by sign.
-By sign alone, as Adam has it, the noise of those that are 0 would be followed too, and many arrows have such."""
+"""Epsilon of Adam, in nats per deviation: much smaller gradients are followed in proportion, larger ones by sign.
+
+With steps by sign alone, the usual behaviour of Adam, the noise of zero gradients would be followed too, and many edges
+have such gradients.
+"""
 
 
 @dataclass(frozen=True)
 class Link:
-    """How the location of a latent at S steps moves with another one, for B sequences.
+    """Linear dependence of the location of a latent at S steps on another latent, for B sequences.
 
     Args:
-        parent: the latent that is read.
-        to, of: (P,) places among the S steps, in order, and steps of the parent, 0 of a static one.
-        weight: (B, P, E, D), in units.
-        centre, deviation: (B, P, E) of what is read.
+        parent: name of the latent that is read.
+        to, of: indices (P,) among the S steps, in order, and steps of the parent, 0 for a static one.
+        weight: weights (B, P, E, D), in units.
+        centre, deviation: mean and standard deviation (B, P, E) of the values that are read.
     """
 
     parent: str
@@ -64,7 +68,7 @@ class Link:
     deviation: Tensor
 
     def moves(self, values: Sequence[Tensor], steps: int) -> Tensor:
-        """(k, B, S, D) in units, from values (k B, E) of the parent by step."""
+        """Return shifts (k, B, S, D) in units, from values (k B, E) of the parent by step."""
         read = torch.stack([values[s] for s in self.of.tolist()], 1).unflatten(0, (-1, len(self.weight)))
         read = (read - self.centre) / self.deviation
         if steps == 1:
@@ -74,10 +78,10 @@ class Link:
         return each.new_zeros(*each.shape[:2], steps, each.shape[3]).index_add(2, to, each)
 
     def by_step(self, steps: int) -> list[Link | None]:
-        """The same for each of the steps alone, None where nothing is read."""
+        """Return one link for each of the steps, None if nothing is read there."""
         counts = np.bincount(self.to, minlength=steps)
         places = np.split(self.of, counts.cumsum()[:-1])
-        # not a slice for each: that would have a gradient as large as the whole
+        # split rather than slice: the gradient of a slice is as large as the whole tensor
         tensors = (each.split(counts.tolist(), 1) for each in (self.weight, self.centre, self.deviation))
         parts = zip(places, *tensors, strict=True)
         return [Link(self.parent, of * 0, of, *rest) if len(of) else None for of, *rest in parts]
@@ -85,13 +89,13 @@ class Link:
 
 @dataclass(frozen=True)
 class Correction:
-    """What is added to a conditional of the guide at S steps, 1 of a static latent, for B sequences.
+    """Correction of a conditional of the guide at S steps (1 for a static latent), for B sequences.
 
     Args:
-        unit: (B, S, D), deviations.
-        shift: (B, S, D) of the location, in units.
-        stretch: (B, S, D) of the logarithm of the scale.
-        links: to latents that are read.
+        unit: standard deviations (B, S, D).
+        shift: shift (B, S, D) of the location, in units.
+        stretch: shift (B, S, D) of the logarithm of the scale.
+        links: links to latents that are read.
     """
 
     unit: Tensor
@@ -100,7 +104,7 @@ class Correction:
     links: tuple[Link, ...]
 
     def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]]) -> Parameters:
-        """Location and scale (k B, S, D) from the guide's own, and from latents by step."""
+        """Return location and scale (k B, S, D) from those of the guide and the latents by step."""
         if len(parameters[0]) % len(self.unit):
             raise ValueError(
                 f"this guide is of {len(self.unit)} sequences of its own, and the batch has {len(parameters[0])} rows; "
@@ -114,7 +118,7 @@ class Correction:
         return loc.flatten(0, 1), scale.flatten(0, 1)
 
     def by_step(self) -> list[Correction]:
-        """The same for each of its steps alone."""
+        """Return one correction for each step."""
         steps = self.unit.shape[1]
         links = zip(*(link.by_step(steps) for link in self.links), strict=True) if self.links else [()] * steps
         tensors = (each.split(1, 1) for each in (self.unit, self.shift, self.stretch))
@@ -123,23 +127,23 @@ class Correction:
 
     @property
     def free(self) -> list[tuple[Tensor, int]]:
-        """What is to be found, and of how many numbers of it a location or a scale is made."""
+        """Free parameters, each with the number of its entries that affect one location or scale."""
         linked = [(link.weight, np.bincount(link.to).max() * link.weight.shape[2]) for link in self.links]
         return [(self.shift, 1), (self.stretch, 1), *linked]
 
     def freed(self, change: Callable[[Tensor], Tensor]) -> Correction:
-        """The same with that changed."""
+        """Return a copy with changed free parameters."""
         links = tuple(replace(link, weight=change(link.weight)) for link in self.links)
         return replace(self, shift=change(self.shift), stretch=change(self.stretch), links=links)
 
 
 class Local(nn.Module):
-    """A conditional of the guide with a correction, in its place.
+    """Conditional of the guide with a correction, which replaces the conditional.
 
     Args:
-        own: the guide's.
-        factor: what it reads now.
-        correction: of it.
+        own: conditional of the guide.
+        factor: factor with the present parents.
+        correction: correction of the conditional.
     """
 
     def __init__(self, own: Conditional, factor: Factor, correction: Correction):
@@ -148,7 +152,7 @@ class Local(nn.Module):
         self.parents = [parent.name for parent in factor.parents]
 
     def __getattr__(self, name: str) -> Any:
-        """What is not corrected is the guide's own."""
+        """Return attributes that are not corrected from the guide's conditional."""
         return super().__getattr__(name) if name == "own" else getattr(self.own, name)
 
     def forward(self, parents: Mapping[str, Tensor], *arguments: Any) -> Parameters:
@@ -160,7 +164,7 @@ class Local(nn.Module):
         return _alone(self.correction(_with_step(own), values))
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """The state of the guide's own loop, or its parameters by step where it reads nothing of what is drawn."""
+        """Return the state of the guide's loop, or its parameters by step if it reads no drawn variable."""
         known = {link.parent: _by_step(given[link.parent]) for link in self.correction.links if link.parent in given}
         steps = self.correction.by_step()
         if all(name in given for name in self.own.parents):
@@ -177,7 +181,7 @@ class Local(nn.Module):
         return _alone(steps[t](_with_step(own), {**drawn, **known})), (fixed, inner, known, steps)
 
     def chain(self, *_: Any) -> None:
-        """There is no fused loop of it."""
+        """Return None: there is no fused loop."""
 
 
 def _by_step(value: Tensor) -> Sequence[Tensor]:
@@ -205,24 +209,25 @@ def local_guide(
     seed: int = 0,
     progress: Callable[[], object] = lambda: None,
 ) -> DynamicalVAE:
-    """The model with a guide for these sequences alone, each at the best of its own bound (see the module).
+    """Return the model with a semi-amortized guide, fitted to the bound of each of these sequences (see the module).
 
     Args:
-        model: the model with its guide; of one that this function made, the search goes on where it is.
-        batch: the sequences. Programs of the model that is returned take these, in this order, or so many times over
-            (`importance_bound` and `annealed_bound` with a `chunk` of all of them), and nothing else.
-        missing: the guide reads the latents too that the posterior depends on and it does not, in its order of drawing
-            (`audit`).
-        steps: of Adam, with a rate that falls to 0.
-        rate: of the first of them, in deviations of the guide; what is read of other latents has together as much.
-        draws: of every sequence in each step.
-        reach: between local latents that are read linearly; None for all that the arrows allow.
-        seed: of the draws.
-        progress: called after each step.
+        model: model with its guide; for a result of this function, the search continues.
+        batch: sequences to fit. The returned model accepts only these sequences in this order, or whole repetitions of
+            them (`importance_bound` and `annealed_bound` with a `chunk` that covers all).
+        missing: whether the guide also reads the latents that the posterior depends on and it ignores, in its order of
+            drawing (`audit`).
+        steps: number of steps of Adam, with a learning rate that falls to 0.
+        rate: learning rate of the first step, in deviations of the guide; the weights of one location share it.
+        draws: number of draws of every sequence in each step.
+        reach: largest distance in steps between local latents with a linear dependency; None for all that the edges
+            allow.
+        seed: seed of the draws.
+        progress: function called after each step.
 
     Raises:
-        ValueError: a model without latents or likelihood, or latents of other laws than normals, or that sequences
-            share; numbers below 1; data missing in the batch.
+        ValueError: when the model has no latents or likelihood, a latent is not normal or shared by sequences, a number
+            is below 1, or data are missing in the batch.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
@@ -260,10 +265,10 @@ def local_guide(
 
 
 def require_local(model: DynamicalVAE) -> None:
-    """Refuses a model whose sequences have no local guides.
+    """Refuse a model for which semi-amortized guides are not possible.
 
     Raises:
-        ValueError: it has no latents or no likelihood, or laws of latents are no normals.
+        ValueError: when the model has no latents or no likelihood, or a latent is not normal in the guide.
     """
     require_likelihood(model)
     require_latents(model)
@@ -276,7 +281,7 @@ def require_local(model: DynamicalVAE) -> None:
 
 
 def missing_latents(model: DynamicalVAE) -> dict[str, tuple[Parent, ...]]:
-    """By latent, the latents that its guide does not read and the posterior depends on, in the guide's order."""
+    """Return for each latent those that its guide ignores and the posterior depends on, in the guide's order."""
     found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing_parents
     lacking = {name: tuple(p for p in parents if p.name in model.latents) for name, parents in found.items()}
     return {name: parents for name, parents in lacking.items() if parents}
@@ -285,7 +290,7 @@ def missing_latents(model: DynamicalVAE) -> dict[str, tuple[Parent, ...]]:
 def _start(
     model: DynamicalVAE, data: Mapping[str, Any], missing: bool, reach: int | None
 ) -> tuple[DynamicalVAE, dict[str, Correction]]:
-    """The model with corrections that are to be found, and these."""
+    """Return the model with initial corrections, and these corrections."""
     added = missing_latents(model) if missing else {}
     drawn = _Drawn(model, data)
     corrections = {}
@@ -299,7 +304,7 @@ def _start(
 
 
 def _joined(parents: Sequence[Parent], added: Sequence[Parent]) -> tuple[Parent, ...]:
-    """Parents with further ones, those of one name as one."""
+    """Return parents with additional ones; parents of the same name are merged."""
     found = {parent.name: parent for parent in parents}
     for parent in added:
         own = found.get(parent.name, parent).relation
@@ -311,20 +316,20 @@ def _joined(parents: Sequence[Parent], added: Sequence[Parent]) -> tuple[Parent,
 def _with(
     model: DynamicalVAE, corrections: Mapping[str, Correction], inference: Factorization | None = None
 ) -> DynamicalVAE:
-    """The model, which stays as it is, with a guide that is corrected."""
+    """Return a copy of the model with a corrected guide; the model does not change."""
     found = copy.copy(model)
     found.inference = inference or model.inference
     encoder = {}
     for name, correction in corrections.items():
         own = model.encoder[name]
         encoder[name] = Local(own.own if isinstance(own, Local) else own, found.inference.factor(name), correction)
-    found.__dict__.pop("encoder", None)  # where the guide is the prior
+    found.__dict__.pop("encoder", None)  # present if the guide is the prior
     found._modules = {**model._modules, "encoder": nn.ModuleDict(encoder)}
     return found
 
 
 class _Drawn:
-    """Draws of the guide, and the units that they give."""
+    """Draws of the guide, and the units computed from them."""
 
     def __init__(self, model: DynamicalVAE, data: Mapping[str, Any]):
         sites = sites_of(poutine.trace(model.guide).get_trace(repeat(data, UNITS)))
@@ -341,7 +346,7 @@ class _Drawn:
         return Correction(unit, torch.zeros_like(unit), torch.zeros_like(unit), self.links(factor, reach))
 
     def links(self, factor: Factor, reach: int | None) -> tuple[Link, ...]:
-        """Of nothing yet, to the latents among the parents."""
+        """Return links to the latents among the parents, with zero weights."""
         _, size, _, width = self.values[factor.child].shape
         length = max(value.shape[2] for value in self.values.values())
         found = []
@@ -357,6 +362,6 @@ class _Drawn:
                 values = self.values[parent.name][:, :, of]
                 weight = values.new_zeros(size, len(to), values.shape[-1], width)
                 deviation = values.std(0)
-                deviation = torch.where(deviation > 0, deviation, 1.0)  # of padding
+                deviation = torch.where(deviation > 0, deviation, 1.0)  # zero at padding
                 found.append(Link(parent.name, to, of, weight, values.mean(0), deviation))
         return tuple(found)

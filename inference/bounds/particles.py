@@ -1,11 +1,11 @@
-"""The particle bound: importance weighting with resampling on the way, for any factorization with a forward guide.
+"""FIVO bound: importance weighting with resampling at each step, for any factorization with a forward guide.
 
     sum_t log 1/K sum_k w_t^k,    w_t = p(z_t | .) p(x_t | .) / q(z_t | .)
 
-K particles of each sequence draw their latents from the guide step by step. Where their weights have become too
-unequal, unlikely particles are replaced by copies of likely ones, and the weights begin anew. The product of the mean
-weights is an unbiased estimate of the evidence, so that the mean of its log is a lower bound: that of Maddison et al.
-(2017, FIVO, arXiv 1705.09279), Le et al. (2018, arXiv 1705.10306) and Naesseth et al. (2018, arXiv 1705.11140).
+K particles of each sequence draw their latents from the guide step by step. When their weights have become too unequal,
+likely particles replace unlikely ones, and the weights are reset. The product of the mean weights is an unbiased
+estimate of the evidence, so the mean of its log is a lower bound. It is the bound of Maddison et al. (2017, FIVO, arXiv
+1705.09279), Le et al. (2018, arXiv 1705.10306) and Naesseth et al. (2018, arXiv 1705.11140).
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from .elbo import require_data, require_likelihood
 
 @dataclass(frozen=True)
 class ParticleBound:
-    """The particle bound of every sequence and how its particles fared.
+    """FIVO bound of every sequence, with statistics of its particles.
 
     Args:
-        bound: (B,) log of the estimated evidence, in nats.
-        effective: (T, B) effective sample size of the weights after each step, between 1 and K; nan at padding.
-        resamplings: (B,) how often the particles were resampled.
-        particles: K.
+        bound: log of the estimated evidence, in nats, (B,).
+        effective: effective sample size of the weights after each step, between 1 and K, (T, B); NaN at padding.
+        resamplings: number of resamplings, (B,).
+        particles: K, number of particles.
     """
 
     bound: Tensor
@@ -51,29 +51,29 @@ class ParticleBound:
 def particle_bound(
     model: DynamicalVAE, batch: AnyBatch, particles: int = 16, *, resample_below: float = 0.5, chunk: int = 4096
 ) -> ParticleBound:
-    """The log of a particle filter's estimate of p(x), per sequence, with the guide as proposal.
+    """Return the FIVO bound: the log of a particle filter's estimate of p(x) per sequence, with the guide as proposal.
 
-    exp(bound) is unbiased for p(x), whatever the number of particles, so that on average the bound rises with it to the
-    log evidence. With one particle it is the evidence lower bound, at one draw; without resampling the
-    importance-weighted bound, which it exceeds on long sequences unless the guide is nearly exact (docs/bounds.md).
+    exp(bound) is unbiased for p(x) with any number of particles, so on average the bound rises with their number to the
+    log evidence. With one particle it is the evidence lower bound at one draw. Without resampling it is the IWAE bound,
+    which it exceeds on long sequences unless the guide is nearly exact (docs/bounds.md).
 
-    Resampling is systematic. Static latents are drawn first and travel with their particle; several local ones are
-    drawn in the guide's order within each step.
+    Resampling is systematic. Static latents are drawn first and resampled with their particle. Several local latents
+    are drawn in the guide's order within each step.
 
     Args:
-        model: the model with its guide.
-        batch: see `DynamicalVAE.model`; ragged batches and missing entries included.
-        particles: K.
-        resample_below: particles are resampled before a step where the effective sample size has fallen below this
-            share of K. 0 never resamples, 1 wherever weights differ.
-        chunk: sequences times particles to hold at once.
+        model: model with its guide.
+        batch: batch as in `DynamicalVAE.model`, which may be ragged or have missing entries.
+        particles: K, number of particles.
+        resample_below: share of K; particles are resampled before a step if the effective sample size is below it. 0
+            never resamples, 1 whenever weights differ.
+        chunk: largest number of sequences times particles in memory.
 
     Returns:
         Bound (B,), effective sample size (T, B), number of resamplings (B,).
 
     Raises:
-        ValueError: a factorization that cannot be run forward step by step: a guide that runs backward in time, a
-            factor that reads latents after t, such as p(x_t | z_{1:T}); data or context missing in the batch.
+        ValueError: when the factorization cannot run forward step by step (the guide runs backward in time, or a factor
+            reads latents after t, such as p(x_t | z_{1:T})), or data or context are missing in the batch.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
@@ -104,9 +104,9 @@ class Filter:
     """K particles of every sequence; row k B + b of their N = K B rows is particle k of sequence b.
 
     Args:
-        model: the model with its guide.
-        batch: of data and context.
-        particles: K.
+        model: model with its guide.
+        batch: batch with data and context.
+        particles: K, number of particles.
     """
 
     def __init__(self, model: DynamicalVAE, batch: AnyBatch, particles: int):
@@ -121,7 +121,7 @@ class Filter:
         self.paths = {name: Rows([None] * self.known.length) for name in (*self._local(model.latents), *self.hidden)}
 
     def run(self, resample_below: float) -> ParticleBound:
-        """All steps. After it `drawn` are the draws of the particles that are left."""
+        """Run all steps. Afterwards `drawn` contains the draws of the surviving particles."""
         model, length, batch = self.model, self.known.length, self.known.batch
         shape = self.particles, batch
         log_weights = self._draw_statics(late=False).view(shape)
@@ -157,9 +157,9 @@ class Filter:
 
     @property
     def drawn(self) -> dict[str, Tensor]:
-        """Name to the latents (N, T, D), or (N, D) if static, of the particles and their ancestors.
+        """Latents (N, T, D) by name, or (N, D) if static, of the particles and their ancestors.
 
-        Data with missing entries are among them: the model reads its own means there.
+        Data with missing entries are included, because the model reads its own means there.
         """
         stacked = {name: torch.stack(list(path), 1) for name, path in self.paths.items() if path[-1] is not None}
         if self.known.lengths is not None:
@@ -182,7 +182,7 @@ class Filter:
         data: Mapping[str, Rows],
         counted: Mapping[str, Rows | None],
     ) -> Tensor:
-        """Draws the latents at t, and returns the logs (N,) of the weights for it."""
+        """Draw the latents at t, and return the log weights (N,) of the step."""
         total = like(self.model).new_zeros(len(self.sequence))
         history = {**data, **self.paths}
         for name, law in guide.items():
@@ -193,13 +193,13 @@ class Filter:
             parameters = law.step(t, history)
             value = data[name][t] if name in data else self.paths[name][t]
             total = total + _log_prob(law.conditional, parameters, value, _at(counted[name], t))
-            if name in self.hidden:  # the model reads its own mean there
+            if name in self.hidden:  # the model reads its own mean where x is missing
                 seen = self.known.observed[name][:, t].index_select(0, self.sequence)
                 self.paths[name][t] = torch.where(seen, value, law.conditional.mean(parameters))
         return total
 
     def _draw_statics(self, late: bool) -> Tensor:
-        """Draws the static latents that come before the steps, or after them; returns the logs (N,) of the weights."""
+        """Draw the static latents that precede or follow the steps, and return the log weights (N,)."""
         model, total = self.model, like(self.model).new_zeros(len(self.sequence))
         for name in model.latents:
             if not model.generative.local(name) and (name in self.late) == late:
@@ -219,7 +219,7 @@ class Filter:
         return total
 
     def _parameters(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Parameters:
-        """Of a static variable, (N, D)."""
+        """Return the parameters (N, D) of a static variable."""
         given, size, lengths, rows = self._given(conditional, shared)
         return tuple(pick(p, rows) for p in conditional(given, size, self.known.length, lengths))
 
@@ -236,9 +236,9 @@ class Filter:
     def _given(
         self, conditional: Conditional, shared: Mapping[str, Tensor]
     ) -> tuple[dict[str, Tensor], int, Tensor | None, Tensor]:
-        """The known parents, their number of rows, their lengths, and the row of each particle.
+        """Return the known parents, their number of rows, their lengths, and the row of each particle.
 
-        What is the same for all particles of a sequence is computed once for them.
+        Values that all particles of a sequence share are computed once per sequence.
         """
         lengths, seen = self.known.lengths, self.known.observed
         there = {presence(name): steps for name, steps in self.known.present.items() if name in conditional.parents}
@@ -254,12 +254,12 @@ class Filter:
 
 @dataclass
 class Stepwise:
-    """A local variable's conditional for all particles, one step after another.
+    """Conditional of a local variable for all particles, evaluated step by step.
 
     Args:
-        conditional: of the variable.
-        state: its network's; where nothing that is drawn in the steps enters, the parameters by step.
-        reads: what is drawn in the steps and enters.
+        conditional: conditional of the variable.
+        state: state of its network; the parameters by step if it reads no variable that is drawn in the steps.
+        reads: names of the parents that are drawn in the steps.
     """
 
     conditional: Conditional
@@ -267,28 +267,29 @@ class Stepwise:
     reads: list[str]
 
     def step(self, t: int, history: Mapping[str, Rows]) -> Parameters:
-        """The law's parameters (N, D) at step t."""
+        """Return the distribution's parameters (N, D) at step t."""
         if not self.reads:
             return tuple(parameter[t] for parameter in self.state)
         parameters, self.state = self.conditional.step(self.state, t, {name: history[name] for name in self.reads})
         return parameters
 
     def select(self, rows: Tensor) -> Stepwise:
-        """For these of its particles."""
+        """Return the conditional for these particles."""
         moved = self.conditional.select(self.state, rows) if self.reads else select(self.state, rows)
         return Stepwise(self.conditional, moved, self.reads)
 
 
 def effective_size(log_weights: Tensor) -> Tensor:
-    """(B,) effective sample size of weights (K, B): (sum w)^2 / sum w^2."""
-    weights = (log_weights - log_weights.amax(0)).exp()  # a difference of two large logs would have no digits left
+    """Return the effective sample size (B,) of weights (K, B): (sum w)^2 / sum w^2."""
+    weights = (log_weights - log_weights.amax(0)).exp()  # the difference of two large logs would lose all digits
     return weights.sum(0).square() / weights.square().sum(0)
 
 
 def ancestors(log_weights: Tensor, chosen: Tensor) -> Tensor:
-    """Rows (K B,) of the ancestors under systematic resampling with weights (K, B), where `chosen` (B,); else itself.
+    """Return the rows (K B,) of ancestors under systematic resampling with weights (K, B).
 
-    Particle k has floor(K w_k) or one more descendants, and K w_k on average.
+    Particle k has floor(K w_k) descendants or one more, and K w_k on average. Particles of sequences that are not
+    `chosen` (B,) are their own ancestors.
     """
     count, batch = log_weights.shape
     places = torch.arange(count, device=log_weights.device)[:, None]
@@ -304,11 +305,11 @@ def _log_mean(log_weights: Tensor) -> Tensor:
 
 
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
-    """(N,) of values (N, D); entries that are not `counted` are left out."""
+    """Return the log probability (N,) of values (N, D), without entries that are not `counted`."""
     entries = conditional.distribution(parameters).log_prob(conditional.scored(value, counted))
-    if counted is not None and counted.dim() != entries.dim():  # one of guide and model has whole events
+    if counted is not None and counted.dim() != entries.dim():  # either guide or model scores whole events
         counted = counted.all(-1) if conditional.whole else counted[:, None]
-    # where, not a product: an entry that does not count may be infinite
+    # where rather than a product: an entry that is not counted may be infinite
     entries = entries if counted is None else torch.where(counted, entries, 0.0)
     return entries if conditional.whole else entries.sum(-1)
 
@@ -318,12 +319,12 @@ def _at(values: Rows | None, t: int) -> Tensor | None:
 
 
 def _hidden(run: Rollout) -> list[str]:
-    """The data with missing entries, at which the model reads its own means."""
+    """Return the data variables with missing entries, where the model reads its own means."""
     return [name for name, seen in run.observed.items() if not seen.all()]
 
 
 def _late(model: DynamicalVAE) -> set[str]:
-    """The static latents that the guide draws after the steps, because they read what is drawn there."""
+    """Return the static latents that the guide draws after the steps, because they read variables drawn there."""
     late: set[str] = set()
     for name in model.latents:
         factor = model.inference.factor(name)
@@ -337,10 +338,10 @@ def _waits(factor: Factor, names: set[str]) -> bool:
 
 
 def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
-    """Why a model cannot be drawn and weighed forward, step by step, in a sentence; "" where it can.
+    """Return a sentence on why a model cannot be filtered forward step by step; "" if it can.
 
     Raises:
-        ValueError: a batch that cannot be read.
+        ValueError: when the batch cannot be read.
     """
     run = model.rollout(batch)
     instead = "use importance_bound"

@@ -1,21 +1,21 @@
-"""The log score: how probable a forecast holds what happened, as a bound per sequence.
+"""Log score: the log density of the observed future under the model's forecast, as a bound per sequence.
 
-A forecast draws the latents of the past from the guide, given the past alone, and lets the model run free. What it says
-of the future x_{O+1:T} is therefore the density
+A forecast draws the latents of the past from the guide, given the past alone, and then runs the model freely. Its
+density of the future x_{O+1:T} is therefore
 
     F = E_{q(w, z_{1:O} | x_{1:O})} p(x_{O+1:T} | w, z_{1:O}, x_{1:O})
 
-which is p(x_{O+1:T} | x_{1:O}) where the guide is the posterior. Its logarithm is a proper score (Gneiting and Raftery
-2007), which draws from F estimate badly: few of them come near a given future. So the latents are proposed by the
-guide that has seen the future too, and weighted:
+which is p(x_{O+1:T} | x_{1:O}) if the guide is the posterior. Its logarithm is a proper score (Gneiting and Raftery,
+2007). Draws from F estimate it badly, because few of them come near a given future. The latents are therefore proposed
+by the guide given past and future, and weighted:
 
     F = E_q [ q(w, z_{1:O} | x_{1:O}) prod_{t > O} p(z_t | .) p(x_t | .) / q ],    q = q(w, z_{1:T} | x_{1:T})
 
-The mean of K weights is unbiased for F, so that its logarithm is on average at most log F: it errs to the side of a
-worse score, by the less the more particles there are, and not at all where both guides are posteriors.
+The mean of K weights is unbiased for F, so its logarithm is on average at most log F. The bound underestimates the
+score, less so with more particles, and not at all if both guides are posteriors.
 
-Where entries are missing, the density is that of the observed ones: x_{O+1:T} and x_{1:O} are what was observed of
-them. A model that reads its own past reads its means in gaps, as in the bounds.
+With missing entries, the density is of the observed entries of x_{O+1:T}, given those of x_{1:O}. A model that reads
+its own past reads its means at missing entries, as in the bounds.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from .elbo import ImportanceBound, importance_mean, log_densities, require_likel
 def predictive_bound(
     model: DynamicalVAE, batch: AnyBatch, observed: int, particles: int = 100, *, chunk: int = 4096
 ) -> ImportanceBound:
-    """Log density of what follows the observed frames under the model's own forecasts; see the module.
+    """Return a bound on the log density of the future under the model's forecast; see the module.
 
     Args:
-        model: the model with its guide.
+        model: model with its guide.
         batch: whole sequences (B, T, D), or a mapping with context over all T steps.
-        observed: O, the frames that are given.
-        particles: K.
-        chunk: sequences times particles to hold at once.
+        observed: O, number of observed frames.
+        particles: K, number of particles.
+        chunk: largest number of sequences times particles in memory.
 
     Returns:
-        The bound in nats a sequence, and the shape of the weights' tail, (B,) each.
+        The bound in nats per sequence, and the tail shape of the weights, (B,) each.
 
     Raises:
-        ValueError: a model without likelihood or with forecasts of its own, a ragged batch, or nothing observed or to
-            predict.
+        ValueError: when the model has no likelihood or its own forecast method, the batch is ragged, or no frame is
+            observed or to predict.
     """
     require_likelihood(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
@@ -59,7 +59,7 @@ def predictive_bound(
     with model.running():
         data = model.read(batch)
         size, length = data[model.observed[0]].shape[:2]
-        observed -= model.view.past  # the others are context, and given anyhow
+        observed -= model.view.past  # the view's past frames are context, which is always given
         if model.grouped and data.group is not None:
             raise ValueError(
                 f"groups share {', '.join(model.grouped)}, and a log score is of one sequence; leave it out"
@@ -85,7 +85,7 @@ def predictive_bound(
             whole = repeat(data, count)
             proposed = poutine.trace(model.guide).get_trace(whole)
             joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(whole)
-            if not observed:  # and latents are from the prior
+            if not observed:  # latents are then from the prior
                 return total(log_densities(joint)) - total(log_densities(proposed))
             drawn = {n: s["value"] for n, s in sites_of(proposed).items()}
             known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}

@@ -1,15 +1,15 @@
-"""The probe: futures from latents that are drawn from elsewhere, to see whether a model listens to them at all.
+"""Test of whether a model uses a latent: forecasts with latents drawn from another distribution.
 
-Where a model has learned to ignore a latent, it makes the same future whatever that latent is: drawn from N(50, 50) in
-place of its prior N(0, I), futures are as good and as much alike as ever (Aliakbarian, Saleh, Salzmann, Petersson and
-Gould, 2020, arXiv 1908.00733, section 4.1). A model that listens goes astray. So its diversities are to be compared:
+If a model has learned to ignore a latent, its futures do not depend on it. With draws from N(50, 50) instead of the
+prior N(0, I), they remain as accurate and as similar to one another (Aliakbarian, Saleh, Salzmann, Petersson and Gould,
+2020, arXiv 1908.00733, section 4.1). The futures of a model that uses the latent become wrong. Compare the diversities:
 
     models = {"as it is": model, "probed": Redrawn(model, {"z": Normal(50.0, 50**0.5)})}
     found = dvae.evaluate(models, windows, scores=scores)
     found.ratio("probed", "as it is", "APD")
 
-The paper does not say whether the second 50 is a variance, as the I beside it is, or a standard deviation; both are far
-beyond the prior.
+The paper does not state whether the second 50 is a variance, as I in the prior suggests, or a standard deviation; both
+are far outside the prior.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from ...program.conditional import like
 
 
 class Redrawn(nn.Module):
-    """A model whose forecasts draw some latents from other laws, for `evaluate` and whatever else forecasts.
+    """Model whose forecasts draw some latents from other distributions, for use with `evaluate`.
 
     Args:
         model: a `DynamicalVAE`.
-        laws: latent to the distribution of each of its numbers, or one that broadcasts to them. Wherever the latent is
-            drawn it is from this, also where it would be inferred from the past.
+        laws: distribution of each coordinate of a latent, by name; it broadcasts to the latent. Every draw of the
+            latent is from it, even where the guide would infer it from the past.
 
     Raises:
-        ValueError: no latent of the model, or one that follows from others.
+        ValueError: when a name is no latent of the model, or the latent depends on others.
     """
 
-    likelihood = False  # what is scored is not the model's own
+    likelihood = False  # the scores are not those of the model itself
 
     def __init__(self, model: Any, laws: Mapping[str, Distribution]) -> None:
         super().__init__()
@@ -59,18 +59,18 @@ class Redrawn(nn.Module):
         self.generative, self.inference = model.generative, model.inference
 
     def is_drawn(self, means: bool = False) -> bool:
-        """As the model decides."""
+        """Return the decision of the model."""
         return bool(self.model.is_drawn(means))
 
     def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> Mapping[str, Tensor]:
-        """As the model's, with latents from the other laws."""
+        """Return the model's forecast, with latents from the other distributions."""
         with self.model.running(), _Redrawing(self.laws, like(self.model)):
             found: Mapping[str, Tensor] = self.model.forecast(batch, horizon, samples, **options)
             return found
 
 
 class _Redrawing(Messenger):
-    """Has sites of these names drawn from these laws, as tensors of one kind."""
+    """Handler that draws the named sites from the given distributions, in the dtype and on the device of `kind`."""
 
     def __init__(self, laws: Mapping[str, Distribution], kind: Tensor) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
-"""What a comparison measures of one model, teacher-forced: bounds, and what the guide's latents do and tell.
+"""Teacher-forced scores of one model in a comparison: bounds, active units and information of the latents.
 
-References: Burda et al., 2016, arXiv 1509.00519 (importance-weighted bound, active units); Vehtari et al., 2024, arXiv
-1507.02646 (k-hat); Hoffman and Johnson, 2016, "ELBO surgery", and Poole et al., 2019, arXiv 1905.06922 (information).
+References: Burda et al., 2016, arXiv 1509.00519 (IWAE bound, active units); Vehtari et al., 2024, arXiv 1507.02646
+(k-hat); Hoffman and Johnson, 2016, "ELBO surgery", and Poole et al., 2019, arXiv 1905.06922 (information).
 """
 
 import math
@@ -22,7 +22,7 @@ from ..evaluation.held import on_device_of, refuse_non_finite
 from .elbo import SequenceELBO, importance_bound, site_log_prob, sites_of
 from .particles import particle_bound
 
-_GUIDE_DRAWS = 8  # over which posterior means are averaged; the noise that this leaves is taken out
+_GUIDE_DRAWS = 8  # draws to average posterior means; the remaining noise is subtracted
 
 
 def bounds(
@@ -34,7 +34,7 @@ def bounds(
     estimates: int,
     parts: Iterable[slice],
 ) -> dict[str, Any]:
-    """Bounds and KL terms in nats a sequence (N,), KL by step (T,), estimates (E, N), frames (N,)."""
+    """Return bounds and KL terms in nats per sequence (N,), KL by step (T,), estimates (E, N) and frames (N,)."""
     found: list[dict[str, Tensor]] = []
     steps: dict[str, Tensor] = {}
     for part in parts:
@@ -71,7 +71,7 @@ def filtered(
     particles: int,
     parts: Iterable[slice],
 ) -> dict[str, np.ndarray]:
-    """The particle bound in nats a sequence (N,)."""
+    """Return the FIVO bound in nats per sequence (N,)."""
     found = []
     for part in parts:
         bound = particle_bound(model, on_device_of(model, batch.rows(part)), particles).bound
@@ -81,7 +81,7 @@ def filtered(
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
-    """Latent to (D,): the variance over sequences of the posterior mean, pooled over steps."""
+    """Return the variance over sequences of each latent's posterior mean, pooled over steps, (D,)."""
     sums: dict[str, Tensor] = {}
     for part in parts:
         piece = on_device_of(model, batch.rows(part))
@@ -102,7 +102,7 @@ def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict
 
 
 def _posterior_means(model: DynamicalVAE, batch: Batch) -> dict[str, Tensor]:
-    """Latent to the means (B, T, D), or (B, 1, D), of its conditionals at a draw from the guide."""
+    """Return the means (B, T, D), or (B, 1, D) if static, of each latent's conditional at a draw from the guide."""
     means = {}
     for name, site in sites_of(poutine.trace(model.guide).get_trace(batch)).items():
         fn, value = site["fn"], site["value"]
@@ -112,7 +112,7 @@ def _posterior_means(model: DynamicalVAE, batch: Batch) -> dict[str, Tensor]:
 
 
 def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
-    """Latent to (T,), or (1,) of a static one: what it tells of the data, among the M sequences of the batch."""
+    """Return the information of each latent about which of the M sequences it is from: (T,), or (1,) if static."""
     batch = on_device_of(model, batch)
     size = length_of(batch)
     drawn = model.guide(batch) if size else {}
@@ -139,10 +139,10 @@ def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> di
 
 
 def length_of(batch: Batch) -> int:
-    """N, the number of sequences."""
+    """Return N, the number of sequences."""
     return len(next(value for value in batch.values() if isinstance(value, Tensor)))
 
 
 def _alive(lengths: Tensor, steps: int) -> Tensor:
-    """(T,) the number of sequences that reach each step."""
+    """Return the number of sequences that reach each step, (T,)."""
     return (lengths[:, None] > torch.arange(steps)).sum(0)

@@ -1,18 +1,20 @@
-"""The evidence between two bounds, and where the bound that is trained loses what it lacks of it.
+"""Bracket of the evidence between two bounds, and a decomposition of the gap between ELBO and evidence.
 
-    evidence - ELBO = (ELBO of the best local guide - ELBO)                                    amortisation
-                    + (that of the best one with all arrows - that of the best local guide)    missing arrows
-                    + (evidence - that of the best one with all arrows)                        family
+    evidence - ELBO = (ELBO of the best semi-amortized guide - ELBO)                         amortisation
+                    + (the same with all edges - ELBO of the best semi-amortized guide)      missing edges
+                    + (evidence - ELBO of the best semi-amortized guide with all edges)      family
 
-A local guide is the model's own with parameters that are free for every sequence (`local_guide`), so that what its
-network fails to read off the data, or may not read, is amortisation. With all arrows it reads the latents too that the
-posterior depends on and the guide's equations leave out. What then is left is the price of normals whose locations move
-linearly with what was added. After Cremer, Li and Duvenaud (2018, arXiv 1801.03558), whose approximation gap is the sum
-of the last two. Each part is at least 0, but for noise and what a search has not found, which is counted further down.
-Both local guides have the same number of steps from the model's own.
+A semi-amortized guide is the model's own guide with free parameters for every sequence (`local_guide`). Amortisation is
+the cost of everything that the network fails to infer from the data, or cannot read. With all edges, the guide also
+reads the latents that the posterior depends on and its equations omit. The remaining gap is the cost of normals whose
+locations depend linearly on the added latents.
 
-The evidence is bracketed: from below by annealed importance sampling, which starts at the local guide with all arrows,
-and from above by the same run backward, for sequences simulated from the model (`annealed_bound`).
+The decomposition follows Cremer, Li and Duvenaud (2018, arXiv 1801.03558), whose approximation gap is the sum of the
+last two parts. Each part is at least 0, except for noise and an incomplete search, whose error counts in a later part.
+Both semi-amortized guides are fitted for the same number of steps from the model's own.
+
+The evidence is bracketed. The lower bound is annealed importance sampling that starts at the semi-amortized guide with
+all edges. The upper bound is the same run in reverse, for sequences simulated from the model (`annealed_bound`).
 """
 
 from __future__ import annotations
@@ -48,39 +50,42 @@ if TYPE_CHECKING:
 
 OWN, ALL = "local ELBO", "local ELBO, all arrows"
 BOUNDS = ("ELBO", "IWAE", "FIVO", OWN, ALL, "AIS", "upper")
-"""What bounds are called, from the loosest to the upper one."""
+"""Names of the bounds, from the loosest to the upper one."""
 PARTS = {
     "amortisation": ("ELBO", OWN),
     "missing arrows": (OWN, ALL),
     "family": (ALL, "AIS"),
     "unknown": ("AIS", "upper"),
 }
-"""Parts of the gap, each from one bound to another. "family" is a lower bound of its part, as AIS is one of the
-evidence; "unknown" is the bracket, of simulated data alone."""
+"""Parts of the gap, each from one bound to another.
+
+"family" is a lower bound of its part, because AIS is a lower bound of the evidence. "unknown" is the bracket, for
+simulated data only.
+"""
 WIDE = 0.5
-"""Nats of a bracket that may be a missed mode: of two equal ones it is log 2."""
+"""Width of a bracket, in nats, that may indicate a missed mode; with two equal modes it is log 2."""
 DATA = ("real", "simulated")
 CHUNK = 4096
-"""Sequences times draws to hold at once."""
+"""Largest number of sequences times draws in memory."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Bracket(Result):
-    """Bounds of one model on the same sequences and on as many simulated ones, in nats a sequence.
+    """Bounds of one model on the same sequences and on as many simulated ones, in nats per sequence.
 
     Attributes:
-        bounds: "real" and "simulated" to {bound: (N,)}; "upper" of simulated data alone, FIVO where it can be run,
-            local ones of guides that are normal.
+        bounds: "real" and "simulated" to {bound: (N,)}; "upper" only for simulated data, FIVO if the model allows it,
+            semi-amortized bounds if the guide is normal.
         keys: (split, clip, first frame) of every sequence.
-        frames: (N,) of every sequence, real and simulated.
+        frames: number of frames of every sequence, real and simulated, (N,).
         equations: "generative" and "inference".
-        added: latent to the latents that the guide with all arrows reads beside its own.
-        data: sequences and coordinates, and what windows say of themselves.
-        particles: K of IWAE and FIVO, and draws over which ELBOs are averaged.
-        temperatures, chains: of annealed importance sampling.
-        fitting: steps of each local guide.
-        seed: of all draws.
-        notes: what is not there, and why.
+        added: for each latent, the latents that the guide with all edges reads in addition.
+        data: fingerprint and description of the windows.
+        particles: K of IWAE and FIVO, and number of draws for ELBOs.
+        temperatures, chains: numbers of temperatures and chains of annealed importance sampling.
+        fitting: number of steps of each semi-amortized guide.
+        seed: seed of all draws.
+        notes: bounds that are not available, with reasons, and warnings.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
@@ -104,15 +109,15 @@ class Bracket(Result):
     notes: list[str]
 
     def estimate(self, bound: str, above: str = "", data: str = "real", *, frame: bool = False) -> Estimate:
-        """The mean of a bound, or of how far it lies above another one.
+        """Return the mean of a bound, or of its difference to another one.
 
         Args:
-            bound, above: names.
+            bound, above: names; with `above`, the result is `bound` minus `above`.
             data: "real", with errors clustered by clip, or "simulated".
-            frame: in nats a frame and not a sequence.
+            frame: whether to return nats per frame instead of per sequence.
 
         Raises:
-            KeyError: a bound that is not there.
+            KeyError: when there is no such bound.
         """
         known = self.bounds[data]
         if lacking := [name for name in (bound, above) if name and name not in known]:
@@ -123,17 +128,17 @@ class Bracket(Result):
         return Crossed.by_clip(values[None], weights, places).estimate()
 
     def gap(self, data: str = "real", *, frame: bool = False) -> dict[str, Estimate]:
-        """The parts of what the ELBO lacks of the evidence, as far as they are known; see the module.
+        """Return the known parts of the gap between ELBO and evidence; see the module.
 
-        "family" is at least this, as it ends at the lower bound of the evidence; "unknown", of simulated data, is how
-        far the upper bound lies above that, and so how much more the family may be.
+        "family" is a lower limit, because it ends at the lower bound of the evidence. "unknown", for simulated data, is
+        the distance from this bound to the upper one, and so how much larger the family part may be.
         """
         known = self.bounds[data]
         parts = {name: ends for name, ends in PARTS.items() if all(end in known for end in ends)}
         return {name: self.estimate(high, low, data, frame=frame) for name, (low, high) in parts.items()}
 
     def table(self) -> Group:
-        """Bounds of real data and of simulated ones, and the parts of the gap."""
+        """Return tables of bounds for real and simulated data, and of the parts of the gap."""
         return Group(*(self._bounds(data) for data in DATA), self._gap())
 
     def _bounds(self, data: str) -> Table:
@@ -173,9 +178,9 @@ class Bracket(Result):
         return table
 
     def plot(self) -> Figure:
-        """All bounds above the ELBO, real and simulated data apart, the parts of the gap, and the bracket shaded."""
+        """Draw all bounds above the ELBO for real and simulated data, the parts of the gap, and the bracket shaded."""
         figure = canvas(9, 6)
-        panels = figure.subplots(2, 1)  # each with its own axis: a guide may be far worse on data it was not fitted to
+        panels = figure.subplots(2, 1)  # separate axes: a guide may be far worse on data it was not fitted to
         unknown = self.estimate("upper", "AIS", "simulated").mean
         for panel, data in zip(panels, DATA, strict=True):
             names = list(self.bounds[data])
@@ -225,7 +230,7 @@ class Bracket(Result):
 
 
 def told(estimate: Estimate) -> str:
-    """A mean ± its standard error over sequences."""
+    """Return a mean ± its standard error over sequences as text."""
     places = decimals(estimate.mean, estimate.sequences)
     return f"{number(estimate.mean, places)} ± {number(estimate.sequences, places)}"
 
@@ -250,31 +255,32 @@ def bracket(
     batch_size: int = 32,
     progress: bool = True,
 ) -> Bracket:
-    """Bounds on a model's evidence from both sides, and the parts of what its ELBO lacks of it.
+    """Return bounds on a model's evidence from both sides, and the parts of the gap to its ELBO.
 
     Sequences simulated from the model have the lengths and the context of the real ones, and no missing entries.
 
-    What it costs: for each sequence, real or simulated, 3 K runs of guide and model for means of weights, 12 programs
-    forward and backward for each step of a local guide, of which there are two (one where no arrows are missing), and
-    about 7 L gradients of guide and model for each chain, nearly twice that where simulated.
+    Cost for each sequence, real or simulated: 3 K runs of guide and model for means of weights, and 12 forward and
+    backward passes for each step of a semi-amortized guide. There are two such guides, or one if no edges are missing.
+    Each chain takes about 7 L gradients of guide and model, nearly twice that for simulated sequences.
 
     Args:
-        model: the model with its guide.
+        model: model with its guide.
         data: windows, x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
-        count: how many of the sequences, drawn at random; None for all.
-        particles: K, draws of ELBOs and IWAE, and particles of FIVO.
+        count: number of sequences, drawn at random; None for all.
+        particles: K, number of draws of ELBOs and IWAE, and of particles of FIVO.
         temperatures, chains: L and K of annealed importance sampling, see `annealed_bound`.
-        fitting: steps of the local guides, see `local_guide`; 0 leaves them and the parts of the gap out, and chains
-            start at the model's own guide.
-        reach: of the arrows that local guides have, see `local_guide`.
-        seed: of all draws.
-        batch_size: sequences at once.
+        fitting: number of steps of the semi-amortized guides, see `local_guide`; 0 omits them and the parts of the gap,
+            and chains start at the model's own guide.
+        reach: largest distance in steps of edges in the semi-amortized guides, see `local_guide`.
+        seed: seed of all draws.
+        batch_size: number of sequences in a batch.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: a model without latents or likelihood, or of which a batch has groups; numbers out of range.
-        TypeError: data of another kind.
-        FloatingPointError: a bound that is not finite.
+        ValueError: when the model has no latents or likelihood, the batch has groups that share latents, or a number is
+            out of range.
+        TypeError: when the data are of another kind.
+        FloatingPointError: when a bound is not finite.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
@@ -358,7 +364,7 @@ def bracket(
 
 
 def _seeds(chance: torch.Generator, count: int) -> list[int]:
-    """Of draws that have nothing to do with each other: what a guide was fitted by is not what it is judged by."""
+    """Return independent seeds, so that a guide is not evaluated with the draws it was fitted with."""
     return torch.randint(2**31, (count,), generator=chance).tolist()  # type: ignore[no-any-return]
 
 
@@ -372,7 +378,7 @@ def _frames(model: DynamicalVAE, data: Batch) -> Tensor:
 
 
 def _simulated(model: DynamicalVAE, real: Batch) -> tuple[Batch, dict[str, Tensor]]:
-    """Sequences drawn from the model, as it sees them, of the same lengths and context; and their latents."""
+    """Return sequences drawn from the model, as it reads them, of the same lengths and context, and their latents."""
     x = real[model.observed[0]]
     kept = Batch({name: value for name, value in real.items() if name not in (*model.observed, "mask", "log_det")})
     drawn = model.model(kept, length=x.shape[1] if x.dim() == 3 else None, size=len(x))
@@ -383,7 +389,7 @@ def _simulated(model: DynamicalVAE, real: Batch) -> tuple[Batch, dict[str, Tenso
 
 @dataclass(frozen=True)
 class _Work:
-    """What is computed of each batch."""
+    """Computations for each batch."""
 
     model: DynamicalVAE
     particles: int
@@ -397,9 +403,9 @@ class _Work:
     def bounds(
         self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seeds: Sequence[int], advance: Any
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Bound to (B,), an upper one too where there are latents that data were drawn with, and effective chains (B,).
+        """Return the bounds (B,) by name, and effective chains (B,); with given latents, also an upper bound.
 
-        The draws of all ELBOs have one seed, so that their differences have less noise.
+        The draws of all ELBOs have the same seed, so that their differences have less noise.
         """
         model, found = self.model, {}
         judging, fitting, annealing = seeds
@@ -409,13 +415,13 @@ class _Work:
             if not self.blocked:
                 found["FIVO"] = particle_bound(model, data, self.particles, chunk=CHUNK).bound
         for name, missing in ((OWN, False), (ALL, True)) if self.fitting else ():
-            if not missing or self.lacking:  # else there is nothing to add
+            if not missing or self.lacking:  # otherwise there is nothing to add
                 how: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": fitting}
                 model = local_guide(self.model, data, **how, progress=advance)
             with reproducibly(model, judging):
                 found[name] = self._weights(model, data).mean(0)
         how = {"temperatures": self.temperatures, "chains": self.chains, "seed": annealing}
-        how["chunk"] = self.chains * len(found["ELBO"])  # a local guide is for all of them
+        how["chunk"] = self.chains * len(found["ELBO"])  # a semi-amortized guide needs all sequences of the batch
         annealed = annealed_bound(model, data, **how)
         found["AIS"] = annealed.bound
         if latents is not None:
@@ -423,7 +429,7 @@ class _Work:
         return found, annealed.effective
 
     def _weights(self, model: DynamicalVAE, data: AnyBatch) -> Tensor:
-        """(K, B) of log p(x, z) - log q(z | x), at draws z."""
+        """Return log p(x, z) - log q(z | x) at draws z, (K, B)."""
         size = len(data[model.observed[0]])  # type: ignore[call-overload, index]
         at_once = max(1, CHUNK // size)
         found = []

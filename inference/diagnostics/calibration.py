@@ -1,7 +1,8 @@
-"""Simulation-based calibration of a guide (Talts et al., 2018, arXiv 1804.06788), with the exact simultaneous test and
-envelope for discrete ranks of Säilynoja et al. (2022, arXiv 2103.10522), and with two quantities of all latents
-together that depend on the data: the log joint (Modrák et al., 2023, arXiv 2211.02383) and the distance from a point
-(TARP: Lemos et al., 2023, arXiv 2302.03026).
+"""Simulation-based calibration of a guide (Talts et al., 2018, arXiv 1804.06788).
+
+The simultaneous test and envelope for discrete ranks are exact (Säilynoja et al., 2022, arXiv 2103.10522). Two
+quantities of all latents together depend on the data: the log joint (Modrák et al., 2023, arXiv 2211.02383) and the
+distance from a point (TARP: Lemos et al., 2023, arXiv 2302.03026).
 """
 
 from __future__ import annotations
@@ -33,25 +34,25 @@ if TYPE_CHECKING:
 
 LOG_JOINT, TARP = "log joint", "TARP"
 
-_MOST = 2**24  # simulations times draws, or quantities, that are read from a file
+_MOST = 2**24  # largest product of simulations and draws, or quantities, read from a file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Result):
-    """Ranks of simulated latents among the guide's draws; uniform on 0..L where the guide is the exact posterior.
+    """Ranks of simulated latents among the guide's draws; uniform on 0..L if the guide is the exact posterior.
 
     Uniform ranks of single coordinates are necessary, not sufficient: a guide that ignores the data and draws from the
-    prior has them. The rank of the log joint, log p(x, latents), tells such a guide, and one that misses dependence
-    between coordinates. So does that of the latents' distance from a point which the data suggest: whose latents those
-    of the simulation with the nearest data are, of as many further ones as there are draws.
+    prior has them. The rank of the log joint, log p(x, latents), detects such a guide, and one that misses dependence
+    between coordinates. The rank of the latents' distance from a point that depends on the data (TARP) does so too.
+    This point is the latents of the simulation with the nearest data, among L additional simulations.
 
     Attributes:
-        ranks: (N, Q), how many of the L draws lie below the truth.
-        names: of the Q quantities: "w[0]", "z_3[1]" (step from 1, coordinate from 0), "TARP", "log joint".
-        draws: L.
+        ranks: number of the L draws below the truth, (N, Q).
+        names: names of the Q quantities: "w[0]", "z_3[1]" (step from 1, coordinate from 0), "TARP", "log joint".
+        draws: L, number of draws.
         length: T of the simulated sequences.
-        seed: of simulations and draws.
-        equations: of model and guide; no guide's where it was a program of one's own.
+        seed: seed of simulations and draws.
+        equations: equations of model and guide; without the guide's if it is a custom program.
     """
 
     ranks: Annotated[np.ndarray, Dims("simulation", "quantity", kind=int)]
@@ -63,12 +64,12 @@ class Calibration(Result):
 
     @cached_property
     def counts(self) -> np.ndarray:
-        """(Q, L + 1), how often each rank occurred."""
+        """Number of occurrences of each rank, (Q, L + 1)."""
         return np.stack([np.bincount(ranks, minlength=self.draws + 1) for ranks in self.ranks.T])
 
     @cached_property
     def p_values(self) -> np.ndarray:
-        """(Q,), exact p-values of uniformity: at most alpha just where the ECDF leaves its envelope at alpha."""
+        """Exact p-values of uniformity, (Q,): at most alpha if and only if the ECDF leaves its envelope at alpha."""
         tails = _tails(len(self.ranks), self.draws)
         below = self.counts.cumsum(1)[:, :-1]
         least, which = np.unique(tails[np.arange(self.draws), below].min(1), return_inverse=True)
@@ -76,32 +77,32 @@ class Calibration(Result):
 
     @property
     def adjusted(self) -> np.ndarray:
-        """(Q,), p-values times the number of quantities (Bonferroni), at most 1."""
+        """P-values times the number of quantities (Bonferroni), at most 1, (Q,)."""
         return np.minimum(1.0, self.p_values * len(self.names))
 
     @property
     def p_value(self) -> float:
-        """Of uniformity in all quantities at once, however they depend on each other."""
+        """P-value of uniformity of all quantities together, valid under any dependence."""
         return float(self.adjusted.min())
 
     @property
     def bias(self) -> np.ndarray:
-        """(Q,), where the truth lies above the guide's mean, in the guide's standard deviations; see `spread`."""
+        """Position of the truth above the guide's mean, in the guide's standard deviations, (Q,); see `spread`."""
         return self._normals[:, 0]
 
     @property
     def spread(self) -> np.ndarray:
-        """(Q,), standard deviation of the truth about the guide's mean over that of the guide; above 1: too narrow.
+        """Standard deviation of the truth about the guide's mean relative to the guide's, (Q,); above 1: too narrow.
 
-        Bias and spread are those of the normal truth most likely to have these ranks among L standard normal draws:
-        what they are called, where guide and posterior are normal. Where ranks pile up at an end and leave them open, a
-        prior worth less than one simulation keeps them finite.
+        Bias and spread are of the normal truth that most likely has these ranks among L standard normal draws. They are
+        accurate if guide and posterior are normal. If ranks accumulate at an end, the data do not determine them; a
+        prior with less weight than one simulation keeps them finite.
         """
         return np.exp(self._normals[:, 1])
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """What the shape of the ranks says of the guide; "" where uniformity is not rejected at 5 % (adjusted)."""
+        """Interpretation of the shape of the ranks; "" if uniformity is not rejected at 5 % (adjusted)."""
         return tuple(
             _reading(self.names[q], self.counts[q], self.draws) if adjusted <= 0.05 else ""
             for q, adjusted in enumerate(self.adjusted)
@@ -109,7 +110,7 @@ class Calibration(Result):
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """Result of the test in one sentence."""
         rejected = int((self.adjusted <= 0.05).sum())
         number = f"{len(self.names)} quantities, {len(self.ranks)} simulations, p = {self.p_value:.2g}"
         if not rejected:
@@ -117,15 +118,15 @@ class Calibration(Result):
         return f"the guide is not the posterior: {rejected} of {number}"
 
     def envelope(self, alpha: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the ECDF of a quantity's ranks lies, at all points at once, with probability at least 1 - alpha.
+        """Return the simultaneous envelope of the ECDF of a quantity's ranks, with probability at least 1 - alpha.
 
         Returns:
-            Points k / (L + 1), and the least and largest share of ranks below k that still lie within, (L,) each.
+            Points k / (L + 1), and the smallest and largest share of ranks below k inside the envelope, (L,) each.
         """
         return envelope(len(self.ranks), self.draws, alpha)
 
     def table(self, worst: int = 20) -> Table:
-        """The quantities with the smallest p-values first."""
+        """Return a table of the quantities, those with the smallest p-values first."""
         order = np.argsort(self.p_values, kind="stable")[:worst]
         table = Table(title=self._title, caption=self.verdict)
         for column in ("quantity", "p", "p (Bonferroni)", "bias", "spread", "the guide"):
@@ -138,10 +139,10 @@ class Calibration(Result):
         return table
 
     def plot(self, worst: int = 8) -> Figure:
-        """Rank histogram above ECDF difference, for the quantities with the smallest p-values.
+        """Draw rank histograms above ECDF differences, for the quantities with the smallest p-values.
 
-        Histograms are relative to uniform, with a band that holds a bin in 99 % of cases. ECDF differences have the
-        envelope that all quantities keep to, at all points, with 95 % probability (Bonferroni over quantities).
+        Histograms are relative to uniform, with a band that contains a bin in 99 % of cases. ECDF differences have a
+        simultaneous envelope for all quantities and points, with 95 % probability (Bonferroni over quantities).
         """
         order = np.argsort(self.p_values, kind="stable")[:worst]
         columns = min(4, len(order))
@@ -206,7 +207,7 @@ class Calibration(Result):
 
     @cached_property
     def _normals(self) -> np.ndarray:
-        """(Q, 2), bias and logarithm of spread."""
+        """Bias and logarithm of spread, (Q, 2)."""
         return np.stack([_likeliest_normal(counts, self.draws)[0] for counts in self.counts])
 
 
@@ -223,26 +224,27 @@ def calibrate(
     chunk: int = 4096,
     progress: bool = True,
 ) -> Calibration:
-    """Simulation-based calibration: draws latents and data from the model, and asks the guide for the latents.
+    """Calibrate a guide by simulation: draw latents and data from the model, and infer the latents with the guide.
 
-    Says whether the guide is the model's posterior on the model's own data; it knows nothing of real data, nor
-    of whether the model is a good one.
+    The result shows whether the guide is the model's posterior on the model's own data. It does not depend on real
+    data, nor on whether the model is good.
 
     Args:
-        model: the generative model; its own guide is examined where no other is given.
+        model: generative model; its own guide is tested by default.
         length: T of the simulated sequences.
-        simulations: N.
-        draws: L, draws from the guide for each simulation.
-        guide: a Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
-        steps: which steps of local latents are ranked, from 1; all without it.
+        simulations: N, number of simulations.
+        draws: L, number of draws from the guide for each simulation.
+        guide: Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
+        steps: steps of local latents to rank, from 1; all by default.
         context: context variables (C, T, D) or (C, D), used in turn.
-        seed: of simulations and draws.
-        chunk: sequences times draws to hold at once.
+        seed: seed of simulations and draws.
+        chunk: largest number of sequences times draws in memory.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: numbers below 1, steps beyond the length, context that is missing, or a guide without some latent.
-        FloatingPointError: a simulation that is not finite.
+        ValueError: when a number is below 1, steps are beyond the length, context is missing, or the guide has no site
+            for a latent.
+        FloatingPointError: when a simulation is not finite.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
@@ -270,7 +272,7 @@ def calibrate(
     def given(turn: Tensor) -> dict[str, Any]:
         return on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
 
-    with reproducibly(model, seed + 1):  # other simulations than those that are ranked
+    with reproducibly(model, seed + 1):  # independent of the ranked simulations
         points = _Points.of(model, given(torch.arange(draws)), draws, length, places)
     with reproducibly(model, seed), progress_bar(progress) as bar:
         for start in bar.track(range(0, simulations, at_once), description="simulations"):
@@ -282,18 +284,18 @@ def calibrate(
 
 
 def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the ECDF of independent uniform ranks lies, at all points at once, with probability at least 1 - alpha.
+    """Return the simultaneous envelope of the ECDF of independent uniform ranks, with probability at least 1 - alpha.
 
     Args:
-        count: N, the ranks.
+        count: N, number of ranks.
         draws: L; ranks are on 0..L.
-        alpha: between 0 and 1.
+        alpha: probability between 0 and 1.
 
     Returns:
-        Points k / (L + 1), and the least and largest share of ranks below k that still lie within, (L,) each.
+        Points k / (L + 1), and the smallest and largest share of ranks below k inside the envelope, (L,) each.
 
     Raises:
-        ValueError: an alpha that is no such probability.
+        ValueError: when alpha is not between 0 and 1.
     """
     if not 0 < alpha < 1:
         raise ValueError(f"alpha is a probability between 0 and 1, got {alpha}")
@@ -304,11 +306,11 @@ def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, n
 
 @dataclass(frozen=True)
 class _Points:
-    """Simulations, to give TARP a point for any data: the latents of those with the nearest data.
+    """Simulations that give TARP a point for any data: the latents of the simulation with the nearest data.
 
     Args:
-        data: (M, F).
-        latents: (M, Q).
+        data: data (M, F).
+        latents: latents (M, Q).
     """
 
     data: Tensor
@@ -316,29 +318,29 @@ class _Points:
 
     @classmethod
     def of(cls, model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int, steps: Tensor) -> Self:
-        """So many new ones."""
+        """Return `count` new simulations."""
         drawn = _simulated(model, given, count, length)
         return cls(_data(model, drawn), _coordinates(model, drawn, steps))
 
     def distances(self, model: DynamicalVAE, batch: Mapping[str, Any], latents: Tensor) -> Tensor:
-        """(B,), of latents (B, Q), in standard deviations of each of them in the simulations."""
+        """Return distances of latents (B, Q), in standard deviations of each of them in the simulations, (B,)."""
         nearest = torch.cdist(_data(model, batch) / _scale(self.data), self.data / _scale(self.data)).argmin(1)
         return ((latents - self.latents[nearest]) / _scale(self.latents)).norm(dim=1)
 
 
 def _scale(values: Tensor) -> Tensor:
-    """Standard deviations of columns; 1 of those that do not vary."""
+    """Return standard deviations of columns; 1 for constant columns."""
     scale = values.std(0, correction=0)
     return torch.where(scale > 0, scale, 1.0)
 
 
 def _data(model: DynamicalVAE, batch: Mapping[str, Any]) -> Tensor:
-    """(B, F)."""
+    """Return the data as (B, F)."""
     return torch.cat([batch[name].flatten(1) for name in model.observed], 1)
 
 
 def _coordinates(model: DynamicalVAE, latents: Mapping[str, Tensor], steps: Tensor) -> Tensor:
-    """(B, Q), of all latents at these steps."""
+    """Return all latents at these steps as (B, Q)."""
     local = model.generative.local
     return torch.cat(
         [(latents[name][:, steps] if local(name) else latents[name]).flatten(1) for name in model.latents], 1
@@ -346,7 +348,7 @@ def _coordinates(model: DynamicalVAE, latents: Mapping[str, Tensor], steps: Tens
 
 
 def _simulated(model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int) -> Mapping[str, Tensor]:
-    """Latents and data of so many sequences."""
+    """Return latents and data of `count` simulated sequences."""
     truth = model.sample(count, length, given or None)
     if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
         raise FloatingPointError(
@@ -366,10 +368,10 @@ def _ranks(
     steps: Tensor,
     points: _Points,
 ) -> Tensor:
-    """Ranks (B, Q) of B simulations, latents and data, among the guide's draws of their latents."""
+    """Return ranks (B, Q) of B simulations, latents and data, among the guide's draws of their latents."""
 
     def quantities(batch: Mapping[str, Any], latents: Mapping[str, Tensor]) -> Tensor:
-        """(B, Q)."""
+        """Return all quantities, (B, Q)."""
         ranked = _coordinates(model, latents, steps)
         joint = torch.stack(list(model.log_joint(batch, latents).values())).sum(0)
         return torch.cat([ranked, points.distances(model, batch, ranked)[:, None], joint[:, None]], 1)
@@ -388,7 +390,7 @@ def _ranks(
 
 @lru_cache(maxsize=8)
 def _tails(count: int, draws: int) -> np.ndarray:
-    """(L, N + 1): the smaller tail of k in a Binomial(N, i / (L + 1)), which the number of ranks below i follows."""
+    """Return the smaller tail (L, N + 1) of k in a Binomial(N, i / (L + 1)), the distribution of the ranks below i."""
     points = np.arange(1, draws + 1)[:, None] / (draws + 1)
     number = np.arange(count + 1.0)
     at_least = np.where(number > 0, scipy.special.bdtrc(np.maximum(number - 1, 0), count, points), 1.0)
@@ -396,15 +398,15 @@ def _tails(count: int, draws: int) -> np.ndarray:
 
 
 def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
-    """P(the smallest tail of a uniform sample's ECDF over all points is at most `least`), elementwise; exact.
+    """Return P(the smallest tail of a uniform sample's ECDF over all points is at most `least`), elementwise; exact.
 
-    Counts below 1, 2, ... of uniform ranks are a Poisson process given that it ends at N, so the probability to stay
-    within bounds is a chain of convolutions (Säilynoja et al. have binomial steps). `arviz_stats` simulates the same
-    probability, but drops the upper tail of every simulation with no rank below some point.
+    Counts below 1, 2, ... of uniform ranks are a Poisson process conditioned to end at N. The probability to stay
+    within bounds is therefore a chain of convolutions (Säilynoja et al. use binomial steps). `arviz_stats` simulates
+    the same probability, but drops the upper tail of every simulation with no rank below some point.
     """
     step, size = _poisson(count, count / (draws + 1)), scipy.fft.next_fast_len(2 * count + 1, real=True)
     transform = scipy.fft.rfft(step, size)
-    bound = least[:, None] * (1 + 1e-9)  # tails that are equal but for rounding are equal
+    bound = least[:, None] * (1 + 1e-9)  # tails that differ only by rounding are equal
     within = np.zeros((len(least), count + 1))
     within[:, 0] = 1
     for tails in _tails(count, draws):
@@ -416,14 +418,14 @@ def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
 
 
 def _poisson(largest: int, mean: float) -> np.ndarray:
-    """Probabilities of 0 to `largest`."""
+    """Return the probabilities of 0 to `largest`."""
     number = np.arange(largest + 1)
     return np.exp(scipy.special.xlogy(number, mean) - mean - scipy.special.gammaln(number + 1))
 
 
 @lru_cache(maxsize=32)
 def _critical(alpha: float, count: int, draws: int) -> float:
-    """The largest tail that is rejected at level alpha; 0 where none is."""
+    """Return the largest tail that is rejected at level alpha; 0 if there is none."""
     candidates = np.unique(_tails(count, draws))
     place = bisect_right(candidates, alpha, key=lambda least: _ecdf_test(np.array([least]), count, draws)[0])
     return float(candidates[place - 1]) * (1 + 1e-9) if place else 0.0
@@ -431,7 +433,7 @@ def _critical(alpha: float, count: int, draws: int) -> float:
 
 @lru_cache(maxsize=8)
 def _rank_table(draws: int) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of fine intervals of the real line, and P(rank | truth in the interval) among standard normal draws."""
+    """Return edges of fine intervals on the line, and P(rank | truth in the interval) among standard normal draws."""
     edges = np.linspace(-8, 8, 801)
     middles = np.concatenate([edges[:1], (edges[1:] + edges[:-1]) / 2, edges[-1:]])
     number, special = np.arange(draws + 1.0)[:, None], scipy.special
@@ -442,9 +444,9 @@ def _rank_table(draws: int) -> tuple[np.ndarray, np.ndarray]:
 def _likeliest_normal(
     counts: np.ndarray, draws: int, bias: float | None = None, log_spread: float | None = None
 ) -> tuple[np.ndarray, float]:
-    """Mean and log standard deviation, where not given, of the truth that most likely has these ranks; how likely.
+    """Return mean and log standard deviation of the truth that most likely has these ranks, and the log-likelihood.
 
-    Ranks 0 and L are tails: they do not say how far beyond all draws a truth lies.
+    A given value is fixed. Ranks 0 and L are tails: they do not determine how far outside all draws a truth lies.
     """
     edges, table = _rank_table(draws)
     scores = scipy.special.ndtri((np.arange(draws + 1) + 0.5) / (draws + 1))
@@ -463,17 +465,17 @@ def _likeliest_normal(
     mean = counts @ scores / counts.sum()
     ratio = math.sqrt(counts @ (scores - mean) ** 2 / counts.sum() / (scores**2).mean())
     limits = [(-12.0, 12.0) if bias is None else (bias, bias), (-3.0, 3.0) if log_spread is None else (log_spread,) * 2]
-    start = np.clip([mean, math.log(max(ratio, 1.0))], *np.transpose(limits))  # wide, so that all ranks have a slope
+    start = np.clip([mean, math.log(max(ratio, 1.0))], *np.transpose(limits))  # wide, so that all ranks have a gradient
     found = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits)
     return found.x, -float(found.fun)
 
 
 def _reading(name: str, counts: np.ndarray, draws: int) -> str:
-    """What three standard errors, by the likelihood ratio, tell of bias at any spread and of spread at any bias."""
+    """Return an interpretation from likelihood ratio tests (three standard errors) of bias and of spread."""
     (bias, log_spread), likelihood = _likeliest_normal(counts, draws)
     biased = 2 * (likelihood - _likeliest_normal(counts, draws, bias=0.0)[1]) > 9
     spread = 2 * (likelihood - _likeliest_normal(counts, draws, log_spread=0.0)[1]) > 9
-    if name == LOG_JOINT:  # of draws that are all near the mode, the truth is the least probable
+    if name == LOG_JOINT:  # if all draws are near the mode, the truth is the least probable
         return ("draws improbable latents" if bias > 0 else "is too concentrated") if biased else "has another shape"
     if name == TARP:  # the nearer draws are to each other, the nearer to a point among them
         return ("is too concentrated" if bias > 0 else "is too dispersed") if biased else "has another shape"

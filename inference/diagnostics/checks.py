@@ -1,8 +1,8 @@
 """Predictive checks: do replicated sequences look like real ones?
 
 `predictive_checks` compares statistics of real windows with those of forecasts and of draws from the posterior
-predictive distribution (Gelman, Meng and Stern, 1996). `STATISTICS` are some for any sequences, `usual` these in the
-unit of the data.
+predictive distribution (Gelman, Meng and Stern, 1996). `STATISTICS` lists statistics for any sequences, and `usual`
+returns them in the unit of the data.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number that says something of a sequence.
+    """Statistic of a sequence.
 
     Args:
-        function: x (..., T, D) -> (...). Of windows with missing entries x is NaN there, in replicates too.
-        unit: of the number.
-        note: a line below the table.
+        function: function from x (..., T, D) to (...). For windows with missing entries x is NaN there, also in
+            replicates.
+        unit: unit of the statistic.
+        note: line below the table.
     """
 
     function: Callable[[Tensor], Tensor]
@@ -49,7 +50,7 @@ class Statistic:
 
 
 def variance(x: Tensor) -> Tensor:
-    """(..., D), over time, of what is not NaN of x (..., T, D)."""
+    """Return the variance over time, (..., D), of x (..., T, D), ignoring NaN."""
     if not x.isnan().any():
         return x.var(-2, correction=0)
     return mean_of_known((x - mean_of_known(x, -2).unsqueeze(-2)).square(), -2)
@@ -96,19 +97,23 @@ STATISTICS = {
     "smallest": Statistic(_smallest),
     "largest": Statistic(lambda x: -_smallest(-x)),
 }
-"""For any sequences: mean of all numbers; their standard deviation over time about it, coordinate by coordinate, and
-that of their steps from frame to frame (root mean squares over coordinates); the lag at which the autocorrelation,
-pooled over coordinates, falls below 1/e, T where it never does, and that at a lag of 1, 1 of what stands still; and of
-data that are counts or positive, the share of numbers that are 0, and the extremes. Means are of what was observed."""
+"""Statistics for any sequences, of observed numbers:
+
+"mean": mean of all numbers. "scale": standard deviation over time. "roughness": root mean square step from frame to
+frame. Both are root mean squares over coordinates. "correlation length": lag at which the autocorrelation, pooled over
+coordinates, falls below 1/e, or T if it never does. "lag-1 correlation": autocorrelation at a lag of 1, and 1 for a
+constant sequence. For counts or positive data, "zeros" is the share of zeros, and "smallest" and "largest" are the
+extremes.
+"""
 _OF_DATA = ("mean", "scale", "roughness", "smallest", "largest")
-"""Those in the unit of the data."""
+"""Names of statistics in the unit of the data."""
 
 
 def usual(windows: HeldOutWindows) -> dict[str, Statistic]:
-    """`STATISTICS`, of all columns together, as `scores.proper` has its scores.
+    """Return `STATISTICS` of all columns together, with units as for the scores of `scores.proper`.
 
-    In the unit of the columns, if windows name them and they share one; else, where windows tell the scales of columns,
-    of numbers in these, which have no unit.
+    If the windows name columns that share a unit, statistics are in this unit. If the windows define the scales of
+    columns, statistics are of scaled numbers without a unit.
     """
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
@@ -137,9 +142,9 @@ class Check:
     """One statistic of real and of replicated windows.
 
     Attributes:
-        real: (N,), of the windows of which the statistic says something.
-        replicated: (S, N).
-        unit: of both.
+        real: values (N,) of the windows where the statistic is defined.
+        replicated: values (S, N) of replicates.
+        unit: unit of both.
     """
 
     real: Annotated[np.ndarray, Dims("sequence", name="{0} {2} {1}")]
@@ -148,7 +153,7 @@ class Check:
 
     @property
     def tail_areas(self) -> np.ndarray:
-        """(N,), each window's Bayesian p-value: the share of its replicates that are larger, ties counting half."""
+        """Bayesian p-value of each window, (N,): the share of its replicates that are larger, ties counting half."""
         larger, equal = self.replicated > self.real, self.replicated == self.real
         return (larger + 0.5 * equal).mean(0)
 
@@ -159,17 +164,17 @@ class Check:
 
     @property
     def expected_outside(self) -> float:
-        """`outside` of the true model's forecasts, ties apart: the window's rank among its S is uniform on 0..S."""
+        """Expected `outside` for the true model's forecasts without ties: ranks among S are uniform on 0..S."""
         samples = len(self.replicated)
         return 2 * -(-samples // 20) / (samples + 1)
 
     @property
     def wasserstein(self) -> float:
-        """Distance between the distributions of real and replicated values, in their unit."""
+        """Wasserstein distance between the distributions of real and replicated values, in their unit."""
         return float(scipy.stats.wasserstein_distance(self.real, self.replicated.ravel()))
 
 
-_SEAM = 2  # observed frames that are joined to a forecast, so that a jump counts
+_SEAM = 2  # observed frames joined to a forecast, so that a jump counts
 PROGRAMS = {
     "forecast": "free-running given what was observed",
     "posterior": "free-running given latents inferred from the whole window",
@@ -178,17 +183,17 @@ PROGRAMS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PredictiveChecks(Result):
-    """Statistics of replicated windows beside those of the real ones.
+    """Statistics of replicated and of real windows.
 
     Attributes:
-        models: by model, program and statistic, `Check`; programs are "forecast" and, of a model with latents,
+        models: `Check` by model, program and statistic; programs are "forecast" and, for a model with latents,
             "posterior".
-        data: fingerprint, windows, frames, coordinates, and what the windows say of themselves.
-        protocol: the fields of the windows' protocol.
-        samples: S, replicates of each window.
+        data: fingerprint, windows, frames, coordinates, and the windows' description.
+        protocol: fields of the windows' protocol.
+        samples: S, number of replicates of each window.
         emission: "mean" or "drawn".
-        seed: of every model's draws.
-        notes: lines below the table on how statistics are to be read.
+        seed: seed of every model's draws.
+        notes: lines below the table on how to read statistics.
     """
 
     models: Annotated[dict[str, dict[str, dict[str, Check]]], MODELS]
@@ -201,7 +206,7 @@ class PredictiveChecks(Result):
 
     @cached_property
     def checks(self) -> dict[tuple[str, str, str], Check]:
-        """By (model, program, statistic)."""
+        """Checks by (model, program, statistic)."""
         return {
             (model, program, name): check
             for model, programs in self.models.items()
@@ -215,7 +220,7 @@ class PredictiveChecks(Result):
         return self.checks[key]
 
     def table(self) -> Table:
-        """Quantiles of real and replicated values, their distance, and where real values lie among replicates."""
+        """Return a table of quantiles of real and replicated values, their distance, and tail areas of real values."""
         expected = next(iter(self.checks.values())).expected_outside
         models, programs, names = self._keys
         caption = [
@@ -244,7 +249,7 @@ class PredictiveChecks(Result):
         return table
 
     def plot(self) -> Figure:
-        """Densities of each statistic: real windows grey, replicates as one line per model."""
+        """Draw the density of each statistic: real windows in grey, replicates as one line per model."""
         models, programs, names = self._keys
         size = (0.6 + 2.3 * len(names), 0.8 + 2.0 * len(programs))
         figure = canvas(*size)
@@ -252,7 +257,7 @@ class PredictiveChecks(Result):
         for column, name in enumerate(names):
             checks = [self.checks[model, program, name] for program in programs for model in models[program]]
             values = [found for check in checks for found in (check.real, check.replicated)]
-            # the outer bins take what is more extreme: a wild replicate must not flatten the rest
+            # the outer bins include more extreme values, so that a wild replicate does not flatten the rest
             low, high = np.quantile(np.stack([np.quantile(v, (0.005, 0.995)) for v in values]), (0, 1))
             edges = np.linspace(low, high if high > low else low + 1, 41)
             for row, program in enumerate(programs):
@@ -323,29 +328,32 @@ def predictive_checks(
     batch_size: int = 32,
     progress: bool = True,
 ) -> PredictiveChecks:
-    """Replicates windows with one model or several, and compares statistics with those of the real ones.
+    """Replicate windows with one or several models, and compare statistics with those of the real windows.
 
-    Two replications, both free-running. "forecast": the frames after the observed ones; the last two observed frames
-    are joined to them, so that a jump at the seam counts. "posterior", the posterior predictive distribution proper:
-    latents are inferred from the whole window, and all its frames are generated anew from them; a model without latents
-    has none. Where entries of a window are missing, its replicates lack them too; a window that leaves too few for a
-    statistic does not count in it.
+    There are two kinds of replicates, both free-running. "forecast": the frames after the observed ones. The last two
+    observed frames are joined to them, so that a jump counts. "posterior", the posterior predictive distribution:
+    latents are inferred from the whole window, and all its frames are generated from them. A model without latents has
+    no "posterior".
+
+    Missing entries of a window are also missing in its replicates. A window with too few entries for a statistic is not
+    counted.
 
     Args:
         model: a model, or `{name: model}`.
         windows: `ArrayWindows`, or any `HeldOutWindows`.
-        statistics: name to `Statistic`, such as those of an application; those that are `usual`, if not
-            given.
-        samples: S, replicates of each window; at least 19, for tail areas below .05 to be a tenth.
-        draw_emission: replicate draws of x. Its means, as forecasts are shown, lack the noise of the emission: with
-            them what is shown is examined, and no longer the model.
-        seed: of every model's draws.
-        batch_size: windows replicated at once.
+        statistics: `Statistic` by name, such as those of an application; `usual` by default.
+        samples: S, number of replicates of each window; at least 19, so that tail areas below .05 have a probability of
+            a tenth at most.
+        draw_emission: whether replicates are draws of x. Its means have no emission noise: with them, the check is of
+            displayed forecasts rather than of the model.
+        seed: seed of every model's draws.
+        batch_size: number of windows in a batch.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: ragged windows, too few samples, a statistic of the wrong shape or not finite on real windows.
-        FloatingPointError: a statistic that is not finite on replicated windows.
+        ValueError: when windows are ragged, there are too few samples, or a statistic has the wrong shape or is not
+            finite on real windows.
+        FloatingPointError: when a statistic is not finite on replicated windows.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -405,7 +413,7 @@ def predictive_checks(
 
 
 def _forecast(model: DynamicalVAE, batch: Batch, observed: int, samples: int, drawn: bool) -> Tensor:
-    """The last observed frames and the future, (S, B, seam + H, D)."""
+    """Return the last observed frames and the future, (S, B, seam + H, D)."""
     x = batch["x"]
     seen, horizon = batch.past(observed), x.shape[1] - observed
     future = model.forecast(seen, horizon, samples, draw_emission=drawn)["x"]
@@ -413,7 +421,7 @@ def _forecast(model: DynamicalVAE, batch: Batch, observed: int, samples: int, dr
 
 
 def _posterior(model: DynamicalVAE, batch: Batch, observed: int, samples: int, drawn: bool) -> Tensor:
-    """(S, B, T, D)."""
+    """Return windows generated from inferred latents, (S, B, T, D)."""
     repeated = repeat(batch, samples)
     return decode(model, repeated, model.guide(repeated), not drawn).unflatten(0, (samples, -1))
 
@@ -424,7 +432,7 @@ _REPLICATES = {"forecast": _forecast, "posterior": _posterior}
 def _measure(
     statistics: Mapping[str, Statistic], x: Tensor, whose: str, told: Mapping[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
-    """Statistics (..., N) by name; NaN of a window that has too many gaps, or of which `told` (N,) says so."""
+    """Return statistics (..., N) by name; NaN for windows with too few entries, or where `told` (N,) is False."""
     found = {}
     for name, statistic in statistics.items():
         found[name] = statistic.function(x).double().cpu()
@@ -443,9 +451,9 @@ def _measure(
 def decode(
     model: DynamicalVAE, batch: Mapping[str, Tensor], latents: Mapping[str, Tensor], mean_emission: bool
 ) -> Tensor:
-    """x (B, T, D) run free from its own past, given context and latents; latents that are not given are drawn.
+    """Return x (B, T, D) run freely from its own past, given context and latents; other latents are drawn.
 
-    It is as the data are, and not as the model sees them. First frames that are context stay as they are.
+    x is in data space, not in the model's view. First frames that are context are kept.
     """
     data = model.read(batch)
     known = {name: value for name, value in data.items() if name in model.context}

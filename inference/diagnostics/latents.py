@@ -1,4 +1,4 @@
-"""Latents as rows of numbers, and the posterior of one sequence where these are measured in the guide's deviations."""
+"""Latents as flat vectors, and the posterior of one sequence in units of the guide's standard deviations."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from ..bounds.elbo import log_densities, require_data, require_latents, require_
 
 Values = Mapping[str, Tensor]
 Shapes = Mapping[str, tuple[int, int]]
-"""Latent to steps and dimension; no steps of a static one."""
+"""Number of steps and dimension of each latent, by name; 0 steps for a static one."""
 CHUNK = 4096
-"""Rows of a batch that are held at once."""
+"""Largest number of rows of a batch in memory."""
 _LEAST = 1e-6
 
 
 def joined(values: Values) -> Tensor:
-    """(..., B, P) of latents (..., B, ...), of which all but one dimension is of a sequence."""
+    """Return latents (..., B, ...) as flat vectors (..., B, P); B is the first dimension of each."""
     return torch.cat([value.reshape(len(value), -1) for value in values.values()], -1)
 
 
 def split(flat: Tensor, like: Values) -> dict[str, Tensor]:
-    """Latents (..., ...) of (..., P), in the shapes of these."""
+    """Return latents by name from flat vectors (..., P), in the shapes of `like`."""
     shapes = {name: value.shape[1:] for name, value in like.items()}
     parts = flat.split([shape.numel() for shape in shapes.values()], -1)
     each = zip(shapes.items(), parts, strict=True)
@@ -38,7 +38,7 @@ def split(flat: Tensor, like: Values) -> dict[str, Tensor]:
 
 
 def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
-    """What single numbers of latents are called: "w[0]", "z_3[1]" (step from 1, coordinate from 0)."""
+    """Return names of the single numbers of latents: "w[0]", "z_3[1]" (step from 1, coordinate from 0)."""
     local = [f"_{t}" for t in steps]
     return tuple(
         f"{name}{step}[{d}]"
@@ -49,16 +49,16 @@ def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
 
 
 def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | None) -> list[Batch]:
-    """Batches of one sequence each, as the model reads them, of those whose posteriors have a score.
+    """Return batches of one sequence each, as the model reads them, after checking that posteriors have a score.
 
     Args:
         model: the model.
-        batch: see `DynamicalVAE.model`.
-        sequences: which of the batch; None for all.
+        batch: batch as in `DynamicalVAE.model`.
+        sequences: indices of sequences in the batch; None for all.
 
     Raises:
-        ValueError: a model without likelihood or latents, with latents that are not any real numbers, or whose
-            sequences share some; data that are missing; sequences that are not in the batch.
+        ValueError: when the model has no likelihood or latents, a latent is not any real number or is shared by
+            sequences, data are missing, or a sequence is not in the batch.
     """
     require_likelihood(model)
     require_latents(model)
@@ -80,21 +80,21 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
 
 
 class Inferred:
-    """The latents of one sequence as P numbers u: what the guide draws, and the density that they should have.
+    """Latents of one sequence as P numbers u, with draws of the guide and the posterior density up to a constant.
 
         z = m + s u,    m and s: mean and standard deviation of the guide's draws, number by number
 
-    Numbers at padding, which the posterior says nothing of, are not among them.
+    Numbers at padding are excluded, because the posterior does not depend on them.
 
     Args:
-        model: with its guide.
-        data: of one sequence, as the model reads them.
-        guide: a Pyro program of the batch with a site for every latent; None for the model's own.
-        draws: K of the guide, of which m and s are.
+        model: model with its guide.
+        data: batch of one sequence, as the model reads it.
+        guide: Pyro program of the batch with a site for every latent; None for the model's own.
+        draws: K, number of draws of the guide for m and s.
 
     Raises:
-        ValueError: a guide without some latent.
-        FloatingPointError: draws that are not finite.
+        ValueError: when the guide has no site for a latent.
+        FloatingPointError: when draws are not finite.
     """
 
     def __init__(self, model: DynamicalVAE, data: Batch, guide: Callable[..., Any] | None, draws: int):
@@ -114,31 +114,31 @@ class Inferred:
         self._repeated: tuple[int, Any] = 0, None
 
     def drawn(self, n: int) -> Tensor:
-        """(n, P) draws z of the guide."""
+        """Return draws z (n, P) of the guide."""
         counts = [min(CHUNK, n - first) for first in range(0, n, CHUNK)]
         return torch.cat([joined(self._of_guide(count))[:, self.there] for count in counts])
 
     def prior(self, n: int) -> Tensor:
-        """(n, P) draws z of what the model says of them before it has seen the data of their own step."""
+        """Return draws z (n, P) from the conditionals of the model, which do not use the data of their own step."""
         drawn = self.model.model(repeat(self.data, n))
         return joined({name: drawn[name] for name in self.model.latents})[:, self.there]
 
     def whitened(self, z: Tensor) -> Tensor:
-        """(..., P) numbers u of z."""
+        """Return the numbers u (..., P) of z."""
         return (z - self.center) / self.scale
 
     def log_joint(self, u: Tensor) -> Tensor:
-        """(R,) log p(x, z) of u (R, P), but for a constant."""
+        """Return log p(x, z) of u (R, P), up to a constant, (R,)."""
         if self._repeated[0] != len(u):
             self._repeated = len(u), repeat(self.data, len(u))
         flat = self._elsewhere.repeat(len(u), 1)
-        flat[:, self.there] = (self.center + self.scale * u).to(flat)  # of single precision NUTS makes double
+        flat[:, self.there] = (self.center + self.scale * u).to(flat)  # NUTS converts single precision to double
         program = poutine.condition(self.model.model, data=split(flat, self._like))
-        with torch.backends.cudnn.flags(enabled=False):  # which has no gradients of recurrent networks in evaluation
+        with torch.backends.cudnn.flags(enabled=False):  # no gradients of recurrent networks in evaluation mode
             return total(log_densities(poutine.trace(program).get_trace(self._repeated[1])))
 
     def score(self, u: Tensor) -> Tensor:
-        """(R, P), the gradient of `log_joint`."""
+        """Return the gradient of `log_joint`, (R, P)."""
         parts = []
         for some in u.split(CHUNK):
             with torch.enable_grad():
@@ -148,7 +148,7 @@ class Inferred:
         return torch.cat(parts)
 
     def whole(self, values: Tensor) -> Tensor:
-        """(..., Q) of (..., P), NaN at padding."""
+        """Return values (..., P) as (..., Q), with NaN at padding."""
         found = values.new_full((*values.shape[:-1], len(self.there)), math.nan)
         found[..., self.there] = values
         return found

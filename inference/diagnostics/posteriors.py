@@ -1,14 +1,14 @@
-"""The posterior of latents given whatever was observed: its mode and the normal about that, of all sequences at once.
+"""Posterior of latents given observations: its mode and a normal approximation there, for all sequences in parallel.
 
     w* = argmax log p(w, seen),    p(w | seen) ~ N(w*, H^-1),    H = -d2 log p(w*, seen) / dw dw
 
-What was observed is said as a Pyro program says it. Its sequences do not know of each other, so that the sum of their
-energies E = -log p has the gradient of each: sequences and starts go down as the rows of one batch, by Adam, which
-steps number by number. Curvatures of all rows come out of as many backward passes as a row has numbers. By them the
-last steps are Newton's, which are exact where E is quadratic; the normal is so too, and else Laplace's approximation.
+A Pyro program defines the observations. Its sequences are independent, so the sum of their energies E = -log p has the
+gradient of each. Sequences and starts are the rows of one batch, which Adam minimises number by number. The curvatures
+of all rows need as many backward passes as a row has numbers. With these, the last steps are Newton steps. They are
+exact if E is quadratic, and so is the normal; otherwise it is Laplace's approximation.
 
-A row's posterior says how far it has converged (`left`), whether starts agree (`behind`), and whether the normal is
-one to rely on (`bent`, and k-hat of `evidence`).
+The result reports for each row whether the search has converged (`left`), whether starts agree (`behind`), and whether
+the normal is reliable (`bent`, and k-hat of `evidence`).
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ _Program = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class Descent:
-    """How a mode is looked for.
+    """Options of the search for a mode.
 
     Args:
-        steps: of Adam.
-        rate: of learning at first; it falls to 0 along a cosine.
-        starts: S, from which a sequence's mode is looked for; the lowest one is kept.
-        candidates: draws from the prior, and as many from the guide where there is one. They and the mean of the
-            prior's are dealt out to the starts, each of which is the most probable of its own.
-        renewed: steps after which what the batch says of the values is renewed.
-        newton: steps of Newton's at the end, each with a curvature of its own.
+        steps: number of steps of Adam.
+        rate: initial learning rate; it falls to 0 along a cosine.
+        starts: S, number of starts for each sequence; the lowest result is kept.
+        candidates: number of draws from the prior, and from the guide if there is one. They and the mean of the prior's
+            draws are divided among the starts; each starts at its most probable one.
+        renewed: number of steps between calls of `renew`.
+        newton: number of Newton steps at the end, each with its own curvature.
 
     Example:
         >>> quick = dvae.Descent(steps=50, starts=2)
@@ -69,19 +69,19 @@ class Descent:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Modes of B sequences, and normals about them.
+    """Modes of B sequences, and normal approximations there.
 
     Args:
-        mode: latent to its most probable value (B, ...).
-        energy: (B,) -log p(w*, seen), in nats.
-        energies: (S, B) those at which starts arrived, the lowest first, before Newton's steps.
-        course: (steps, B) that of the start which arrived lowest, on its way.
-        left: (B,) nats by which another step of Newton's would lower the energy, if it were quadratic: about 0 where
-            the descent has converged.
-        bent: (B,) directions in which the energy is less curved than that of the prior alone. There the normal is as
-            wide as the prior, for it would be wider, or have no width.
-        factor: (B, P, P) lower triangle whose square is the covariance of all numbers of a sequence's latents, in the
-            order of `mode`.
+        mode: most probable value (B, ...) of each latent.
+        energy: -log p(w*, seen), in nats, (B,).
+        energies: energies that the starts reached, the lowest first, before Newton steps, (S, B).
+        course: energies during the search from the start that reached the lowest, (steps, B).
+        left: reduction of the energy by another Newton step, in nats, if the energy were quadratic, (B,); about 0 after
+            convergence.
+        bent: number of directions in which the energy is less curved than with the prior alone, (B,). There the normal
+            is as wide as the prior, because otherwise it would be wider or have no finite width.
+        factor: lower triangular factor of the covariance of all latent numbers of a sequence, in the order of `mode`,
+            (B, P, P).
 
     Example:
         >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
@@ -100,25 +100,25 @@ class Posterior:
 
     @property
     def moved(self) -> Tensor:
-        """(B,) nats by which the energy fell in the last tenth of the steps."""
+        """Reduction of the energy in the last tenth of the steps, in nats, (B,)."""
         return self.course[-ceil(len(self.course) / 10)] - self.course[-1]
 
     @property
     def behind(self) -> Tensor:
-        """(S, B) nats by which starts arrived above the lowest one."""
+        """Energy that each start reached above the lowest one, in nats, (S, B)."""
         return self.energies - self.energies[:1]
 
     @property
     def deviation(self) -> dict[str, Tensor]:
-        """Latent to standard deviations (B, ...)."""
+        """Standard deviations (B, ...) of each latent."""
         return split(self.factor.norm(dim=-1), self.mode)
 
     def draw(self, n: int, seed: int = 0) -> dict[str, Tensor]:
-        """Latent to draws (n, B, ...) from the normal."""
+        """Return draws (n, B, ...) of each latent from the normal."""
         return split(joined(self.mode) + self._away(n, torch.Generator().manual_seed(seed)), self.mode)
 
     def guide(self, batch: Any = None) -> dict[str, Tensor]:
-        """The normal as a Pyro guide of the program, on the same batch."""
+        """Sample the normal as a Pyro guide of the program, on the same batch."""
         with pyro.plate("sequences", len(self.factor)):
             law = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
             flat = pyro.sample("_latents", law, infer={"is_auxiliary": True})
@@ -129,15 +129,15 @@ class Posterior:
     def evidence(
         self, program: _Program, batch: Any, particles: int = 200, *, seed: int = 0, chunk: int = 4096
     ) -> ImportanceBound:
-        """The log evidence of what was seen, by importance sampling from the normal, and k-hat of its weights.
+        """Return the log evidence of the observations by importance sampling from the normal, with its k-hat.
 
-        A k-hat above 0.7 says that the posterior is not like the normal: take its intervals as rough.
+        A k-hat above 0.7 means that the posterior differs from the normal: its intervals are then rough.
 
         Args:
-            program, batch: of which this is the posterior.
-            particles: K.
-            seed: of the draws.
-            chunk: sequences times particles to hold at once.
+            program, batch: program and batch of this posterior.
+            particles: K, number of particles.
+            seed: seed of the draws.
+            chunk: largest number of sequences times particles in memory.
         """
         generator = torch.Generator().manual_seed(seed)
         law = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)
@@ -150,7 +150,7 @@ class Posterior:
         return importance_mean(log_weights, len(self.factor), particles, chunk)
 
     def _away(self, n: int, generator: torch.Generator) -> Tensor:
-        """(n, B, P) draws from the normal, less its mean."""
+        """Return draws (n, B, P) from the normal, minus its mean."""
         noise = torch.randn(n, *self.factor.shape[:-1], generator=generator, dtype=self.factor.dtype)
         return (self.factor @ noise.to(self.factor)[..., None]).squeeze(-1)
 
@@ -167,25 +167,25 @@ def posterior(
     chunk: int = 2048,
     progress: bool = False,
 ) -> Posterior:
-    """The posterior of a program's latents given a batch.
+    """Return the posterior of a program's latents given a batch.
 
     Args:
-        program: a Pyro program of the batch, such as `DynamicalVAE.model`, in evaluation mode. Its latents (B, ...) are
-            continuous and unbounded, about as wide as N(0, I), and have a log-concave prior, such as normals; every
-            site has one log-density for each sequence.
-        batch: tensors (B, ...) by name, of what was observed and what else the program reads.
-        guide: a program of the batch that draws latents, or some of them, to begin from as well.
-        descent: how a mode is looked for.
-        renew: what the batch is to hold beside values of latents, such as which points belong together: called with the
-            batch and the latents every `descent.renewed` steps, without gradients.
-        seed: of the candidates.
-        chunk: sequences times starts to hold at once.
+        program: Pyro program of the batch, such as `DynamicalVAE.model`, in evaluation mode. Its latents (B, ...) are
+            continuous and unbounded, about as wide as N(0, I), with a log-concave prior such as a normal; every site
+            has one log-density for each sequence.
+        batch: tensors (B, ...) by name: the observations, and whatever else the program reads.
+        guide: program of the batch that draws some or all latents, as further candidates.
+        descent: options of the search.
+        renew: function that updates parts of the batch that depend on the latents, such as which points belong
+            together. It is called with the batch and the latents every `descent.renewed` steps, without gradients.
+        seed: seed of the candidates.
+        chunk: largest number of sequences times starts in memory.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: a program without latents, with sites of which sequences have no log-density of their own, or with
-            a prior that is not log-concave.
-        FloatingPointError: a sequence of which no start has a finite energy.
+        ValueError: when the program has no latents, a site has no separate log-density for each sequence, or the prior
+            is not log-concave.
+        FloatingPointError: when no start of a sequence has a finite energy.
 
     Example:
         >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
@@ -206,12 +206,12 @@ def posterior(
 
 
 def _some(batch: Any) -> Tensor:
-    """A tensor (B, ...) of a batch."""
+    """Return a tensor (B, ...) of a batch."""
     return batch if isinstance(batch, Tensor) else _some(next(iter(batch.values())))
 
 
 class _Search:
-    """Of one chunk of sequences."""
+    """Search for the modes of one chunk of sequences."""
 
     def __init__(
         self,
@@ -225,7 +225,7 @@ class _Search:
         self.program, self.batch, self.guide, self.descent, self.went = program, batch, guide, descent, went
         self.size = len(_some(batch))
         self.renew = renew or (lambda batch, values: batch)
-        self.latents: dict[str, Tensor] = {}  # of which shapes are read
+        self.latents: dict[str, Tensor] = {}  # examples of the latents, for their shapes
 
     def run(self) -> Posterior:
         with torch.no_grad():
@@ -262,7 +262,7 @@ class _Search:
         )
 
     def _starts(self) -> Tensor:
-        """(S, B, P): of the candidates, the most probable ones."""
+        """Return the most probable candidates, (S, B, P)."""
         nodes: dict[str, Any] = poutine.trace(self.program).get_trace(self.batch).nodes
         self.latents = {
             name: site["value"]
@@ -284,12 +284,12 @@ class _Search:
         return torch.stack([every[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
 
     def _drawn(self, program: _Program) -> dict[str, Tensor]:
-        """Latents that a program draws."""
+        """Return the latents that a program draws."""
         nodes: dict[str, Any] = poutine.trace(program).get_trace(self.batch).nodes
         return {name: nodes[name]["value"] for name in self.latents if name in nodes}
 
     def _down(self, starts: Tensor) -> tuple[Tensor, Tensor]:
-        """Where starts (S, B, P) arrive, and their energies (steps, S, B) on the way."""
+        """Return the results (S, B, P) of Adam from starts (S, B, P), and their energies (steps, S, B) on the way."""
         descent, course = self.descent, []
         batch = repeat(self.batch, len(starts))
         values = starts.flatten(0, 1).clone().requires_grad_()
@@ -300,7 +300,7 @@ class _Search:
                 batch = self._renewed(batch, values.detach())
             energy = self._energy(batch, values)
             (gradient,) = torch.autograd.grad(energy.sum(), values)
-            values.grad = gradient.nan_to_num(0.0, 0.0, 0.0)  # of a row that has left for infinity, and others go on
+            values.grad = gradient.nan_to_num(0.0, 0.0, 0.0)  # for a diverged row, so that the others continue
             adam.step()
             falling.step()
             course.append(energy.detach())
@@ -319,7 +319,7 @@ class _Search:
             return self._energy(self._renewed(batch, values), values)
 
     def _curvature(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> tuple[Tensor, Tensor]:
-        """Gradients (B, P) and second derivatives (B, P, P) of the energy, or of what these sites add to it."""
+        """Return gradients (B, P) and second derivatives (B, P, P) of the energy, or of the part of these sites."""
         values = values.clone().requires_grad_()
         with torch.enable_grad():
             energy = self._energy(batch, values, sites)
@@ -331,7 +331,7 @@ class _Search:
         return gradient.detach(), torch.stack(found, -1)
 
     def _lower(self, batch: Any, values: Tensor, step: Tensor) -> Tensor:
-        """A step, or what half, quarter or eighth of it lowers the energy; no step where none does."""
+        """Return the best of a full, half, quarter or eighth step, or no step if none lowers the energy."""
         shares = step.new_tensor([1.0, 0.5, 0.25, 0.125, 0.0])
         tried = [values + share * step for share in shares]
         energies = torch.stack([self._measured(batch, each) for each in tried]).nan_to_num(torch.inf)
@@ -339,7 +339,7 @@ class _Search:
 
 
 def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str] | None = None) -> Tensor:
-    """-log p (B,) of a program's sites, or of some of them, at these values of its latents."""
+    """Return -log p (B,) of a program's sites, or of some of them, at these values of its latents."""
     with alone:
         trace = poutine.trace(poutine.condition(program, data=dict(values))).get_trace(batch)
     trace.compute_log_prob(site_filter=lambda name, _: sites is None or name in sites)
@@ -350,11 +350,11 @@ def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str
             f"log-densities are {wrong}, expected one for each of {size} sequences; draw in one plate over sequences, "
             "and say of all other dimensions that they are of one event (`.to_event()`)"
         )
-    return -torch.stack([log for log in logs.values() if log.dim()]).sum(0)  # plates have none
+    return -torch.stack([log for log in logs.values() if log.dim()]).sum(0)  # plates have no dimensions
 
 
 def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Lower roots (B, P, P) of inverse curvature, at least the prior's, and in how many directions it was less."""
+    """Return lower roots (B, P, P) of the inverse of the curvature, raised to the prior's, and the number of raises."""
     kind, curvature, prior = curvature, curvature.double(), prior.double()
     root, failed = torch.linalg.cholesky_ex(prior)
     if failed.any():
@@ -365,7 +365,7 @@ def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     white = torch.linalg.solve_triangular(root, torch.eye(prior.shape[-1]).to(prior), upper=False)
     relative = white @ curvature @ white.mT
     values, directions = torch.linalg.eigh((relative + relative.mT) / 2)
-    bent = (values < 1 - 1e-3).sum(-1)  # 1 but for rounding, where nothing was observed
+    bent = (values < 1 - 1e-3).sum(-1)  # without observations exactly 1, except for rounding
     upper = torch.linalg.qr((white.mT @ directions / values.clamp(min=1.0)[..., None, :].sqrt()).mT)[1]
     signs = upper.diagonal(dim1=-2, dim2=-1).sign()
     return (upper * signs[..., None]).mT.to(kind), bent

@@ -1,16 +1,16 @@
-"""Kernel Stein discrepancy of a guide's draws from the posterior: a test that needs no draws from the posterior.
+"""Kernel Stein discrepancy between a guide's draws and the posterior: a test that needs no draws from the posterior.
 
     h(u, v) = s(u)'s(v) k(u, v) + s(u)' dk/dv + s(v)' dk/du + sum_p d2k / du_p dv_p,    s = d log p(x, u) / du,
-    KSD^2   = mean of h over pairs of different draws: unbiased, and 0 on average where they are from the posterior
+    KSD^2   = mean of h over pairs of different draws: unbiased, and 0 on average if they are from the posterior
 
-(Liu, Lee and Jordan, 2016, arXiv 1602.03253; Chwialkowski, Strathmann and Gretton, 2016, arXiv 1602.02964), with the
-inverse multiquadric kernel k(u, v) = (1 + |u - v|^2 / b^2)^(-1/2), whose tails are heavy enough that draws which do not
-converge to the posterior are told (Gorham and Mackey, 2017, arXiv 1703.01717). Preconditioned: u are the latents in
-standard deviations of the guide, number by number, by draws of their own. The bandwidth is b^2 = 2 P, as far apart as
-two draws of P such numbers are, squared, on average. The score needs no evidence; it is one gradient of the model.
+(Liu, Lee and Jordan, 2016, arXiv 1602.03253; Chwialkowski, Strathmann and Gretton, 2016, arXiv 1602.02964). The kernel
+is inverse multiquadric, k(u, v) = (1 + |u - v|^2 / b^2)^(-1/2). Its tails are heavy enough to detect draws that do not
+converge to the posterior (Gorham and Mackey, 2017, arXiv 1703.01717). The latents u are preconditioned: each number is
+in standard deviations of the guide, estimated from separate draws. The bandwidth is b^2 = 2 P, the mean squared
+distance between two draws of P such numbers. The score needs no evidence; it is one gradient of the model.
 
-p-values are by the wild bootstrap: the mean of h with the sign of each draw changed at random is what KSD^2 would be
-of draws from the posterior. Sums over sequences have that of sums, and tell more than any sequence by itself.
+p-values use the wild bootstrap: the mean of h with random signs of the draws has the distribution of KSD^2 for draws
+from the posterior. Sums over sequences are compared with sums, and have more power than single sequences.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCALED = 1000
-"""Draws of the guide, of which its deviations are."""
+"""Number of draws of the guide for its standard deviations."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SteinDiscrepancy(Result):
-    """How far a guide's draws are from the posterior of each of S sequences, and whether that is chance.
+    """Distance of a guide's draws from the posterior of each of S sequences, with a test of its significance.
 
     Attributes:
-        squared: (S,) KSD^2; it may be below 0, as it is unbiased.
-        critical: (S,) what draws from the posterior exceed in 5 % of cases.
-        p_values: (S,) share of the bootstrap that is not below.
-        p_value: of all sequences together, by the sum of their KSD^2.
-        numbers: (S,) P, of which a sequence's latents are.
-        sequences: which of the batch.
-        draws: K.
+        squared: KSD^2, (S,); it may be below 0, as it is unbiased.
+        critical: value that draws from the posterior exceed in 5 % of cases, (S,).
+        p_values: share of the bootstrap that is not below the value, (S,).
+        p_value: p-value of all sequences together, by the sum of their KSD^2.
+        numbers: P, number of latent values of each sequence, (S,).
+        sequences: indices of the sequences in the batch.
+        draws: K, number of draws.
         bootstrap: replicates of the wild bootstrap.
-        seed: of all draws.
-        equations: of model and guide; no guide's where it was a program of one's own.
+        seed: seed of all draws.
+        equations: equations of model and guide; without the guide's if it is a custom program.
     """
 
     squared: Annotated[np.ndarray, Dims("sequence")]
@@ -68,7 +68,7 @@ class SteinDiscrepancy(Result):
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """Result of the test in one sentence."""
         number = f"p = {self.p_value:.2g} of {len(self.sequences)} sequences together, {self.draws} draws of each"
         if self.p_value <= 0.05:
             alone = f"; {(self.p_values <= 0.05).sum()} of them are told at 5 % by themselves"
@@ -76,7 +76,7 @@ class SteinDiscrepancy(Result):
         return f"nothing speaks against the guide ({number})"
 
     def table(self) -> Table:
-        """Every sequence."""
+        """Return a table with a row for each sequence."""
         guide = self.equations.get("inference", "a guide of one’s own")
         table = Table(title=f"kernel Stein discrepancy · {guide}", caption=self.verdict)
         for column in ("sequence", "latent numbers", "KSD²", "5 % critical", "p"):
@@ -87,7 +87,7 @@ class SteinDiscrepancy(Result):
         return table
 
     def plot(self) -> Figure:
-        """KSD^2 of every sequence over what draws from the posterior exceed in 5 % of cases."""
+        """Draw KSD^2 of every sequence relative to its 5 % critical value."""
         figure = canvas(2.5 + 0.3 * len(self.sequences), 3.2)
         panel = figure.subplots()
         panel.plot([str(sequence) for sequence in self.sequences], self.squared / self.critical, "o")
@@ -123,26 +123,26 @@ def stein_discrepancy(
     seed: int = 0,
     progress: bool = True,
 ) -> SteinDiscrepancy:
-    """Tests whether a guide's draws are from the posterior, on data of any kind, sequence by sequence.
+    """Test for each sequence whether a guide's draws are from the posterior, on data of any kind.
 
-    Nothing is drawn from the posterior: the gradient of the log joint at the guide's draws is enough. A small p-value
-    says that the guide is wrong, a large one little where latents are many numbers: see docs/criticism.md for how much
-    is told.
+    The test uses the gradient of the log joint at the guide's draws, and no draws from the posterior. A small p-value
+    shows that the guide is wrong. A large one is weak evidence if there are many latent values: see docs/criticism.md
+    for the power of the test.
 
     Args:
-        model: the generative model; its own guide is examined where no other is given.
-        batch: see `DynamicalVAE.model`; ragged batches, missing entries and context included.
-        sequences: which of the batch, from 0; all without it.
-        guide: a Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
-        draws: K, from the guide for each sequence; memory grows with its square.
+        model: generative model; its own guide is tested by default.
+        batch: batch as in `DynamicalVAE.model`, which may be ragged or have missing entries and context.
+        sequences: indices of sequences in the batch, from 0; all by default.
+        guide: Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
+        draws: K, number of draws from the guide for each sequence; memory grows with its square.
         bootstrap: replicates of the wild bootstrap: p-values are at least 1 / (1 + bootstrap).
-        seed: of all draws.
+        seed: seed of all draws.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: a model without latents or likelihood, whose sequences share latents or whose latents cannot be any
-            real numbers; sequences that are not in the batch; data that are missing; numbers that are too small.
-        FloatingPointError: a gradient that is not finite.
+        ValueError: when the model has no latents or likelihood, a latent is shared by sequences or is not any real
+            number, a sequence is not in the batch, data are missing, or a number is too small.
+        FloatingPointError: when a gradient is not finite.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
@@ -177,12 +177,12 @@ def stein_discrepancy(
 
 
 def _share(means: Tensor) -> float:
-    """Of the first and the bootstrap's, those that are not below the first."""
+    """Return the share of all values, the first included, that are not below the first."""
     return float((means >= means[0]).double().mean())
 
 
 def _stein(u: Tensor, score: Tensor) -> Tensor:
-    """(K, K) h of all pairs of draws u (K, P) with these scores, 0 of a draw and itself."""
+    """Return h (K, K) of all pairs of draws u (K, P) with these scores, 0 on the diagonal."""
     u, score = u.double(), score.double()
     width = 2 * u.shape[1]
     base = 1 / (1 + torch.cdist(u, u).square() / width)

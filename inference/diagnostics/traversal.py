@@ -1,4 +1,4 @@
-"""Traversals: what a coordinate of a latent does to the data."""
+"""Traversals: the effect of a latent's coordinates on the data."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from .checks import decode
 
 @dataclass(frozen=True, eq=False)
 class Traversal:
-    """Motions decoded while one coordinate of a latent moves.
+    """Motions decoded at several values of one coordinate of a latent.
 
     Attributes:
-        latent: its name.
+        latent: name of the latent.
         coordinates: the C coordinates that were moved, one at a time.
-        offsets: (M,) in units of `scale`; 0 is the latent as inferred.
-        scale: (C,) the standard deviation of each coordinate under the prior or the posterior.
-        frames: (C, M, B, T, D), x decoded.
+        offsets: offsets (M,) in units of `scale`; 0 is the latent as inferred.
+        scale: standard deviation of each coordinate under the prior or the posterior, (C,).
+        frames: decoded x, (C, M, B, T, D).
         unit: "prior" or "posterior".
     """
 
@@ -37,7 +37,7 @@ class Traversal:
 
     @property
     def effect(self) -> Tensor:
-        """(C,), root mean square over sequences, steps and dimensions of how far x moves about its mean."""
+        """Root mean square change of x about its mean over offsets, over sequences, steps and dimensions, (C,)."""
         return self.frames.var(1, correction=0).mean((1, 2, 3)).sqrt()
 
 
@@ -55,26 +55,27 @@ def traverse(
     draws: int = 256,
     seed: int = 0,
 ) -> Traversal:
-    """Moves one coordinate of a latent at a time, a local one at all steps alike, and decodes.
+    """Move one coordinate of a latent at a time, for a local latent at all steps alike, and decode.
 
-    Latents are drawn once from the guide. One coordinate is then shifted, the rest stays, and x runs free from its own
-    past, set to its mean: all that changes between two decoded motions is what x reads of that coordinate.
+    Latents are drawn once from the guide. One coordinate is then shifted and the others are kept. x runs freely from
+    its own past, set to its mean. Decoded motions therefore differ only by the effect of that coordinate on x.
 
     Args:
-        model: the model with its guide.
+        model: model with its guide.
         batch: sequences (B, T, D) to start from, or a mapping with context.
-        latent: which latent moves.
-        coordinates: of it; all without.
+        latent: name of the latent to move.
+        coordinates: coordinates to move; all by default.
         span: smallest and largest offset, in standard deviations.
-        steps: M, the number of offsets, evenly spaced; 0, the latent as inferred, is to be one of them.
-        unit: whose standard deviation: that of the prior (over free runs and steps), or the guide's given the batch.
-        free: other latents, drawn anew from the model with the same noise, so that they follow the one that moves.
-            Needed to see a latent that acts on x through others only.
-        draws: from which the standard deviation is estimated.
-        seed: of all draws.
+        steps: M, number of evenly spaced offsets, which must include 0, the latent as inferred.
+        unit: standard deviation that offsets are in: of the prior (over free runs and steps), or of the guide given the
+            batch.
+        free: other latents, drawn from the model with the same noise at each offset, so that they follow the moved one.
+            Required if the latent affects x only through others.
+        draws: number of draws for the standard deviation.
+        seed: seed of all draws.
 
     Raises:
-        ValueError: an unknown latent or coordinate, offsets without 0, or a latent that nothing on the way to x reads.
+        ValueError: when a latent or coordinate is unknown, offsets do not include 0, or the latent does not affect x.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3})
@@ -114,7 +115,7 @@ def traverse(
         for coordinate, unit_scale in zip(chosen, scale, strict=True):
             moved = repeat(inferred[latent], steps).unflatten(0, (steps, -1))
             moved[..., coordinate] += (offsets * unit_scale).reshape(steps, *[1] * (moved.dim() - 2))
-            # Draws of free latents have the same noise only in runs of their own.
+            # Free latents have the same noise at each offset only in separate runs.
             for group in moved.split(1 if free else steps):
                 torch.manual_seed(seed)
                 latents = {**repeat(kept, len(group)), latent: group.flatten(0, 1)}
@@ -138,7 +139,7 @@ def _check_path(model: DynamicalVAE, latent: str, free: Sequence[str]) -> None:
 
 
 def _scale(model: DynamicalVAE, data: dict[str, Tensor], latent: str, unit: str, draws: int) -> Tensor:
-    """(D,), the standard deviation of a latent's coordinates, pooled over steps (and sequences, of the posterior)."""
+    """Return standard deviations (D,) of a latent's coordinates, pooled over steps (and sequences, if posterior)."""
     if unit == "prior":
         size, length = data["x"].shape[:2]
         rows = torch.arange(draws) % size

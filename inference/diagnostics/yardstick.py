@@ -1,12 +1,12 @@
-"""Reference posteriors: what a guide says of latents beside what their posterior is, exactly or by NUTS.
+"""Reference posteriors: comparison of a guide with the posterior, which is exact or sampled by NUTS.
 
-    q(z | x)   beside   p(z | x) ~ p(x, z):   means, standard deviations, correlations, each with its Monte Carlo error
+    q(z | x)   versus   p(z | x) ~ p(x, z):   means, standard deviations, correlations, each with its Monte Carlo error
 
-The posterior of a linear-Gaussian model is known (`dvae.Oracle`). Of any other, Pyro's NUTS (Hoffman and Gelman, 2014,
-arXiv 1111.4246) draws from it, in the guide's own deviations. The chains of a sequence are one chain on the product of
-its posterior with itself: a step of all of them is one evaluation of the model, whose cost hardly depends on how many
-rows it has. They share lengths of steps and trees, not their momenta or starts. Every other one starts at a draw from
-the prior, so that R-hat tells a mode that the guide does not know.
+The posterior of a linear-Gaussian model is known (`dvae.Oracle`). For any other model, Pyro's NUTS (Hoffman and Gelman,
+2014, arXiv 1111.4246) samples it, in units of the guide's standard deviations. The chains of a sequence are run as one
+chain on the product of copies of its posterior. A step of all chains is then one evaluation of the model, whose cost
+hardly depends on the number of rows. The chains share step sizes and trees, but not momenta or starts. Every other
+chain starts at a draw from the prior, so that R-hat reveals a mode that the guide does not cover.
 """
 
 from __future__ import annotations
@@ -36,20 +36,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RHAT, EFFECTIVE = 1.01, 100
-"""Largest R-hat, and least effective sample size for each chain, of chains that have converged (Vehtari et al., 2021,
-arXiv 1903.08008)."""
+"""Criteria of convergence: largest R-hat, and smallest effective sample size per chain (Vehtari et al., 2021).
 
-_MOST = 2**22  # correlations, of which a file holds two times as many
+See arXiv 1903.08008.
+"""
+
+_MOST = 2**22  # largest number of correlations; a file contains twice as many
 
 
 @dataclass(frozen=True, eq=False)
 class LatentMoments:
-    """Of the latents of S sequences, Q numbers each; NaN at padding.
+    """Moments of the latents of S sequences with Q numbers each; NaN at padding.
 
     Args:
-        mean, deviation: (S, Q).
-        correlation: (S, Q, Q).
-        mean_error, deviation_error: (S, Q) Monte Carlo standard errors; 0 of what is exact.
+        mean, deviation: mean and standard deviation, (S, Q).
+        correlation: correlations (S, Q, Q).
+        mean_error, deviation_error: Monte Carlo standard errors (S, Q); 0 if exact.
     """
 
     mean: Annotated[np.ndarray, Dims("sequence", "quantity")]
@@ -60,21 +62,24 @@ class LatentMoments:
 
     @property
     def correlation_error(self) -> np.ndarray:
-        """(S, Q, Q), as of a normal, (1 - r^2) / sqrt(n), with n effective draws by the error of the deviations."""
+        """Monte Carlo standard error of correlations, (S, Q, Q).
+
+        It is (1 - r^2) / sqrt(n) as for a normal distribution, with n effective draws from the error of the deviations.
+        """
         spread = np.sqrt(2) * self.deviation_error / self.deviation
         return (1 - self.correlation**2) * np.maximum(spread[:, :, None], spread[:, None, :])  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """How NUTS fared on S sequences.
+    """Convergence statistics of NUTS on S sequences.
 
     Args:
-        rhat: (S, Q), rank-normalised; NaN at padding.
-        effective: (S, Q) effective draws of the bulk.
-        divergences: (S,) transitions after the warm-up that diverged.
-        evaluations: (S,) gradients of the model, each of all chains of a sequence.
-        chains, draws, warmup: of each sequence; of each chain.
+        rhat: rank-normalised R-hat, (S, Q); NaN at padding.
+        effective: effective draws of the bulk, (S, Q).
+        divergences: number of divergent transitions after the warm-up, (S,).
+        evaluations: number of gradients of the model, each of all chains of a sequence, (S,).
+        chains, draws, warmup: number of chains per sequence; of draws and warm-up steps per chain.
     """
 
     rhat: Annotated[np.ndarray, Dims("sequence", "quantity")]
@@ -87,12 +92,12 @@ class Sampling:
 
     @property
     def converged(self) -> np.ndarray:
-        """(S,) whether R-hat is at most 1.01, and the effective draws at least 100 for each chain."""
+        """Whether R-hat is at most 1.01, and the effective draws at least 100 for each chain, (S,)."""
         return (np.nanmax(self.rhat, 1) <= RHAT) & (np.nanmin(self.effective, 1) >= EFFECTIVE * self.chains)  # type: ignore[no-any-return]
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """Result of the sampling in one sentence."""
         numbers = f"R-hat up to {np.nanmax(self.rhat):.3f}, effective draws from {np.nanmin(self.effective):.0f}"
         count = int(self.divergences.sum())
         narrow = f"; {count} divergences: it may have missed where the posterior is narrow" if count else ""
@@ -107,17 +112,17 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ReferencePosterior(Result):
-    """A guide beside the posterior, on some sequences.
+    """Comparison of a guide with the posterior, on some sequences.
 
     Attributes:
         guide, reference: moments of the latents.
-        shapes: latent to steps, 0 of a static one, and dimension.
-        names: of the Q numbers: "w[0]", "z_3[1]" (step from 1, coordinate from 0).
-        sequences: which of the batch.
-        sampling: of the reference; None where it is exact.
-        guide_draws: K, of which the guide's moments are.
-        seed: of all draws.
-        equations: of model and guide; no guide's where it was a program of one's own.
+        shapes: number of steps (0 if static) and dimension of each latent.
+        names: names of the Q numbers: "w[0]", "z_3[1]" (step from 1, coordinate from 0).
+        sequences: indices of the sequences in the batch.
+        sampling: convergence of the reference; None if it is exact.
+        guide_draws: K, number of draws for the guide's moments.
+        seed: seed of all draws.
+        equations: equations of model and guide; without the guide's if it is a custom program.
     """
 
     guide: LatentMoments
@@ -137,38 +142,38 @@ class ReferencePosterior(Result):
 
     @property
     def bias(self) -> np.ndarray:
-        """(S, Q), the guide's mean less the reference's, in standard deviations of the reference."""
+        """Mean of the guide minus that of the reference, in standard deviations of the reference, (S, Q)."""
         return (self.guide.mean - self.reference.mean) / self.reference.deviation  # type: ignore[no-any-return]
 
     @property
     def bias_error(self) -> np.ndarray:
-        """(S, Q), Monte Carlo standard error of `bias`."""
+        """Monte Carlo standard error of `bias`, (S, Q)."""
         return np.hypot(self.guide.mean_error, self.reference.mean_error) / self.reference.deviation  # type: ignore[no-any-return]
 
     @property
     def ratio(self) -> np.ndarray:
-        """(S, Q), the guide's standard deviation over the reference's; below 1: too narrow."""
+        """Standard deviation of the guide over that of the reference, (S, Q); below 1: too narrow."""
         return self.guide.deviation / self.reference.deviation  # type: ignore[no-any-return]
 
     @property
     def ratio_error(self) -> np.ndarray:
-        """(S, Q), Monte Carlo standard error of `ratio`."""
+        """Monte Carlo standard error of `ratio`, (S, Q)."""
         each = (part.deviation_error / part.deviation for part in (self.guide, self.reference))
         return self.ratio * np.hypot(*each)  # type: ignore[no-any-return]
 
     @property
     def lack(self) -> np.ndarray:
-        """(S, Q, Q), correlations of the reference less those of the guide."""
+        """Correlations of the reference minus those of the guide, (S, Q, Q)."""
         return self.reference.correlation - self.guide.correlation  # type: ignore[no-any-return]
 
     @property
     def lack_error(self) -> np.ndarray:
-        """(S, Q, Q), Monte Carlo standard error of `lack`."""
+        """Monte Carlo standard error of `lack`, (S, Q, Q)."""
         return np.hypot(self.guide.correlation_error, self.reference.correlation_error)  # type: ignore[no-any-return]
 
     @property
     def pairs(self) -> dict[str, np.ndarray]:
-        """What pairs of numbers have in common, "z, between steps" or "w with z", to (Q, Q), each pair once."""
+        """Masks (Q, Q) of pairs of numbers by kind, such as "z, between steps" or "w with z", each pair once."""
         latent, step, _ = self._places
         there, same = (
             np.isfinite(self.lack).any(0) & np.tri(len(latent), k=-1, dtype=bool).T,
@@ -187,7 +192,7 @@ class ReferencePosterior(Result):
 
     @property
     def verdict(self) -> str:
-        """One sentence on the reference."""
+        """Quality of the reference in one sentence."""
         return (
             "the reference is exact, as the model is linear-Gaussian"
             if self.sampling is None
@@ -195,7 +200,7 @@ class ReferencePosterior(Result):
         )
 
     def table(self) -> Group:
-        """Of every latent, bias and ratio of deviations; of every kind of pair, correlations; and how NUTS fared."""
+        """Return tables of bias and deviations by latent, correlations by kind of pair, and convergence."""
         guide = self.equations.get("inference", "a guide of one’s own")
         title = f"{guide} beside the posterior of {len(self.sequences)} sequences"
         moments = Table(title=title, caption="bias in deviations of the reference; noise is what bias has by chance")
@@ -244,13 +249,13 @@ class ReferencePosterior(Result):
         return table
 
     def plot(self, sequence: int = 0, panels: int = 4) -> Figure:
-        """Means with bands of two standard deviations, deviations of all numbers, and correlations side by side.
+        """Draw means with bands of two standard deviations, deviations of all numbers, and correlations.
 
-        Bands are of the coordinates where guide and reference differ most, by bias and log ratio together.
+        Bands are for the coordinates where guide and reference differ most, by bias and log ratio together.
 
         Args:
-            sequence: place among `sequences`, of bands and correlations.
-            panels: coordinates with bands.
+            sequence: index in `sequences`, for bands and correlations.
+            panels: number of coordinates with bands.
         """
         latent, step, coordinate = self._places
         off = self.bias[sequence] ** 2 + 2 * np.log(self.ratio[sequence]) ** 2
@@ -323,7 +328,7 @@ class ReferencePosterior(Result):
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(Q,) each: place of the latent among all, step from 1 (0 of a static one), coordinate."""
+        """Index of the latent, step from 1 (0 if static) and coordinate of each number, (Q,) each."""
         places = [
             (place, t, d)
             for place, (steps, size) in enumerate(self.shapes.values())
@@ -356,25 +361,25 @@ def reference_posterior(
     seed: int = 0,
     progress: bool = True,
 ) -> ReferencePosterior:
-    """The posterior of the latents of some sequences beside what a guide says of it: a yardstick for the guide.
+    """Compare a guide with the posterior of the latents of some sequences.
 
-    Of a linear-Gaussian model the posterior is exact, and of any other it is drawn by NUTS,
-    which takes long: see docs/criticism.md for the cost. It says for itself whether it has converged.
+    The posterior of a linear-Gaussian model is exact. For any other model it is sampled by NUTS, which is slow: see
+    docs/criticism.md for the cost. The result reports whether sampling has converged.
 
     Args:
-        model: the generative model; its own guide is examined where no other is given.
-        batch: see `DynamicalVAE.model`; ragged batches, missing entries and context included.
-        sequences: which of the batch, from 0; all without it.
-        guide: a Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
-        draws, chains, warmup: of NUTS, for each sequence; of each chain.
-        guide_draws: of which the guide's moments are.
-        seed: of all draws.
+        model: generative model; its own guide is tested by default.
+        batch: batch as in `DynamicalVAE.model`, which may be ragged or have missing entries and context.
+        sequences: indices of sequences in the batch, from 0; all by default.
+        guide: Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
+        draws, chains, warmup: NUTS settings: draws per chain, chains per sequence, warm-up steps per chain.
+        guide_draws: number of draws for the guide's moments.
+        seed: seed of all draws.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: a model without latents or likelihood, whose sequences share latents or whose latents cannot be any
-            real numbers; sequences that are not in the batch; data that are missing; numbers that are too small.
-        FloatingPointError: where a chain starts, the log joint is not finite.
+        ValueError: when the model has no latents or likelihood, a latent is shared by sequences or is not any real
+            number, a sequence is not in the batch, data are missing, or a number is too small.
+        FloatingPointError: when the log joint is not finite at the start of a chain.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
@@ -382,7 +387,7 @@ def reference_posterior(
         >>> found.exact, found.bias.shape, found.lack.shape
         (True, (2, 4), (2, 4, 4))
     """
-    if min(draws, guide_draws) < 4 or chains < 2 or warmup < 1:  # of less arviz has no R-hat
+    if min(draws, guide_draws) < 4 or chains < 2 or warmup < 1:  # arviz needs as many for R-hat
         raise ValueError(
             f"NUTS takes at least 4 draws, 2 chains and 1 of warm-up, and the guide 4 draws; got {draws}, {chains}, "
             f"{warmup} and {guide_draws}"
@@ -424,10 +429,10 @@ def reference_posterior(
 
 
 def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> LatentMoments | None:
-    """Of a linear-Gaussian model; NaN at padding."""
+    """Return the moments of a linear-Gaussian model, NaN at padding; None for any other model."""
     try:
         mean, covariance = Oracle(model, max(steps for steps, _ in inferred.shapes.values())).posterior(data)
-    except ValueError:  # the networks or laws are others, or there is context
+    except ValueError:  # other networks or distributions, or there is context
         return None
     mean, covariance = mean[0, inferred.there], covariance.reshape(len(mean.t()), -1)[inferred.there][:, inferred.there]
     deviation = covariance.diagonal().sqrt()
@@ -440,7 +445,7 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> 
 def _nuts(
     inferred: Inferred, draws: int, chains: int, warmup: int, went: Callable[[], object]
 ) -> tuple[Tensor, int, int]:
-    """(C, N, P) draws z of the posterior, how many transitions diverged, and evaluations."""
+    """Return draws z (C, N, P) of the posterior, the number of divergent transitions, and of evaluations."""
     start = inferred.drawn(chains)
     start[1::2] = inferred.prior(chains)[1::2]
     start = inferred.whitened(start)
@@ -469,16 +474,16 @@ def _nuts(
 
 
 def _moments(inferred: Inferred, draws: Tensor) -> LatentMoments:
-    """Of draws (C, N, P), with errors by their effective number."""
-    from arviz_stats.base import array_stats  # over a second to import
+    """Return moments of draws (C, N, P), with errors from their effective number."""
+    from arviz_stats.base import array_stats  # the import takes over a second
 
     values = draws.double().cpu()
     flat = values.flatten(0, 1)
     deviation = flat.std(0)
     unit = (flat - flat.mean(0)) / deviation.clamp(min=1e-12)
-    # of the deviation by the squares' own effective number: NUTS goes back and forth, so that means have more
+    # errors of deviations use the effective number of the squares: NUTS alternates sides, so means have a larger one
     squares = (values - flat.mean(0)).square() / (2 * deviation.clamp(min=1e-12))
-    with np.errstate(invalid="ignore"):  # chains that stood still have no error
+    with np.errstate(invalid="ignore"):  # constant chains have no error
         errors = [array_stats.mcse(each.numpy(), chain_axis=0, draw_axis=1) for each in (values, squares)]
     across = inferred.whole(inferred.whole(unit.T @ unit / (len(flat) - 1)).T)
     told = flat.mean(0), deviation, *map(torch.as_tensor, errors)
@@ -487,7 +492,7 @@ def _moments(inferred: Inferred, draws: Tensor) -> LatentMoments:
 
 
 def _diagnosed(inferred: Inferred, draws: Tensor) -> Iterator[np.ndarray]:
-    """R-hat and effective draws of the bulk (Q,) of draws (C, N, P); of chains that stood still, 1000 and 0."""
+    """Yield R-hat and effective draws of the bulk (Q,) of draws (C, N, P); 1000 and 0 for constant chains."""
     from arviz_stats.base import array_stats
 
     for measure in (array_stats.rhat, array_stats.ess):

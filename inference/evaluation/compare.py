@@ -1,9 +1,9 @@
-"""Comparison of models on held-out sequences, as a statistician would make it.
+"""Comparison of models on held-out sequences.
 
-Every model is scored on the same sequences, teacher-forced: evidence lower bound, importance-weighted bound with the
-Pareto diagnosis of its weights, the particle filter's bound where it is asked for, KL of every latent, and what the
-guide's latents tell of the data. Free-running scores come from `evaluate`. Models are ranked by the importance-weighted
-bound per frame. What their differences are sure of stands in `comparison`.
+Every model is scored teacher-forced on the same sequences: evidence lower bound, IWAE bound with the Pareto diagnostic
+of its weights, optionally the FIVO bound, KL of every latent, and information of the latents about the data.
+Free-running scores come from `evaluate`. Models are ranked by the IWAE bound per frame. `comparison` has the
+uncertainty of their differences.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from .record import plain
 from .result import progress_bar
 from .scores import Measure, Scores, proper
 
-_PAIRS = 4096  # sequences times contrasts to hold at once
+_PAIRS = 4096  # largest number of sequences times contrasts in memory
 
 
 def compare(
@@ -49,57 +49,59 @@ def compare(
 ) -> Comparison:
     """Compare models on held-out sequences: bounds, differences with their errors, use of latents, forecasts.
 
-    All models see the same sequences, and each draws from the same seed, so that no score depends on which others are
-    compared; scores do depend on `batch_size`, as draws come batch by batch.
+    All models are scored on the same sequences, and each draws from the same seed. Scores therefore do not depend on
+    which other models are compared. They do depend on `batch_size`, because draws are made by batch.
 
-    *Active units* of a latent (Burda et al., 2016): coordinates whose posterior mean varies over the data with a
-    variance above 0.01. For a local latent the variance is that over sequences at the same step, pooled over steps:
-    what all sequences share, such as a clock, is no activity. Posterior means of a guide that reads its own past are
-    averages over 8 draws of it, and the variance that is due to the draws is subtracted. The threshold is meant for
+    *Active units* of a latent (Burda et al., 2016) are coordinates whose posterior mean varies over the data with a
+    variance above 0.01. For a local latent, the variance is over sequences at the same step, pooled over steps, so a
+    pattern that all sequences share, such as a clock, does not count. If a guide reads its own past, its posterior mean
+    is averaged over 8 draws of that past, and the variance due to the draws is subtracted. The threshold is meant for
     latents of about unit scale.
 
-    *Information* of a latent on the data, among M sequences (`contrasts`), M the same for all models:
+    *Information* of a latent about the data, among M sequences (`contrasts`), with the same M for all models:
 
         mean over n of  log q(z_n | own past, x_n) - log (1/M) sum_m q(z_n | own past, x_m)
 
-    with z_n drawn for x_n, "own past" what q reads of the latents, and x_m with its context. It is 0 where q ignores
-    the data, and at most log M. For a static latent whose factor reads data only it is the mutual information under
-    the guide among these sequences (Hoffman and Johnson, 2016), and in expectation a lower bound of that over the
-    population (Poole et al., 2019, section 2.4). For a local latent it is taken by step, in nats a step, log M being
-    the limit of each: a whole trajectory of z nearly always tells one sequence from all others, and its information
-    would be log M for every model. Where q reads data only, this is I(x; z_t). Where q reads other latents too, it is
-    what x adds to them. The contrasts are not weighted by how well they explain that past; hence it is at least
-    I(x; z_t | past), by the divergence of the two mixtures, and does not vanish because the past has already told
-    which sequence it is. Contrasts may be windows of one clip that overlap: nothing tells apart what they share, so
-    that log M is out of reach among them.
+    z_n is drawn for x_n, "own past" denotes the latents that q reads, and x_m includes its context. The information is
+    0 if q ignores the data, and at most log M. For a static latent whose factor reads only data, it is the mutual
+    information under the guide among these sequences (Hoffman and Johnson, 2016). In expectation it is then a lower
+    bound of the mutual information over the population (Poole et al., 2019, section 2.4).
+
+    For a local latent it is computed by step, in nats per step, with the limit log M at each. A whole trajectory of z
+    nearly always identifies its sequence, so its information would be log M for every model. If q reads only data, this
+    is I(x; z_t). If q reads other latents too, it is the information that x adds to them. The contrasts are not
+    weighted by how well they explain the past of the latents. It is therefore at least I(x; z_t | past), by the
+    divergence of the two mixtures, and does not vanish when the past already identifies the sequence. Overlapping
+    windows of one clip may be among the contrasts. Nothing distinguishes their common part, so log M cannot be reached
+    among them.
 
     Args:
-        models: name to a model, or to several that differ in their training seed only.
+        models: a model by name, or several that differ only in their training seed.
         data: windows (such as `ArrayWindows`), x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
-        scores: of forecasts; see `evaluate`.
-        particles: K of the importance-weighted bound. k-hat needs 25, and 100 or more to be read sequence by sequence.
-        estimates: independent importance-weighted estimates of every sequence, of K particles each. The bound is
-            their mean. `Comparison.to_arviz` needs 25 or more.
-        filter_particles: K of the particle filter's bound too (FIVO, see `particle_bound`); 0 leaves it out. Models of
-            which it cannot be had, as where the guide goes backward, are left without it, and say why.
-        contrasts: M, the sequences, drawn at random, among which information is measured; all if there are no more,
-            0 leaves it out.
-        samples: forecasts per window of the free-running scores; 0 leaves these out, which take longest. Data that are
-            no windows, or whole sequences, have none.
-        draw_emission: forecast draws of x, or (False) its means; None as in `evaluate`.
-        seed: of every model's draws, and of the choice of contrasts.
-        batch_size: sequences scored at once.
-        configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
+        scores: scores of forecasts; see `evaluate`.
+        particles: K of the IWAE bound. k-hat needs 25, and 100 or more to be meaningful for single sequences.
+        estimates: number of independent IWAE estimates of every sequence, each with K particles. The bound is their
+            mean. `Comparison.to_arviz` needs 25 or more.
+        filter_particles: K of the FIVO bound (see `particle_bound`); 0 omits it. For a model without a FIVO bound, such
+            as one with a backward guide, a note gives the reason.
+        contrasts: M, number of randomly drawn sequences among which information is measured; all if there are fewer, 0
+            omits it.
+        samples: forecasts per window for the free-running scores; 0 omits these, which take longest. Tensors, batches
+            and whole sequences have none.
+        draw_emission: whether forecasts are draws of x (True) or its means (False); None as in `evaluate`.
+        seed: seed of every model's draws, and of the choice of contrasts.
+        batch_size: number of sequences in a batch.
+        configs: `{name: configuration}`, stored with the rows; any JSON value.
         progress: whether to show a progress bar.
 
     Returns:
-        The comparison; print it, or take its `table`, `plot`, `difference`, `to_json` and `to_arviz`.
+        The comparison; print it, or use its `table`, `plot`, `difference`, `to_json` and `to_arviz`.
 
     Raises:
-        ValueError: no models, models of different equations or sizes in one row, numbers out of range, data without
-            sequences; windows that are ragged, for forecasts.
-        TypeError: data of another kind, or what is no model.
-        FloatingPointError: a bound that is not finite, naming model and sequence.
+        ValueError: when there are no models, models in one row differ in equations or sizes, a number is out of range,
+            the data have no sequences, or windows to forecast are ragged.
+        TypeError: when the data are of another kind, or a value in `models` is no model.
+        FloatingPointError: when a bound is not finite, naming model and sequence.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
@@ -190,7 +192,7 @@ def _measured(
     batch_size: int,
     progress: bool,
 ) -> dict[str, Any]:
-    """Everything teacher-forced of one model, each part with draws from the seed."""
+    """Return all teacher-forced scores of one model, each group with draws from the seed."""
     with progress_bar(progress) as bar:
 
         def parts(what: str, count: int, size: int) -> Iterator[slice]:
@@ -215,7 +217,7 @@ def _measured(
 
 
 def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> Contender:
-    """A row from what was measured of the models of its seeds, of which one is given."""
+    """Return a row from the scores of the models of its seeds; `model` is one of them."""
     said = {"frames", "notes"}
     scores = _stack([{key: value for key, value in seed.items() if key not in said} for seed in seeds])
     equations = {"generative": model.generative.text, "inference": model.inference.text}
@@ -223,7 +225,7 @@ def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: 
 
 
 def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
-    """Name to the models of every seed."""
+    """Return the models of every seed by name."""
     if not isinstance(models, Mapping):
         raise TypeError(f"models are a mapping such as {{'srnn': model}}, not {type(models).__name__}")
     for name, value in models.items():
@@ -254,14 +256,14 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
 
 
 def _each(contenders: Mapping[str, list[Any]]) -> Iterator[tuple[str, str, Any]]:
-    """Label, name and model of every seed."""
+    """Yield label, name and model of every seed."""
     for name, versions in contenders.items():
         for place, model in enumerate(versions):
             yield (name if len(versions) == 1 else f"{name}, model {place + 1}"), name, model
 
 
 def _fingerprint(batch: Batch) -> str:
-    """SHA-256 of every tensor of the batch: its name, shape, type and values."""
+    """Return the SHA-256 of every tensor of the batch: its name, shape, type and values."""
     digest = hashlib.sha256()
     for name, value in sorted(batch.leaves().items()):
         values = np.ascontiguousarray(value.cpu().numpy())
@@ -270,6 +272,6 @@ def _fingerprint(batch: Batch) -> str:
 
 
 def _stack(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The seeds' arrays, stacked under their names."""
+    """Return the seeds' arrays, stacked by name."""
     columns = {key: [one[key] for one in found] for key in found[0]}
     return {key: _stack(own) if isinstance(own[0], Mapping) else np.stack(own) for key, own in columns.items()}

@@ -1,4 +1,4 @@
-"""Comparisons: several models on the same sequences, and how sure one can be of their order (`.estimates`, `.many`)."""
+"""Comparisons: several models on the same sequences, with the uncertainty of their order (`.estimates`, `.many`)."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ ACTIVE = 0.01
 """Variance over the data above which the posterior mean of a latent's coordinate counts as active (Burda et al.)."""
 
 ACROSS = 6
-"""Scores that have room side by side; more stand below each other."""
+"""Largest number of scores in columns; more are shown in rows."""
 
 KHAT = 0.7
-"""Pareto shape above which an importance-weighted bound is unreliable (Vehtari et al.)."""
+"""Pareto shape above which an IWAE bound is unreliable (Vehtari et al.)."""
 
 _LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and needs five
 
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """What was measured of one model, for S seeds, N sequences in C clips, T steps.
+    """Scores of one model, for S seeds, N sequences in C clips, T steps.
 
     Args:
         equations: "generative" and "inference".
-        config: what the caller said of it.
-        bounds: "ELBO", "importance bound", "k-hat" and "KL z" for every latent z, and "particle bound" where there is
-            one: (S, N), bounds in nats a sequence.
-        kl_steps: local latent to (S, T), its mean KL over sequences by step, in nats.
-        variances: latent to (S, D), variance over the data of each coordinate's posterior mean.
-        information: latent to (S, T), or (S, 1) of a static one: nats a step, or a sequence.
-        estimates: (E, N) independent importance-weighted bounds in nats a sequence, each the mean over seeds.
-        free_running: metric to (S, C), the means of each clip's windows.
-        notes: what was asked for and is not there, and why.
+        config: configuration given by the caller.
+        bounds: (S, N) each: "ELBO", "importance bound", "k-hat", "KL z" for every latent z, and "particle bound" if
+            computed; bounds in nats per sequence.
+        kl_steps: mean KL over sequences by step, in nats, (S, T), of each local latent.
+        variances: variance over the data of each coordinate's posterior mean, (S, D), of each latent.
+        information: information of each latent, (S, T) in nats per step, or (S, 1) in nats per sequence if static.
+        estimates: independent IWAE bounds in nats per sequence, (E, N), each the mean over seeds.
+        free_running: means of each clip's windows, (S, C), of each metric.
+        notes: requested scores that are not available, with reasons.
     """
 
     equations: dict[str, str]
@@ -69,7 +69,7 @@ class Contender:
 
     @property
     def seeds(self) -> int:
-        """S."""
+        """Number of seeds S."""
         return len(self.bounds["ELBO"])
 
     @property
@@ -79,7 +79,7 @@ class Contender:
 
     @property
     def active_units(self) -> dict[str, np.ndarray]:
-        """Latent to (S,), how many of its coordinates have a posterior mean that varies; NaN of one sequence."""
+        """Number of coordinates with a varying posterior mean, (S,), of each latent; NaN for one sequence."""
         return {
             name: np.where(np.isnan(variance).any(-1), math.nan, (variance > ACTIVE).sum(-1))
             for name, variance in self.variances.items()
@@ -87,32 +87,32 @@ class Contender:
 
     @property
     def unreliable(self) -> float:
-        """Share of sequences whose k-hat is above 0.7; NaN where it was not estimated."""
+        """Share of sequences whose k-hat is above 0.7; NaN if it was not estimated."""
         khat = self.bounds["k-hat"]
         return float((khat > KHAT)[~np.isnan(khat)].mean()) if not np.isnan(khat).all() else math.nan
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Result):
-    """Models side by side on the same sequences, with all that is needed to say what was measured.
+    """Scores of several models on the same sequences, with the settings of the measurement.
 
-    Indexing gives the estimates of a model: `comparison["srnn"]["importance bound"].mean`, in nats per frame.
+    Indexing returns the estimates of a model: `comparison["srnn"]["importance bound"].mean`, in nats per frame.
 
     Attributes:
         rows: `{name: Contender}`.
         keys: (split, clip, first frame) of every sequence.
-        frames: (N,) the number of frames of every sequence.
+        frames: number of frames of every sequence, (N,).
         data: fingerprint (of windows), sequences, frames and coordinates.
-        protocol: the fields of the windows' protocol; empty for tensors.
-        particles: K of the importance-weighted bound.
-        contrasts: M, the sequences among which information was measured; its upper limit is log M.
-        samples: forecasts per window, 0 where there are no free-running scores.
-        emission: "mean" or "drawn": what was forecast.
-        seed: of every model's draws.
-        shown: free-running score to its unit, those of the table.
-        notes: lines below that table on how scores are to be read, or why there are none.
-        better: by score of that table, "lower", "higher" or "".
-        filter_particles: K of the particle bound; 0 where there is none.
+        protocol: fields of the windows' protocol; empty for tensors.
+        particles: K of the IWAE bound.
+        contrasts: M, number of sequences among which information was measured; its upper limit is log M.
+        samples: forecasts per window, 0 if there are no free-running scores.
+        emission: "mean" or "drawn": kind of forecasts.
+        seed: seed of every model's draws.
+        shown: unit of each free-running score in the table.
+        notes: lines below that table on how to read scores, or why there are none.
+        better: "lower", "higher" or "" for each score of that table.
+        filter_particles: K of the FIVO bound; 0 if there is none.
 
     Example:
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
@@ -144,14 +144,14 @@ class Comparison(Result):
 
     @property
     def ranking(self) -> list[str]:
-        """Names by importance-weighted bound per frame, the best first."""
+        """Names in the order of the IWAE bound per frame, the best first."""
         return sorted(self.rows, key=lambda name: -self[name]["importance bound"].mean)
 
     def difference(self, first: str, second: str, metric: str = "importance bound") -> Estimate:
-        """Paired difference of two models, first minus second; see the module for its standard errors.
+        """Return the paired difference of two models, first minus second; see `estimates` for its standard errors.
 
         Raises:
-            KeyError: a model that was not compared, or a metric that one of the two lacks.
+            KeyError: when a model was not compared, or one of the two has no such metric.
         """
         parts = [self._parts(name, metric) for name in (first, second)]
         if first == second:
@@ -159,36 +159,36 @@ class Comparison(Result):
         return parts[0].estimate(parts[1])
 
     def pairs(self, metric: str = "importance bound") -> Pairs:
-        """All paired differences in a metric, with p-values for as many of them as there are (`many.pairs`).
+        """Return all paired differences in a metric, with p-values adjusted for their number (`many.pairs`).
 
         Raises:
-            KeyError: a metric that a model lacks.
+            KeyError: when a model has no such metric.
         """
         return pairs(self._all(metric))
 
     def confidence_set(
         self, metric: str = "importance bound", level: float = 0.9, *, over_seeds: bool = True
     ) -> ConfidenceSet:
-        """The models that may be the best in a metric (`many.confidence_set`).
+        """Return the models that may be the best in a metric (`many.confidence_set`).
 
         Args:
-            metric: of all models.
-            level: with which the best is among them.
-            over_seeds: whether another training seed may change what is best; without, of these very weights.
+            metric: a metric of all models.
+            level: probability that the best model is in the set.
+            over_seeds: whether to account for other training seeds; if False, the set is for these very weights.
 
         Raises:
-            KeyError: a metric that a model lacks.
-            ValueError: a model of one seed, of which nothing is known over seeds; one clip.
+            KeyError: when a model has no such metric.
+            ValueError: when a model has one seed, so that nothing is known over seeds, or there is one clip.
         """
         better = self.better.get(metric, "lower") if metric in self.shown else "higher"
         return confidence_set(self._all(metric), better, level, over_seeds=over_seeds)
 
     def required(self, first: str, second: str, metric: str = "importance bound", **options: Any) -> Requirement:
-        """How many training seeds and clips would tell two models apart (`many.required`, which has the options).
+        """Return how many training seeds and clips would distinguish two models (see `many.required` for the options).
 
         Raises:
             KeyError: as `difference`.
-            ValueError: a model of one seed; options that are out of range.
+            ValueError: when a model has one seed, or an option is out of range.
         """
         return required(self._parts(first, metric), self._parts(second, metric), **options)
 
@@ -196,10 +196,10 @@ class Comparison(Result):
         return {name: self._parts(name, metric) for name in self.rows}
 
     def join(self, other: Comparison) -> Comparison:
-        """This comparison with the rows of another one, made of other models on the same sequences in the same way.
+        """Return this comparison with the rows of another one, of other models on the same sequences and settings.
 
         Raises:
-            ValueError: sequences or settings that differ, or a name that both have.
+            ValueError: when sequences or settings differ, or both have a name.
         """
         ours, theirs = ({**vars(each), "rows": None, "frames": None} for each in (self, other))
         if different := [name for name, value in ours.items() if value != theirs[name]]:
@@ -209,12 +209,12 @@ class Comparison(Result):
         return dataclasses.replace(self, rows={**self.rows, **other.rows})
 
     def table(self) -> Group:
-        """Three tables: bounds in the order of the ranking, use of the latents, free-running scores."""
+        """Return three tables: bounds in the order of the ranking, use of the latents, free-running scores."""
         tables = [self._bound_table(), self._latent_table()]
         return Group(*tables, *([self._free_running_table()] if self.samples else []))
 
     def plot(self) -> Figure:
-        """Bounds, paired differences to the best, k-hat, and the KL of every local latent over time."""
+        """Draw bounds, paired differences to the best, k-hat, and the KL of every local latent over time."""
         ranking = self.ranking
         colours = {name: f"C{place % 10}" for place, name in enumerate(self.rows)}
         latents = list(dict.fromkeys(latent for row in self.rows.values() for latent in row.kl_steps))
@@ -260,7 +260,7 @@ class Comparison(Result):
                     panel.plot(range(1, len(steps) + 1), steps, color=colours[name])
             panel.set(title=f"KL of {latent} over time", xlabel="step", ylabel="nats a step")
             drawn = np.concatenate([line.get_ydata() for line in panel.lines])
-            if (top := drawn.max()) > 0:  # the first step may take a hundred times what the others take
+            if (top := drawn.max()) > 0:  # the first step may have a hundred times the KL of the others
                 least = max(drawn[drawn > 0].min(), top / 1e5)
                 panel.set(yscale="log", ylim=(least / 1.5, top * 1.5))
         for panel in panels[3 + len(latents) :]:
@@ -290,22 +290,24 @@ class Comparison(Result):
             panel.legend(fontsize=8)
 
     def to_arviz(self) -> dict[str, Any]:
-        """`{name: DataTree}` for `arviz_stats.compare` and `arviz_stats.loo`.
+        """Return `{name: DataTree}` for `arviz_stats.compare` and `arviz_stats.loo`.
 
-        The group `log_likelihood` holds independent importance-weighted estimates of every sequence's log evidence, as
-        draws of one chain; a row of several seeds has the mean over its seeds, which is the score of a typical
-        run. (Seeds as draws would be a mixture of runs, and its harmonic mean is ruled by the worst of them.)
-        `constant_data` holds ELBO, importance-weighted bound and k-hat by seed, frames and clip of every sequence.
+        The group `log_likelihood` contains independent IWAE estimates of every sequence's log evidence, as draws of one
+        chain. A row of several seeds has the mean over its seeds, which is the score of a typical run. (Seeds as draws
+        would be a mixture of runs, whose harmonic mean is dominated by the worst of them.) `constant_data` contains
+        ELBO, IWAE bound and k-hat by seed, and frames and clip of every sequence.
 
-        What `loo` means here: the sequences were held out, so nothing is left to leave out, and its elpd is the
-        held-out log evidence. Its p ("effective parameters") measures how far the independent estimates differ, in
-        nats, and is Monte Carlo error; as elpd is a harmonic mean over draws, it lies below their mean by about as
-        much. More particles lower both. Its k-hat is that of the harmonic mean's weights: it warns where estimates
-        of a sequence differ by a nat or more, and nearly always with fewer than 200 draws. Its standard errors take
-        sequences for independent and know no seeds; those of `difference` are clustered by clip.
+        The results of `loo` have another meaning here. The sequences were held out, so nothing remains to leave out,
+        and its elpd is the held-out log evidence. Its p ("effective parameters") measures how much the independent
+        estimates differ, in nats, and is Monte Carlo error. As elpd is a harmonic mean over draws, it lies below their
+        mean by about as much. More particles lower both.
+
+        Its k-hat is of the harmonic mean's weights. It warns if estimates of a sequence differ by a nat or more, and
+        nearly always with fewer than 200 draws. Its standard errors assume independent sequences and ignore seeds; the
+        standard errors of `difference` are clustered by clip.
 
         Raises:
-            ValueError: fewer than 25 estimates, which `loo` cannot smooth.
+            ValueError: when there are fewer than 25 estimates, which `loo` cannot smooth.
         """
         from arviz_base import from_dict
 
@@ -393,7 +395,7 @@ class Comparison(Result):
 
     @property
     def _words(self) -> tuple[str, str, str]:
-        """What is scored, what errors are over, and what it consists of."""
+        """Words for the scored unit, for the unit of clustering, and for a frame."""
         clip, frame = called(self.data)
         if self.protocol.get("observed", 0) is None:
             return "whole sequence", clip, frame
@@ -485,7 +487,7 @@ class Comparison(Result):
 
 
 def _table(title: str, caption: str, columns: Iterable[str]) -> Table:
-    """An empty table whose first column has the names, which take no room from the numbers."""
+    """Return an empty table whose first column, for names, leaves the width to the numbers."""
     table = Table(title=title, caption=caption)
     table.add_column("", overflow="fold")
     for column in columns:
@@ -494,7 +496,7 @@ def _table(title: str, caption: str, columns: Iterable[str]) -> Table:
 
 
 def _interval(estimate: Estimate) -> str:
-    """The interval of 95 % and its degrees of freedom."""
+    """Return the 95 % interval and its degrees of freedom as text."""
     low, high = map(number, estimate.interval())
     return low if low == "–" else f"{low} to {high} ({estimate.freedom[-1]:.3g})"
 

@@ -1,19 +1,19 @@
-"""Tubes around forecasts that hold the future as often as they say, whatever the model: split conformal prediction.
+"""Prediction bands with guaranteed coverage of the future for any model: split conformal prediction.
 
-How far the future y of a window is from the mean m of its K forecasts, in their standard deviations v, is known of
-windows that were kept for calibration. A tube m ± q v, q a quantile of these distances, holds the future of a new
-window with the level asked for, if both are exchangeable (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, arXiv
-1604.04173). At once it holds
+The distance of a window's future y from the mean m of its K forecasts, in their standard deviations v, is known for
+calibration windows. A band m ± q v, with q a quantile of these distances, contains the future of a new window with the
+given level, if both are exchangeable (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, arXiv 1604.04173). A band
+simultaneously contains
 
     every number alone      s = |y_td - m_td| / v_td         a factor for each frame t and coordinate d
     a frame                 s = max over d                   a factor for each frame
     the whole future        s = max over t and d             one factor
 
-Windows of a clip depend on each other: what is exchangeable is clips. The quantile is that of hierarchical conformal
-prediction (Lee, Barber and Willett 2023, arXiv 2306.06342; groups as in Dunn, Wasserman and Ramdas 2018, arXiv
-1809.07441): each of C clips has the weight 1 / (C + 1), which its windows share, and as much lies at infinity. A window
-drawn from a new clip is held with probability `level` at least. Of clips of one window each, q is the
-⌈(C + 1) level⌉-th smallest distance, and the probability is level + 1 / (C + 1) at most where there are no ties.
+Windows of a clip depend on each other; clips are exchangeable. The quantile is from hierarchical conformal prediction
+(Lee, Barber and Willett 2023, arXiv 2306.06342; groups as in Dunn, Wasserman and Ramdas 2018, arXiv 1809.07441). Each
+of C clips has the weight 1 / (C + 1), which its windows share, and the same weight is at infinity. The band contains
+the future of a window drawn from a new clip with probability `level` at least. For clips of one window each, q is the
+⌈(C + 1) level⌉-th smallest distance, and without ties the probability is level + 1 / (C + 1) at most.
 """
 
 from __future__ import annotations
@@ -44,23 +44,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REGIONS: Mapping[str, tuple[int, ...]] = {"number": (), "frame": (-1,), "future": (-2, -1)}
-"""What a tube holds at once, and over which dimensions of (..., H, D) its distance is the largest."""
+"""What a band contains simultaneously, with the dimensions of (..., H, D) over which its distance is the maximum."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tubes(Result):
-    """How many times their spread forecasts are to be widened, so that tubes hold the future as often as they say.
+    """Prediction bands: factors on the spread of forecasts that give the bands their nominal coverage.
 
     Attributes:
-        level: the share of windows whose future tubes hold.
-        factors: by what is held at once, "number" (H, D), "frame" (H, 1) or "future" (1, 1): half the width of the
-            tube over the spread.
-        spread: (H, D), in the unit of the data, where it is not the standard deviation of a window's forecasts.
-        samples: K, the forecasts of a window.
-        seed: of their draws.
+        level: share of windows whose future the bands contain.
+        factors: half the width of the band over the spread, by region: "number" (H, D), "frame" (H, 1) or "future" (1,
+            1).
+        spread: spread (H, D), in the unit of the data; None for the standard deviation of a window's forecasts.
+        samples: K, number of forecasts of a window.
+        seed: seed of their draws.
         options: further arguments of the model's `forecast`.
-        clips: C, what is exchangeable, of the calibration windows.
-        data: of these windows.
+        clips: C, number of exchangeable clips among the calibration windows.
+        data: description of these windows.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -81,18 +81,18 @@ class Tubes(Result):
     data: Mapping[str, Any]
 
     def tube(self, forecasts: Tensor, region: str = "future") -> tuple[Tensor, Tensor]:
-        """The tubes of some forecasts, which are made as those of the calibration were.
+        """Return the bands of forecasts that are made like those of the calibration.
 
         Args:
-            forecasts: `(K, B, H, D)`, of a model or reference.
-            region: what a tube holds with the level: "number", each number alone; "frame", all numbers of a frame; or
-                the whole "future".
+            forecasts: forecasts `(K, B, H, D)` of a model or reference.
+            region: what a band contains with probability `level`: "number", each number alone; "frame", all numbers of
+                a frame; or the whole "future".
 
         Returns:
             Lower and upper end, `(B, H, D)` each.
 
         Raises:
-            ValueError: an unknown region, or forecasts of another shape.
+            ValueError: when the region is unknown, or forecasts have another shape.
         """
         if region not in REGIONS:
             raise ValueError(f"no tubes of a {region!r}{nearest(region, REGIONS)}; there are {', '.join(REGIONS)}")
@@ -104,16 +104,16 @@ class Tubes(Result):
         return forecasts.mean(0) - reach, forecasts.mean(0) + reach
 
     def scores(self, windows: HeldOutWindows) -> list[Measure]:
-        """For `evaluate`: how often the future is held and how wide tubes are, as forecasts say and recalibrated.
+        """Return scores for `evaluate`: coverage of the future and width of bands, before and after recalibration.
 
-        What forecasts say themselves is a tube m ± q v, too, whose q is the quantile of how far each of them is from
-        the others. Shares are of windows of a clip drawn at random: clips count alike, as in the calibration.
+        Forecasts alone also define a band m ± q v, with q the quantile of the distance of each of them from the others.
+        Shares are of windows of a clip drawn at random: clips are weighted equally, as in the calibration.
         """
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
         percent, least = f"{100 * self.level:g} %", {"said": max(3, _fewest(self.level)), "held": 1}
 
-        @lru_cache(maxsize=1)  # for all scores of a batch
+        @lru_cache(maxsize=1)  # shared by all scores of a batch
         def judged(forecasts: Tensor, truth: Tensor) -> dict[tuple[str, str], tuple[Tensor, Tensor]]:
             gaps = truth.isnan()
             spread = self._spread(forecasts)
@@ -156,16 +156,18 @@ class Tubes(Result):
         training_windows: HeldOutWindows | None = None,
         progress: bool = True,
     ) -> Evaluation:
-        """How often tubes hold the future of other windows, with errors clustered by clip, before and after.
+        """Return how often bands contain the future of other windows, before and after recalibration.
+
+        Errors are clustered by clip.
 
         Args:
-            model: whose forecasts the tubes are of; or a reference's name.
-            windows: to judge on.
-            training_windows: what some references know.
+            model: model whose forecasts the bands are of; or a reference's name.
+            windows: windows to evaluate on.
+            training_windows: training data of some references.
             progress: whether to show a progress bar.
 
         Returns:
-            `scores` of these forecasts; "said" is before, "held" after.
+            `scores` of these forecasts; "said" is before, "held" after recalibration.
         """
         models, references = ({}, [model]) if isinstance(model, str) else (model, [])
         return evaluate(
@@ -182,7 +184,7 @@ class Tubes(Result):
         )
 
     def table(self) -> Table:
-        """Factors: their mean over frames and coordinates, the least and the largest."""
+        """Return a table of factors: mean over frames and coordinates, smallest and largest."""
         clip, frame = called(self.data)
         title = f"tubes of {100 * self.level:g} % · {self.data['windows']} windows of {self.clips} {clip}s"
         table = Table(title=title, caption=f"half the width of a tube over the forecasts’ spread, K = {self.samples}")
@@ -194,7 +196,7 @@ class Tubes(Result):
         return table
 
     def plot(self) -> Figure:
-        """Factors over the horizon; of single numbers their mean over coordinates, and where they all are."""
+        """Draw factors over the horizon; for single numbers their mean and range over coordinates."""
         figure = canvas(4.5, 3)
         axes = figure.subplots()
         numbers = self.factors["number"]
@@ -219,7 +221,7 @@ class Tubes(Result):
             raise ValueError("factors and spreads are numbers from 0 on")
 
     def _spread(self, forecasts: Tensor) -> Tensor:
-        """Of forecasts (B, K, H, D): (B, H, D), or the one (H, D) of all."""
+        """Return the spread of forecasts (B, K, H, D): (B, H, D), or the common one (H, D)."""
         return _deviations(forecasts) if self.spread is None else torch.as_tensor(self.spread).to(forecasts)
 
     def _factor(self, region: str, like: Tensor) -> Tensor:
@@ -240,31 +242,32 @@ def conformal(
     options: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> Tubes:
-    """Tubes around forecasts, calibrated on windows that the model has not been fitted to.
+    """Calibrate prediction bands around forecasts on windows that the model was not fitted to.
 
-    They hold the future of new windows as often as the level says if the clips of these are exchangeable with those of
-    calibration: of the same people and styles. Of one person's or style's clips they say nothing of another's. Later
-    steps of the same sequences are not exchangeable with earlier ones, so that windows divided by time are refused.
+    The bands contain the future of new windows with probability `level` if their clips are exchangeable with those of
+    calibration, for example of the same people and styles. Calibration on clips of one person or style gives no
+    guarantee for another. Later steps of the same sequences are not exchangeable with earlier ones, so windows divided
+    by time are refused.
 
     Args:
         model: a model (`Forecasting`), or the name of a reference row, see `References`.
-        windows: of calibration.
-        level: share of windows to be held, between 0 and 1.
-        groups: of each window, the name of what is exchangeable, where it is more than a clip, such as its style. A
+        windows: calibration windows.
+        level: share of windows to contain, between 0 and 1.
+        groups: name of the exchangeable group of each window, if groups are larger than clips, such as its style. A
             level of 0.9 needs 9 of them.
-        residuals: windows, such as those of training, on which errors of the mean forecast are measured, whose root
-            mean square at each frame and coordinate is the spread in place of the forecasts' standard deviation: for
-            forecasts that are points, or spread in the wrong places.
-        samples: K, forecasts of a window, which are drawn.
-        training_windows: what "climatology" and "nearest neighbours" know.
-        seed: of the draws.
-        batch_size: windows forecast at once.
+        residuals: windows, such as those of training, for errors of the mean forecast. Their root mean square at each
+            frame and coordinate is the spread instead of the forecasts' standard deviation: for point forecasts, or a
+            badly distributed spread.
+        samples: K, number of drawn forecasts of a window.
+        training_windows: training data of "climatology" and "nearest neighbours".
+        seed: seed of the draws.
+        batch_size: number of windows in a batch.
         options: further arguments of the model's `forecast`.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: a level that is none, too few clips for it, forecasts without a spread, windows that cannot be
-            forecast or are one part of sequences divided by time, or as many groups as windows are not given.
+        ValueError: when the level is invalid, there are too few clips for it, forecasts have no spread, windows cannot
+            be forecast or are one part of sequences divided by time, or `groups` and windows differ in number.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -297,7 +300,7 @@ def conformal(
     with progress_bar(progress) as bar:
 
         def futures(of: Held, label: str) -> Iterator[tuple[Tensor, Tensor]]:
-            """Forecasts (B, K, H, D) and true futures, batch by batch."""
+            """Yield forecasts (B, K, H, D) and true futures by batch."""
             if isinstance(model, str):
                 name = model
                 drawn, forecaster = References(of, samples, seed, training_windows)[model]
@@ -337,11 +340,11 @@ def conformal(
 
 
 def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
-    """A value for each clip, whose mean weighted by windows is the mean over clips, and errors are of that.
+    """Return a value for each clip whose mean weighted by windows is the mean over clips, with its errors.
 
     Args:
-        values: `(N,)`, the score of every window.
-        clips: `(N,)`, the clip of every window, from 0 to C - 1.
+        values: score of every window, `(N,)`.
+        clips: clip of every window, from 0 to C - 1, `(N,)`.
     """
     means, windows = np.array(clip_means(values, clips)), np.bincount(clips.numpy())
     found: list[float] = (means.mean() + (means - means.mean()) * windows.mean() / windows).tolist()
@@ -349,24 +352,24 @@ def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
 
 
 def _deviations(forecasts: Tensor) -> Tensor:
-    """Standard deviations (B, H, D) of forecasts (B, K, H, D); of a single one 0."""
+    """Return standard deviations (B, H, D) of forecasts (B, K, H, D); 0 for a single one."""
     return forecasts.std(1, correction=min(1, forecasts.shape[1] - 1))
 
 
 def standardised(forecasts: Tensor, truth: Tensor, spread: Tensor) -> Tensor:
-    """How far a future (B, H, D) is from the mean of forecasts (B, K, H, D), in units of their spread.
+    """Return the distance of a future (B, H, D) from the mean of forecasts (B, K, H, D), in units of their spread.
 
-    NaN where it was not observed, and infinite where it is missed by forecasts without a spread.
+    It is NaN where the future was not observed, and infinite where forecasts without a spread miss it.
     """
     return _over((truth - forecasts.mean(1)).abs(), spread)
 
 
 def _own_distances(forecasts: Tensor, spread: Tensor | None) -> Tensor:
-    """How far each of forecasts (B, K, H, D) is from the mean of the others, in units of their spread."""
+    """Return the distance of each of forecasts (B, K, H, D) from the mean of the others, in units of their spread."""
     count, apart = forecasts.shape[1], forecasts - forecasts.mean(1, keepdim=True)
     if spread is None:
         squares = apart.square()
-        left = squares.sum(1, keepdim=True) - count / (count - 1) * squares  # of the others, about their mean
+        left = squares.sum(1, keepdim=True) - count / (count - 1) * squares  # sum of the others, centred
         spread = (left.clamp(min=0) / (count - 2)).sqrt()
     return _over(count / (count - 1) * apart.abs(), spread)
 
@@ -376,7 +379,7 @@ def _over(distance: Tensor, spread: Tensor) -> Tensor:
 
 
 def worst(distances: Tensor, region: str) -> Tensor:
-    """The largest of known distances (..., H, D) in each region; NaN where none is known."""
+    """Return the largest of known distances (..., H, D) in each region; NaN if none is known."""
     if not REGIONS[region]:
         return distances
     largest = distances.nan_to_num(nan=-1.0, posinf=math.inf).amax(REGIONS[region], keepdim=True)
@@ -384,17 +387,19 @@ def worst(distances: Tensor, region: str) -> Tensor:
 
 
 def _smallest(distances: Tensor, level: float) -> Tensor:
-    """The ⌈(K + 1) level⌉-th smallest of K distances (B, K, ...), which are exchangeable with another: (B, ...)."""
+    """Return the ⌈(K + 1) level⌉-th smallest (B, ...) of K distances (B, K, ...) exchangeable with another one."""
     return distances.kthvalue(math.ceil(round((distances.shape[1] + 1) * level, 9)), 1).values
 
 
 def quantile(distances: Tensor, places: Tensor, level: float) -> Tensor:
-    """Of known distances (N, ...) with the weights of hierarchical conformal prediction: (...), where it is finite.
+    """Return the quantile (...) of known distances (N, ...) with the weights of hierarchical conformal prediction.
+
+    Infinite if too few clips are known.
 
     Args:
-        distances: of windows, NaN where nothing is known.
-        places: (N,), the clip of every window.
-        level: of the quantile.
+        distances: distances of windows, NaN if unknown.
+        places: clip of every window, (N,).
+        level: level of the quantile.
     """
     known = (~distances.isnan()).flatten(1).double()
     windows = known.new_zeros(int(places.max()) + 1, known.shape[1]).index_add_(0, places, known)  # by clip
@@ -407,7 +412,7 @@ def quantile(distances: Tensor, places: Tensor, level: float) -> Tensor:
 
 
 def _fewest(level: float) -> int:
-    """Exchangeable numbers of which some quantile is at this level of another one."""
+    """Return the fewest exchangeable numbers with a quantile that bounds another one at this level."""
     return math.ceil(round(level / (1 - level), 9))
 
 

@@ -1,14 +1,14 @@
-"""Evaluation on held-out windows: what a model forecasts, and how well it explains.
+"""Evaluation on held-out windows: forecasts and bounds.
 
-Two programs are scored and never mixed. *Free-running*: the model sees the observed frames, forecasts K futures on its
-own, and `Measure`s compare the futures with the true one; the *log score* is the density that such forecasts have at
-the true future. *Teacher-forced*: the model reads every frame of the window, and its bound on log p(x_{1:T}) is
-reported in nats per frame.
+Two kinds of scores are kept apart. *Free-running*: the model reads the observed frames and forecasts K futures, which
+`Measure`s compare with the true one; the *log score* is the density of such forecasts at the true future.
+*Teacher-forced*: the model reads every frame of the window, and its bound on log p(x_{1:T}) is reported in nats per
+frame.
 
-Every evaluation carries reference rows that any method should beat, such as the last value repeated; `References` has
-them all. Another reference for any data is a model without latents, given as one of the models. Scores that are read by
-what they give the truth add a row, the true futures, which no method should be expected to beat. All rows score the
-same windows, and windows of one clip overlap, so that standard errors are clustered by clip and
+Every evaluation includes reference rows that any method should beat, such as repeating the last value; `References`
+lists them. A model without latents, passed as one of the models, is another reference. Some scores need their value for
+the true futures as a comparison. They add a row with the true futures, which no method is expected to beat. All rows
+are scored on the same windows. Windows of one clip overlap, so standard errors are clustered by clip and
 `Evaluation.difference` is paired.
 """
 
@@ -54,44 +54,43 @@ def evaluate(
     options: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> Evaluation:
-    """Score one model or several, and the reference rows, on the same windows.
+    """Score one or several models, and the reference rows, on the same windows.
 
-    Every method draws from the same seed, so that its scores do not depend on which others are evaluated;
-    they do depend on `batch_size`, as draws come batch by batch. The models' modes and torch's random state
-    are restored.
+    Every method draws from the same seed, so its scores do not depend on which others are evaluated. They do depend on
+    `batch_size`, because draws are made by batch. The models' modes and torch's random state are restored.
 
     Args:
         model: a model (`Forecasting`), or `{name: model}`.
-        windows: `ArrayWindows`, or any `HeldOutWindows`; of data with parts, such as
-            `dvae.tables.PanelData`, those of the test split.
-        scores: of the forecasts, as a function of the windows: `proper` scoring rules, `calibrated` with coverage and
-            PIT beside them, or those of an application.
-        samples: K, the forecasts per window.
+        windows: `ArrayWindows`, or any `HeldOutWindows`; for data with parts, such as `dvae.tables.PanelData`, those of
+            the test split.
+        scores: function from the windows to scores of forecasts: `proper` scoring rules, `calibrated`, which adds
+            coverage and PIT, or those of an application.
+        samples: K, number of forecasts per window.
         seed: seed of every method's draws.
-        batch_size: windows forecast at once.
-        draw_emission: forecast draws of x, or (False) its means. Proper scoring rules judge the model's predictive
-            distribution only when x is drawn. None for draws, or for means where
-            a score is published for these (`Measure.of_means`); see `DynamicalVAE.is_drawn` for exceptions.
-        bound_particles: particles of the importance-weighted bound and its k-hat; 0 leaves both out.
-        log_score_particles: particles of the log score, see `predictive_bound`; 0 leaves it out.
-        references: whether to add the reference rows, each where it can be had; or names of some, see `References`.
-        training_windows: what "mean", "climatology" and "nearest neighbours" know, such as x (N, T, D); without it
-            these are left out.
-        season: the period of "seasonal", in frames; by default what the windows' description says.
-        configs: `{name: configuration}`, stored with the rows; anything that JSON can hold.
-        options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at
-            the mean of the prior.
+        batch_size: number of windows in a batch.
+        draw_emission: whether forecasts are draws of x (True) or its means (False). Proper scoring rules assess the
+            model's predictive distribution only if x is drawn. None for draws, or for means if a score is published for
+            means (`Measure.of_means`); see `DynamicalVAE.is_drawn` for exceptions.
+        bound_particles: number of particles of the IWAE bound and its k-hat; 0 omits both.
+        log_score_particles: number of particles of the log score, see `predictive_bound`; 0 omits it.
+        references: whether to add the reference rows that are available; or names of some, see `References`.
+        training_windows: training data of "mean", "climatology" and "nearest neighbours", such as x (N, T, D); without
+            it these are omitted.
+        season: period of "seasonal", in frames; by default from the windows' description.
+        configs: `{name: configuration}`, stored with the rows; any JSON value.
+        options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at the mean of the
+            prior.
         progress: whether to show a progress bar.
 
     Returns:
-        The evaluation; print it, or take its `table`, `plot` and `to_json`.
+        The evaluation; print it, or use its `table`, `plot` and `to_json`.
 
     Raises:
-        TypeError: what is no model that forecasts, or data that do not say which steps are observed.
-        ValueError: windows that are ragged or leave nothing to predict; a forecast of the wrong shape; a model with the
-            name of a reference row; a reference row that is asked for and cannot be had; fewer than one sample; two
-            scores of one name.
-        FloatingPointError: a forecast or bound that is not finite, naming method and window.
+        TypeError: when a model cannot forecast, or the data do not define which steps are observed.
+        ValueError: when windows are ragged or have no step to predict, a forecast has the wrong shape, a model has the
+            name of a reference row, a requested reference row is not available, `samples` is below one, or two scores
+            have one name.
+        FloatingPointError: when a forecast or bound is not finite, naming method and window.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -191,19 +190,19 @@ def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
 
 
 def _is_drawn(model: Any, draw_emission: bool | None, means: bool) -> bool:
-    """Whether a model's forecasts draw the data: as the caller says, or else by what the scores are published for."""
+    """Return whether a model's forecasts draw the data: the caller's choice, or else the model's for these scores."""
     if draw_emission is not None:
         return draw_emission
     return model.is_drawn(means) if isinstance(model, Emitting) else not means
 
 
 def _certain(model: Any, drawn: bool) -> bool:
-    """Whether all forecasts of a window are one: means of a model in which nothing is latent."""
+    """Return whether all forecasts of a window are equal: means of a model without latents."""
     return isinstance(model, DynamicalVAE) and not (drawn or model.latents or model.summed or model.shared)
 
 
 def _reservations(measures: Sequence[Measure], samples: int, of_means: Sequence[str]) -> Iterator[str]:
-    """Notes on scores that cannot be had of these forecasts, or say little."""
+    """Yield notes on scores that are not available for these forecasts, or not informative."""
     if lacking := [f"{measure.name} ({measure.least})" for measure in measures if measure.least > samples]:
         yield f"left out, as they need more than {samples} forecasts: {', '.join(lacking)}"
     judged = [each.name for each in measures if each.of_draws and not each.of_means and each.least <= samples]
@@ -214,7 +213,7 @@ def _reservations(measures: Sequence[Measure], samples: int, of_means: Sequence[
 
 @dataclass(frozen=True)
 class _Judge:
-    """What is asked of every row of one evaluation; values are by clip."""
+    """Scores of the rows of one evaluation; values are by clip."""
 
     held: Held
     measures: Sequence[Measure]
@@ -225,7 +224,7 @@ class _Judge:
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Scores and histograms of free-running forecasts, those that so many samples have."""
+        """Return scores and histograms of free-running forecasts, where `samples` suffices for them."""
         measures = [measure for measure in self.measures if measure.least <= samples]
         held, found = self.held, []
         index = torch.arange(len(held.keys))
@@ -239,7 +238,7 @@ class _Judge:
         return scores, histograms
 
     def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
-        """Bounds and KL terms in nats per frame."""
+        """Return bounds and KL terms in nats per frame."""
         found = []
         for part in parts:
             batch = on_device_of(model, self.held.part(part))
@@ -254,7 +253,7 @@ class _Judge:
         return self._means(_concatenate(found))
 
     def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
-        """The log score in nats per predicted frame, where it is asked for."""
+        """Return the log score in nats per predicted frame, if it was requested."""
         if not self.log_score_particles:
             return {}
         found = []
@@ -266,7 +265,7 @@ class _Judge:
         return self._means(_concatenate(found))
 
     def metrics(self, rows: Mapping[str, Row]) -> dict[str, Metric]:
-        """How the scores that rows have are read, in the order of the table."""
+        """Return the metrics of all scores in the rows, in the order of the table."""
         found = {name for row in rows.values() for name in row.clip_means}
         latents = sorted(name for name in found if name.startswith("KL "))
         _, frame = called(self.held.windows.description)
@@ -284,7 +283,7 @@ class _Judge:
 def _references(
     asked: bool | Sequence[str], known: References, measures: Sequence[Measure]
 ) -> dict[str, tuple[int, Forecaster]]:
-    """Number of forecasts and forecaster of each reference row."""
+    """Return the number of forecasts and the forecaster of each reference row."""
     futures = known.held.futures
     truths: dict[str, tuple[int, Forecaster]] = {
         measure.truth: (1, lambda part: futures[part][None]) for measure in measures if measure.truth
@@ -296,22 +295,22 @@ def _references(
 
 
 def forecaster_of(model: Any, held: Held, samples: int, options: Mapping[str, Any]) -> Forecaster:
-    """Which windows to a model's K futures of each, with these options of its `forecast`."""
+    """Return the function from a slice of windows to a model's K futures, with these options of its `forecast`."""
     horizon = held.futures.shape[1]
     return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
 
 
 def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: Held, part: slice) -> Tensor:
-    """Futures `(B, K, H, D)` of some windows, on the CPU.
+    """Return futures `(B, K, H, D)` of some windows, on the CPU.
 
     Raises:
-        ValueError, FloatingPointError: forecasts of another shape, or that are not finite.
+        ValueError, FloatingPointError: when forecasts have another shape, or are not finite.
     """
     forecasts = forecaster(part).cpu()
     expected = (samples, *held.futures[part].shape)
     if forecasts.shape != expected:
         raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
-    if not forecasts.sum().isfinite():  # what is not finite survives a sum, which takes a fortieth of the time
+    if not forecasts.sum().isfinite():  # a sum keeps non-finite values, and takes a fortieth of the time
         refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
     return forecasts.movedim(0, 1)
 

@@ -1,4 +1,4 @@
-"""Evaluations: scores of several methods on the same windows, with all that is needed to say what was measured."""
+"""Evaluations: scores of several methods on the same windows, with the settings of the measurement."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
-"""By the direction that is better."""
-_MOST_RANKS = 10_000  # whose envelope is found in a second
+"""Arrow for each direction that is better."""
+_MOST_RANKS = 10_000  # the envelope of this many takes a second
 
 
 @dataclass(frozen=True)
 class Score:
-    """Mean over windows, or a score of the whole set, and its standard error, clustered by clip (NaN of a single one).
+    """Mean over windows, or a score of the whole set, with its standard error, clustered by clip (NaN for one clip).
 
     Args:
-        mean: the mean.
-        standard_error: its standard error.
-        freedom: degrees of freedom of that, one less than there are clips.
+        mean: mean over windows.
+        standard_error: standard error of the mean.
+        freedom: degrees of freedom of the error, the number of clips minus one.
     """
 
     mean: float
@@ -44,7 +44,7 @@ class Score:
     freedom: float = field(default=math.nan, compare=False)
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Where the mean lies at this level, by Student's t; NaN where the error is unknown."""
+        """Return the confidence interval of the mean by Student's t; NaN if the error is unknown."""
         return student_interval(self.mean, self.standard_error, self.freedom, level)
 
     def __str__(self) -> str:
@@ -57,9 +57,9 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One method: its number of samples, what it is, and each score's value for each clip (see `Measure.pool`).
+    """Scores of one method by clip (see `Measure.pool`), its number of samples, equations and configuration.
 
-    Histograms, such as that of the PIT, have as many shares as bins for each clip.
+    Histograms, such as the PIT's, have one share per bin for each clip.
     """
 
     samples: int
@@ -73,24 +73,24 @@ class Row:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(Result):
-    """Scores of several methods on the same windows, with all that is needed to say what was measured.
+    """Scores of several methods on the same windows, with the settings of the measurement.
 
-    Indexing gives the scores of a method: `evaluation["srnn"]["CRPS"].mean`.
+    Indexing returns the scores of a method: `evaluation["srnn"]["CRPS"].mean`.
 
     Attributes:
         rows: `{method: Row}`.
-        metrics: name to how it is to be read, of all scores that at least one method has, in the order of the table.
+        metrics: metric of each score that at least one method has, in the order of the table.
         clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
-        data: fingerprint, windows, frames and coordinates of a window, and what the windows say of themselves.
-        protocol: the fields of the windows' protocol.
-        samples: K, the number of forecasts asked of every method.
-        emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it; "drawn or mean"
-            where those of discrete models were draws and those of others means.
-        bound_particles: particles of the importance bound, 0 where it was not computed.
-        seed: the seed of every method's draws.
-        log_score_particles: particles of the log score, 0 where it was not computed.
-        basis: what scores rest on, by name, such as a judge's weights or a ground truth.
-        notes: lines below the table on how scores are to be read.
+        data: fingerprint, number of windows, frames and coordinates of a window, and the windows' description.
+        protocol: fields of the windows' protocol.
+        samples: K, number of forecasts requested from every method.
+        emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it; "drawn or mean" if
+            discrete models were drawn and others not.
+        bound_particles: number of particles of the IWAE bound, 0 if it was not computed.
+        seed: seed of every method's draws.
+        log_score_particles: number of particles of the log score, 0 if it was not computed.
+        basis: requirements of scores by name, such as the weights of a metric model or a ground truth.
+        notes: lines below the table on how to read scores.
         options: further arguments of the models' `forecast`.
 
     Example:
@@ -119,20 +119,20 @@ class Evaluation(Result):
         return {name: self._score(name, means) for name, means in self._row(method).clip_means.items()}
 
     def difference(self, first: str, second: str, metric: str) -> Score:
-        """Paired difference of two methods in a metric, first minus second, with its standard error.
+        """Return the paired difference of two methods in a metric, first minus second, with its standard error.
 
         Raises:
-            KeyError: a method that was not evaluated, or a metric that one of the two lacks.
+            KeyError: when a method was not evaluated, or one of the two has no such metric.
         """
         ours, theirs = self._both(first, second, metric)
         return self._score(metric, ours - theirs)
 
     def ratio(self, first: str, second: str, metric: str) -> Score:
-        """Ratio of the means of two methods in a metric, first by second, with its standard error, linearised.
+        """Return the ratio of two methods' means in a metric, first by second, with its linearised standard error.
 
         Raises:
             KeyError: as `difference`.
-            ValueError: a second mean of 0.
+            ValueError: when the second mean is 0.
         """
         ours, theirs = self._both(first, second, metric)
         over, under = (self._score(metric, means).mean for means in (ours, theirs))
@@ -141,7 +141,7 @@ class Evaluation(Result):
         return self._score(metric, over / under + (ours - over / under * theirs) / under)
 
     def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:
-        """The values of two methods by clip."""
+        """Return the values of two methods by clip."""
         means = []
         for method in (first, second):
             row = self._row(method)
@@ -152,7 +152,7 @@ class Evaluation(Result):
         return means
 
     def table(self) -> Table:
-        """Metrics down, methods across: mean ± standard error, the two programs apart."""
+        """Return a table of mean ± standard error, a row per metric and a column per method, by kind of score."""
         table = Table(title=self._title(), caption=self._caption())
         table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
         for method, row in self.rows.items():
@@ -170,7 +170,7 @@ class Evaluation(Result):
         return table
 
     def plot(self, metrics: Sequence[str] | None = None) -> Figure:
-        """One panel per metric, with an arrow for what is better; a dot per method with a bar of one standard error."""
+        """Draw one panel per metric, with a dot and a bar of one standard error per method."""
         names = list(self.metrics if metrics is None else metrics)
         columns = min(4, len(names))
         rows = math.ceil(len(names) / columns)
@@ -189,25 +189,27 @@ class Evaluation(Result):
             panel.set_yticks(range(len(scores)), list(scores), parse_math=False)
             panel.set_ylim(len(scores) - 0.5, -0.5)
             panel.tick_params(labelsize=8)
-            panel.locator_params(axis="x", nbins=4)  # more would overlap where values agree in many digits
+            panel.locator_params(axis="x", nbins=4)  # more ticks would overlap if values agree in many digits
             panel.grid(axis="x", alpha=0.3)
         for panel in panels[len(names) :]:
             panel.set_axis_off()
         return figure
 
     def departure(self, method: str, histogram: str = "PIT", alpha: float = 0.05) -> tuple[np.ndarray, ...]:
-        """How far the distribution of the PIT of a method's forecasts is from uniform, with a simultaneous band.
+        """Return the difference between the PIT distribution of a method's forecasts and uniform, with a simultaneous
+        band.
 
-        The band is the exact envelope of independent uniform ranks (`calibration.envelope`), of as many as are worth
-        these dependent ones, by their spread over clips (`uncertainty.effective_number`): an approximation, but for
-        clips of one number each. A curve that leaves the band at any point is not that of calibrated forecasts.
+        The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Their number is the
+        effective number of these dependent ranks, from their spread over clips (`uncertainty.effective_number`). This
+        is an approximation, except for clips of one number each. A curve that leaves the band at any point indicates
+        that forecasts are not calibrated.
 
         Returns:
-            Points between bins, the share of the PIT below each less the point itself, and the least and the largest
-            of these that lie within, `(bins - 1,)` each; the band is NaN where there is one clip.
+            Points between bins, the share of the PIT below each minus the point itself, and the lower and upper end of
+            the band, `(bins - 1,)` each; the band is NaN for one clip.
 
         Raises:
-            KeyError: a method or a histogram that there is not.
+            KeyError: when there is no such method or histogram.
         """
         shares = self._histogram(method, histogram).cumsum(1)[:, :-1].T
         points = np.arange(1, len(shares) + 1) / (len(shares) + 1)
@@ -221,13 +223,14 @@ class Evaluation(Result):
         return points, below - points, low - points, high - points
 
     def plot_calibration(self, histogram: str = "PIT") -> Figure:
-        """For each method, its histogram of the PIT, and below it the `departure` of its distribution from uniform.
+        """Draw the PIT histogram of each method, and below it the `departure` of its distribution from uniform.
 
-        The band of the histogram is two standard errors of each bin, that of the curve holds all of it with 95 %
-        probability where forecasts are calibrated. Methods without a histogram, such as points, are left out.
+        The band of the histogram is two standard errors of each bin. The band of the curve contains the whole curve
+        with 95 % probability if forecasts are calibrated. Methods without a histogram, such as point forecasts, are
+        omitted.
 
         Raises:
-            KeyError: no method has the histogram.
+            KeyError: when no method has the histogram.
         """
         methods = [method for method, row in self.rows.items() if histogram in row.histograms]
         if not methods:
@@ -251,17 +254,17 @@ class Evaluation(Result):
         return figure
 
     def plot_horizon(self) -> Figure:
-        """For each method, histograms of the PIT at some frames of the future, and coverage over them.
+        """Draw PIT histograms at some frames of the future, and coverage over these frames, for each method.
 
         Bands are two standard errors, clustered by clip; see `scores.over_horizon`.
 
         Raises:
-            KeyError: no method has a histogram of a frame.
+            KeyError: when no method has a histogram of a frame.
         """
         _, frame = called(self.data)
 
         def at(score: str, names: Iterable[str]) -> dict[int, str]:
-            """Names of a score by frame."""
+            """Return the names of a score by frame."""
             found = (re.fullmatch(rf"{re.escape(score)}, {re.escape(frame)} (\d+)", name) for name in names)
             return {int(each[1]): each[0] for each in found if each}
 
@@ -297,7 +300,7 @@ class Evaluation(Result):
         return figure
 
     def _draw(self, panel: Axes, method: str, histogram: str) -> None:
-        """A histogram over uniform, with two standard errors of each bin."""
+        """Draw a histogram relative to uniform, with two standard errors of each bin."""
         clip_shares = self.rows[method].histograms[histogram].T
         bins = len(clip_shares)
         shares, deviations = linearised(clip_shares, np.array(list(self.clips.values())))

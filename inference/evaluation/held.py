@@ -18,13 +18,13 @@ from ...turns import seeded
 
 @dataclass(frozen=True)
 class Held:
-    """The windows of one evaluation.
+    """Windows of one evaluation.
 
     Args:
-        windows: where they come from.
-        batch: all of them.
-        observed: frames that are seen, O.
-        keys: (split, clip, first frame) of each.
+        windows: source of the windows.
+        batch: batch of all windows.
+        observed: O, number of observed frames.
+        keys: (split, clip, first frame) of each window.
     """
 
     windows: HeldOutWindows
@@ -39,41 +39,41 @@ class Held:
 
     @property
     def futures(self) -> Tensor:
-        """The frames to predict `(N, H, D)`, NaN where they were not observed."""
+        """Frames to predict `(N, H, D)`, NaN where they were not observed."""
         return self.batch.mask_to_nan()[:, self.observed :]
 
     @property
     def mask(self) -> Tensor | None:
-        """`(N, T, D)`, True where x was observed; None where all of it was."""
+        """Mask `(N, T, D)`, True where x was observed; None if all of it was."""
         return self.batch.mask()
 
     def part(self, part: slice) -> Batch:
-        """Some windows, whole."""
+        """Return some windows, past and future."""
         return self.batch.rows(part)
 
     def past(self, part: slice) -> Batch:
-        """Some windows as forecasts see them: x `(B, O, D)`, see `Batch.past`."""
+        """Return the input of forecasts for some windows: x `(B, O, D)`, see `Batch.past`."""
         return self.part(part).past(self.observed)
 
     @property
     def clips(self) -> dict[str, int]:
-        """{"split/clip": number of its windows}."""
+        """Number of windows by clip, `{"split/clip": number}`."""
         return dict(Counter(f"{split}/{clip}" for split, clip, _ in clusters(self.windows)))
 
     @property
     def places(self) -> Tensor:
-        """`(N,)`, the clip of every window, as its place in `clips`."""
+        """Index of the clip of every window in `clips`, `(N,)`."""
         return clip_places(clusters(self.windows))
 
     def description(self) -> dict[str, Any]:
-        """Of the data, for the record."""
+        """Return the description of the data, for the result."""
         count, frames, coordinates = self.x.shape
         found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
         return {**found, "coordinates": coordinates, **self._shares, **self.windows.description}
 
     @property
     def notes(self) -> list[str]:
-        """A line on what is missing, if something is."""
+        """Note on missing values, if there are any."""
         return [
             f"observed are {seen['past']:.1%} of the numbers before the present and {seen['future']:.1%} of those "
             "after it; scores compare with these alone"
@@ -89,11 +89,11 @@ class Held:
 
 
 def hold(data: Any) -> Held:
-    """Prepare windows; of data with parts, those of the test split.
+    """Prepare windows for evaluation; for data with parts, those of the test split.
 
     Raises:
-        TypeError: data that do not say which steps are observed.
-        ValueError: whole sequences; windows that are ragged, or leave nothing to observe or to predict.
+        TypeError: when the data do not define which steps are observed.
+        ValueError: when the data are whole sequences, or windows are ragged or have no step to observe or to predict.
     """
     windows = held_out_windows(data)
     batch = Batch(windows.all())
@@ -124,22 +124,22 @@ def hold(data: Any) -> Held:
 
 
 def clip_places(keys: Sequence[tuple[str, str, int]]) -> Tensor:
-    """`(N,)`, the clip of every window, clips numbered as they come."""
+    """Return the clip of every window as an index `(N,)`; clips are numbered in order of appearance."""
     order: dict[str, int] = {}
     return torch.tensor([order.setdefault(f"{split}/{clip}", len(order)) for split, clip, _ in keys])
 
 
 @contextmanager
 def reproducibly(model: nn.Module, seed: int) -> Iterator[None]:
-    """Evaluation mode, no gradients and draws from `seed`; mode and random state are restored."""
+    """Use evaluation mode, no gradients and draws from `seed`; restore mode and random state afterwards."""
     with seeded(seed, next(model.parameters()).device), evaluating(model), torch.no_grad():
         yield
 
 
 def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
-    """The batch on the device of the model, and in its floating type where it does not read batches by itself."""
+    """Return the batch on the device of the model; a model that does not read batches also gets its floating type."""
     parameter = next(model.parameters())
-    reads = isinstance(model, DynamicalVAE)  # and takes means off before it rounds
+    reads = isinstance(model, DynamicalVAE)  # a DynamicalVAE subtracts means before it rounds
 
     def moved(value: Tensor) -> Tensor:
         return value.to(parameter.device) if reads or not value.is_floating_point() else value.to(parameter)
@@ -148,7 +148,7 @@ def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
 
 
 def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
-    """Raise for the first window whose entry in `finite` (B,) is False."""
+    """Raise FloatingPointError for the first window whose entry in `finite` (B,) is False."""
     if not finite.all():
         split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
         raise FloatingPointError(

@@ -1,20 +1,20 @@
 """Scores of stochastic forecasts, as pure functions on arrays.
 
 The energy score (Gneiting and Raftery 2007, section 4.3), the variogram score (Scheuerer and Hamill 2015) and the CRPS
-are proper: no forecaster gains by spreading its samples. The Fréchet distance compares two sets of features and has
-shapes of its own. Applications add errors of their own, such as those of the best of K samples.
+are proper: no forecaster gains by spreading its samples. The Fréchet distance compares two sets of features and has its
+own shapes. Applications add their own errors, such as the best of K samples.
 
-Calibration (coverage, PIT) rests on where each number of the truth lies among the K numbers of the samples. Of
-calibrated forecasts the truth is exchangeable with the samples, so that its rank, at random among ties, is uniform on
-0, ..., K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1: uniform
-on 0 to 1 for every K, of discrete data too (Czado, Gneiting and Held 2009). Shares and moments are expectations over
-V, so that nothing is drawn, and what they are of calibrated forecasts is exact for every K.
+Calibration (coverage, PIT) depends on the rank of each number of the truth among the K numbers of the samples. If
+forecasts are calibrated, the truth is exchangeable with the samples. Its rank, random among ties, is then uniform on 0,
+..., K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1. This is
+uniform on 0 to 1 for every K, and also for discrete data (Czado, Gneiting and Held 2009). Shares and moments are
+expectations over V, so nothing is drawn. Their values for calibrated forecasts are exact for every K.
 
-Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`; the
-result has the leading shape `(...)`. Functions accept torch tensors and numpy arrays and return a tensor. NaN in a
-truth was not observed and does not count, nor does a frame in which nothing was observed. The value for a data set is
-the plain mean over its windows. Every function raises ValueError for shapes that do not fit. Windows are scored one
-after another, so that memory does not grow with their number.
+Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`; the result
+has the leading shape `(...)`. Functions accept torch tensors and numpy arrays and return a tensor. NaN in a truth was
+not observed and is not counted, nor is a frame without observations. The value for a data set is the plain mean over
+its windows. Every function raises ValueError for shapes that do not fit. Windows are scored one after another, so
+memory does not grow with their number.
 """
 
 import math
@@ -30,35 +30,34 @@ Array = Tensor | np.ndarray
 
 
 def average_pairwise_distance(samples: Array) -> Tensor:
-    """APD, the diversity of the samples: mean of ||vec(X_j) - vec(X_k)|| over the K (K - 1) / 2 pairs.
+    """Return the APD, the diversity of samples: mean of ||vec(X_j) - vec(X_k)|| over the K (K - 1) / 2 pairs.
 
     The norm runs over all T * D numbers and is not divided by time. A single sample has diversity 0.
 
     Args:
-        samples: `(..., K, T, D)`.
+        samples: samples `(..., K, T, D)`.
 
     Returns:
-        `(...)`, in the unit of the data.
+        Diversity `(...)`, in the unit of the data.
     """
     samples = as_samples(samples)
     return per_window(mean_pairwise_distance, samples)
 
 
 def energy_score(samples: Array, truth: Array, diversity: Array | None = None) -> Tensor:
-    """Energy score of the future as one vector; proper, lower is better (Gneiting and Raftery 2007).
+    """Return the energy score of the future as one vector; proper, lower is better (Gneiting and Raftery 2007).
 
-    ES = mean_k ||vec(X_k) - vec(y)|| - 1/2 mean_{j<k} ||vec(X_j) - vec(X_k)||, the unbiased ("fair")
-    estimate, whose expectation does not depend on K. The second mean is the APD. With K = 1 the forecast is a
-    point mass and the score is the distance itself, which is fair to a deterministic forecast but not to one
-    draw of a stochastic one.
+    ES = mean_k ||vec(X_k) - vec(y)|| - 1/2 mean_{j<k} ||vec(X_j) - vec(X_k)||, the unbiased ("fair") estimate, whose
+    expectation does not depend on K. The second mean is the APD. With K = 1 the forecast is a point mass and the score
+    is the distance. This is fair to a deterministic forecast, but not to one draw of a stochastic one.
 
     Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`.
-        diversity: `(...)`, the APD of the samples where it is known and nothing is missing; None to find it.
+        samples: samples `(..., K, T, D)`.
+        truth: truth `(..., T, D)`.
+        diversity: APD of the samples `(...)`, if it is known and nothing is missing; None to compute it.
 
     Returns:
-        `(...)`, in the unit of the data.
+        Score `(...)`, in the unit of the data.
     """
 
     def score(x: Tensor, y: Tensor) -> Tensor:
@@ -70,24 +69,25 @@ def energy_score(samples: Array, truth: Array, diversity: Array | None = None) -
 
 
 def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
-    """CRPS of each number alone, averaged over frames and coordinates; proper, lower is better (Gneiting and Raftery).
+    """Return the CRPS of each number, averaged over frames and coordinates; proper, lower is better (Gneiting and
+    Raftery).
 
     CRPS = mean_k |X_k - y| - 1/2 mean_{j<k} |X_j - X_k|, the unbiased ("fair") estimate, whose expectation does not
-    depend on K: integral of (P(X <= u) - 1[y <= u])^2 du. It is the energy score of one number, blind to dependence
+    depend on K: integral of (P(X <= u) - 1[y <= u])^2 du. It is the energy score of one number, and ignores dependence
     between numbers. With K = 1 the forecast is a point mass and the score is the absolute error.
 
     Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`.
+        samples: samples `(..., K, T, D)`.
+        truth: truth `(..., T, D)`.
 
     Returns:
-        `(...)`, in the unit of the data.
+        Score `(...)`, in the unit of the data.
     """
 
     def score(x: Tensor, y: Tensor) -> Tensor:
         errors, count = (x - y).flatten(1), len(x)
         errors = errors[:, ~y.flatten().isnan()] if y.isnan().any() else errors
-        # Sorted, number i is the larger one in i pairs and the smaller one in K - 1 - i.
+        # When sorted, number i is the larger one in i pairs and the smaller one in K - 1 - i.
         signs = 2 * torch.arange(count, dtype=x.dtype, device=x.device) - (count - 1)
         apart = (signs @ errors.sort(0).values).mean() / max(1, count * (count - 1) / 2)
         return errors.abs().mean() - apart / 2
@@ -96,20 +96,20 @@ def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
 
 
 def probability_integral_transform(samples: Array, truth: Array, uniform: Array) -> Tensor:
-    """PIT of every number of the truth; uniform on 0 to 1 where forecasts are calibrated, whatever K and the ties.
+    """Return the PIT of every number of the truth; uniform on 0 to 1 for calibrated forecasts, for any K and ties.
 
     Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`.
-        uniform: `(..., T, D)`, independent draws from 0 to 1, by which a truth has its place among equal samples and in
-            the gap between two. The same draws give the same transform.
+        samples: samples `(..., K, T, D)`.
+        truth: truth `(..., T, D)`.
+        uniform: independent uniform draws on 0 to 1, `(..., T, D)`, which place a truth among equal samples and in the
+            gap between two. The same draws give the same transform.
 
     Returns:
-        `(..., T, D)`, in double precision; NaN where the truth was not observed. Its rank among the K samples is
+        PIT `(..., T, D)`, in double precision; NaN where the truth was not observed. The rank among the K samples is
         floor((K + 1) PIT).
 
     Raises:
-        ValueError: draws of another shape than the truth, or beyond 0 and 1.
+        ValueError: when the draws have another shape than the truth, or are outside 0 to 1.
     """
     samples, truth = as_pair(samples, truth)
     uniform = torch.as_tensor(uniform, device=truth.device).double()
@@ -123,14 +123,14 @@ def probability_integral_transform(samples: Array, truth: Array, uniform: Array)
 
 
 def pit_mean(samples: Array, truth: Array) -> Tensor:
-    """Mean PIT over frames and coordinates: 1/2 of calibrated forecasts, below it of those that are too high.
+    """Return the mean PIT over frames and coordinates: 1/2 for calibrated forecasts, less for too high ones.
 
     Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`.
+        samples: samples `(..., K, T, D)`.
+        truth: truth `(..., T, D)`.
 
     Returns:
-        `(...)`, in double precision.
+        Mean `(...)`, in double precision.
     """
     samples, truth = as_pair(samples, truth)
     low, ties = _places(samples, truth)
@@ -138,11 +138,11 @@ def pit_mean(samples: Array, truth: Array) -> Tensor:
 
 
 def pit_variance(samples: Array, truth: Array) -> Tensor:
-    """Mean square of PIT - 1/2, in twelfths: 1 of calibrated forecasts, above it of those that are too narrow.
+    """Return the mean square of PIT - 1/2, in twelfths: 1 for calibrated forecasts, more for too narrow ones.
 
-    It is about 1/2, and not about its own mean: of forecasts that are too high or too low it is above 1, too. With
-    K = 1 it is 1 whatever is forecast; at its largest, the truth always beyond all samples, it is
-    3 - 6 / (K + 1) + 4 / (K + 1)^2. Shapes as in `pit_mean`.
+    It is about 1/2 rather than its own mean, so it is also above 1 for forecasts that are too high or too low. With K =
+    1 it is 1 for any forecast. Its largest value, if the truth is always outside all samples, is 3 - 6 / (K + 1) + 4 /
+    (K + 1)^2. Shapes as in `pit_mean`.
     """
     samples, truth = as_pair(samples, truth)
     low, ties = _places(samples, truth)
@@ -151,15 +151,15 @@ def pit_variance(samples: Array, truth: Array) -> Tensor:
 
 
 def pit_histogram(samples: Array, truth: Array, bins: int = 20) -> Tensor:
-    """Shares of the PIT of all numbers in bins of equal width: 1 / bins each of calibrated forecasts.
+    """Return the shares of the PIT of all numbers in bins of equal width: 1 / bins each for calibrated forecasts.
 
     Args:
-        samples: `(..., K, T, D)`; K below `bins` - 1 cannot tell bins apart.
-        truth: `(..., T, D)`.
-        bins: their number.
+        samples: samples `(..., K, T, D)`; with K below `bins` - 1, bins cannot be distinguished.
+        truth: truth `(..., T, D)`.
+        bins: number of bins.
 
     Returns:
-        `(..., bins)`, in double precision, which add up to 1.
+        Shares `(..., bins)`, in double precision, which add up to 1.
     """
     samples, truth = as_pair(samples, truth)
     if bins < 1:
@@ -172,21 +172,22 @@ def pit_histogram(samples: Array, truth: Array, bins: int = 20) -> Tensor:
 
 
 def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 20) -> Tensor:
-    """TARP (Lemos et al. 2023, arXiv 2302.03026): the PIT of the truth's distance from a point, as shares in bins.
+    """Return TARP (Lemos et al. 2023, arXiv 2302.03026): histogram of the PIT of the truth's distance from a point.
 
-    The share of the samples in the ball around the point with the truth on its surface: uniform where they are of the
-    truth's law, wherever the point is, for every K and with ties, as in `pit_histogram`. Unlike the PIT of each number
-    it is of all of them together. Where it is uniform for all points that depend on what a forecast is told, the law of
-    the samples is that of the truth; points that do not depend on it pass samples that ignore it.
+    The statistic is the share of samples in the ball around the point with the truth on its surface. It is uniform if
+    samples and truth have the same distribution, for any point, any K and with ties, as in `pit_histogram`. Unlike the
+    PIT of single numbers, it depends on all numbers together. If it is uniform for all points that depend on the input
+    of the forecast, the distribution of the samples is that of the truth. With points that do not depend on the input,
+    samples that ignore the input also pass.
 
     Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`; what was not observed counts in no distance.
-        reference: `(..., T, D)`, the point; distances are Euclidean, over all numbers, in their units.
-        bins: their number.
+        samples: samples `(..., K, T, D)`.
+        truth: truth `(..., T, D)`; numbers that were not observed do not count in distances.
+        reference: the point `(..., T, D)`; distances are Euclidean, over all numbers, in their units.
+        bins: number of bins.
 
     Returns:
-        `(..., bins)`, in double precision, which add up to 1.
+        Shares `(..., bins)`, in double precision, which add up to 1.
     """
     samples, truth = as_pair(samples, truth)
     reference, missing = torch.as_tensor(reference).to(truth), truth.isnan()
@@ -199,28 +200,30 @@ def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 2
 
 
 def coverage(samples: Array, truth: Array, level: float) -> Tensor:
-    """Share of the numbers of the truth that lie in the central interval of K samples: `level` if calibrated.
+    """Return the share of numbers of the truth in the central interval of K samples: `level` if calibrated.
 
-    That is where the PIT is between (1 - level) / 2 and (1 + level) / 2. With h = (K + 1) (1 - level) / 2, the interval
-    of a whole h runs from the h-th smallest sample to the h-th largest one, which hold a truth that is exchangeable
-    with them with probability 1 - 2 h / (K + 1), exactly. Otherwise a truth in the gap of samples that h falls into
-    counts as the part of the gap, by its rank, that lies inside: as with an interval whose ends are drawn from the two
-    samples so that their mean ranks are h. A truth with ties counts as the part of its ranks that lies inside, so that
-    coverage is `level` of discrete data, too. (Intervals with all their ties hold more.)
+    The truth is inside if the PIT is between (1 - level) / 2 and (1 + level) / 2. Let h = (K + 1) (1 - level) / 2. If h
+    is whole, the interval is from the h-th smallest sample to the h-th largest one. These contain a truth that is
+    exchangeable with them with probability 1 - 2 h / (K + 1), exactly.
 
-    Below h = 1, which is K < 2 / (1 - level) - 1, the interval reaches beyond all samples for a part 1 - h of the time:
-    its mean is still `level` of calibrated forecasts, but it says less of others, and with K = 1 nothing.
+    Otherwise, a truth in the gap between samples that contains the end counts as the part of the gap, by its rank, that
+    is inside. This equals an interval whose ends are drawn from the two samples so that their mean ranks are h. A truth
+    with ties counts as the part of its ranks that is inside, so coverage is `level` for discrete data, too. (Intervals
+    with all their ties contain more.)
+
+    Below h = 1, for K < 2 / (1 - level) - 1, the interval extends beyond all samples with probability 1 - h. Its mean
+    is still `level` for calibrated forecasts, but it is less informative about others, and with K = 1 not at all.
 
     Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`.
-        level: between 0 and 1.
+        samples: samples `(..., K, T, D)`.
+        truth: truth `(..., T, D)`.
+        level: level between 0 and 1.
 
     Returns:
-        `(...)`, in double precision.
+        Share `(...)`, in double precision.
 
     Raises:
-        ValueError: a level that is not between 0 and 1.
+        ValueError: when the level is not between 0 and 1.
     """
     samples, truth = as_pair(samples, truth)
     end, count = _beyond(samples, level), samples.shape[-3] + 1
@@ -230,23 +233,23 @@ def coverage(samples: Array, truth: Array, level: float) -> Tensor:
 
 
 def interval_width(samples: Array, level: float) -> Tensor:
-    """Width of the central interval of `coverage`, averaged over frames and coordinates: sharpness.
+    """Return the width of the central interval of `coverage`, averaged over frames and coordinates: sharpness.
 
-    From the h-th smallest to the h-th largest of K samples, linear between them where h is not whole, and from the
-    smallest to the largest one below h = 1.
+    The interval is from the h-th smallest to the h-th largest of K samples. It is linear between samples if h is not
+    whole, and from the smallest to the largest one below h = 1.
 
     Args:
-        samples: `(..., K, T, D)`; places where they are NaN do not count.
-        level: between 0 and 1.
+        samples: samples `(..., K, T, D)`; numbers that are NaN do not count.
+        level: level between 0 and 1.
 
     Returns:
-        `(...)`, in the unit of the data.
+        Width `(...)`, in the unit of the data.
 
     Raises:
-        ValueError: a level that is not between 0 and 1.
+        ValueError: when the level is not between 0 and 1.
     """
     samples = as_samples(samples)
-    end = max(_beyond(samples, level), 1.0) - 1  # from 0
+    end = max(_beyond(samples, level), 1.0) - 1  # counted from 0
     first, ordered = int(end), samples.sort(-3).values
     spread = ordered.flip(-3) - ordered
     widths = spread[..., first, :, :]
@@ -256,24 +259,25 @@ def interval_width(samples: Array, level: float) -> Tensor:
 
 
 def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
-    """Variogram score of the coordinates of each frame; proper, lower is better (Scheuerer and Hamill 2015).
+    """Return the variogram score of the coordinates of each frame; proper, lower is better (Scheuerer and Hamill 2015).
 
-    VS = mean over frames and coordinate pairs i < j of (|y_i - y_j|^p - mean_k v_k)^2 - var_k v_k / K, where
-    v_k = |X_ki - X_kj|^p. Subtracting the variance of the mean gives the unbiased ("fair") estimate, whose expectation
-    does not depend on K, and which may be negative. With K = 1 the forecast is a point mass and nothing is subtracted.
-    The score sees wrong dependence between coordinates (limbs that do not move together), which moves the energy score
-    little, and it does not see an offset common to all coordinates. A single coordinate has no pairs and scores 0.
+    VS = mean over frames and coordinate pairs i < j of (|y_i - y_j|^p - mean_k v_k)^2 - var_k v_k / K, where v_k =
+    |X_ki - X_kj|^p. Subtracting the variance of the mean gives the unbiased ("fair") estimate, whose expectation does
+    not depend on K, and which may be negative. With K = 1 the forecast is a point mass and nothing is subtracted.
+
+    The score is sensitive to wrong dependence between coordinates (limbs that do not move together), which affects the
+    energy score little. It ignores an offset common to all coordinates. A single coordinate has no pairs and scores 0.
 
     Args:
-        samples: `(..., K, T, D)`.
-        truth: `(..., T, D)`.
-        order: the exponent p.
+        samples: samples `(..., K, T, D)`.
+        truth: truth `(..., T, D)`.
+        order: exponent p.
 
     Returns:
-        `(...)`, in the unit of the data to the power 2 p.
+        Score `(...)`, in the unit of the data to the power 2 p.
 
     Raises:
-        ValueError: an order that is not positive.
+        ValueError: when the order is not positive.
     """
     if not order > 0:
         raise ValueError(f"the order of a variogram must be positive, but is {order}")
@@ -283,17 +287,17 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     count, scores = samples.shape[-3], []
     windows = samples.reshape(-1, count, steps, size), truth.reshape(-1, steps, size)
     for x, y in zip(*(part.split(max(1, CACHED // (count * steps * size))) for part in windows), strict=True):
-        seen, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # seen by frame
+        seen, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # by frame
         missing = bool((seen < size).any())
-        # Coordinates first, so that what is subtracted lies side by side. Pairs with one of them stay in the cache,
-        # where all D * D at once would not.
+        # Coordinates first, so that subtracted values are contiguous. The pairs of one coordinate stay in the cache,
+        # all D * D pairs at once would not.
         x, y = (part.movedim(-1, 0).contiguous() for part in (x, y))
         for i in range(size - 1):
             forecast = (x[i + 1 :] - x[i]).abs_().pow_(order)
             actual = (y[i + 1 :] - y[i]).abs_().pow_(order)
             mean = forecast.mean(2)
             errors = (actual - mean).square_()
-            if count > 1:  # `Tensor.var` takes nine times as long as all else
+            if count > 1:  # `Tensor.var` takes nine times as long as everything else
                 errors -= forecast.sub_(mean.unsqueeze(2)).square_().sum(2) / (count * (count - 1))
             total = total + (torch.where(actual.isnan(), 0.0, errors) if missing else errors).sum((0, 2))
         scores.append(total / ((seen * (seen - 1)).sum(-1) // 2).clamp(min=1))
@@ -301,14 +305,14 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
 
 
 def frechet_distance(features: Array, other: Array) -> Tensor:
-    """Fréchet distance between normal fits to two sets of features: FID (Heusel et al. 2017, arXiv:1706.08500).
+    """Return the Fréchet distance of normal fits to two sets of features: FID (Heusel et al. 2017, arXiv:1706.08500).
 
-    See `gaussian_frechet_distance`; covariances are unbiased (divided by N - 1), in double precision. It is biased
-    upward in small sets, and compares distributions: it does not see which features belong to which window.
+    See `gaussian_frechet_distance`; covariances are unbiased (divided by N - 1), in double precision. The distance is
+    biased upward in small sets. It compares distributions, and ignores which features belong to which window.
 
     Args:
-        features: `(N, F)`, N at least 2.
-        other: `(M, F)`, M at least 2.
+        features: features `(N, F)`, N at least 2.
+        other: features `(M, F)`, M at least 2.
 
     Returns:
         A scalar, in the square of the features' unit.
@@ -324,22 +328,22 @@ def frechet_distance(features: Array, other: Array) -> Tensor:
 
 
 def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tensor, other_covariance: Tensor) -> Tensor:
-    """Squared Fréchet (2-Wasserstein) distance between two normal distributions (Dowson and Landau 1982).
+    """Return the squared Fréchet (2-Wasserstein) distance between two normal distributions (Dowson and Landau 1982).
 
-    |m - n|^2 + tr(C + D - 2 (C D)^1/2), where tr (C D)^1/2 is the sum of the singular values of C^1/2 D^1/2. What is
-    below the rounding error of the traces is 0.
+    |m - n|^2 + tr(C + D - 2 (C D)^1/2), where tr (C D)^1/2 is the sum of the singular values of C^1/2 D^1/2. Values
+    below the rounding error of the traces are set to 0.
 
     Args:
-        mean: `(..., F)`.
-        covariance: `(..., F, F)`, symmetric and positive semidefinite.
+        mean: mean `(..., F)`.
+        covariance: covariance `(..., F, F)`, symmetric and positive semidefinite.
         other_mean: like `mean`.
         other_covariance: like `covariance`.
 
     Returns:
-        `(...)`, in the square of the unit of the means.
+        Distance `(...)`, in the square of the unit of the means.
     """
 
-    # A root of the eigenvalues of C^1/2 D C^1/2 would turn their rounding errors of 1e-16 into 1e-8.
+    # Roots of the eigenvalues of C^1/2 D C^1/2 would turn their rounding errors of 1e-16 into 1e-8.
     def root(matrix: Tensor) -> Tensor:
         values, vectors = torch.linalg.eigh(matrix)
         return vectors * values.clamp(min=0).sqrt()[..., None, :] @ vectors.mT
@@ -352,14 +356,14 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 
 
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
-    """The Fréchet distance between features of true and generated windows, as a jackknife pseudo-value of each clip.
+    """Return the Fréchet distance between features of true and generated windows, as a jackknife pseudo-value per clip.
 
     See `jackknife_pseudo_values`.
 
     Args:
-        real: `(N, F)`, of the true futures.
-        generated: `(N, K, F)`, of the generated ones.
-        places: `(N,)`, the clip of every window, from 0 to C - 1.
+        real: features `(N, F)` of the true futures.
+        generated: features `(N, K, F)` of the generated futures.
+        places: clip of every window, from 0 to C - 1, `(N,)`.
     """
     centre = real.mean(0)  # far from 0, second moments would cancel
     sets = _moments_without_clips(real[:, None] - centre, places), _moments_without_clips(generated - centre, places)
@@ -368,17 +372,17 @@ def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tu
 
 
 def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
-    """A distance of a whole set of windows as a jackknife pseudo-value of each clip.
+    """Return the distance of a whole set of windows as a jackknife pseudo-value of each clip.
 
-    d + (1/w - 1) (d - d'), d' the distance without the clip and w the clip's share of the windows (Busing, Meijer and
-    van der Leeden 1999), moved by one constant so that their mean over windows is the distance as it is defined: the
-    mean of plain pseudo-values is one that is corrected for bias. Of a mean over windows, pseudo-values are the means
-    of the clips, so that the errors of both kinds of scores come from these alike.
+    The pseudo-value is d + (1/w - 1) (d - d'), with d' the distance without the clip and w the clip's share of the
+    windows (Busing, Meijer and van der Leeden 1999). A common constant is added so that the mean over windows is d,
+    because the mean of plain pseudo-values is corrected for bias. For a mean over windows, pseudo-values are the means
+    of the clips, so the errors of both kinds of scores are computed alike.
 
     Args:
-        whole: d.
-        without: `(C,)`, d' of each of C > 1 clips.
-        places: `(N,)`, the clip of every window.
+        whole: d, distance of the whole set.
+        without: d' of each of C > 1 clips, `(C,)`.
+        places: clip of every window, `(N,)`.
     """
     shares = places.bincount().double() / len(places)
     pseudo = whole + (1 / shares - 1) * (whole - (without if len(shares) > 1 else whole))
@@ -386,7 +390,10 @@ def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> t
 
 
 def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Means (1 + C, F) and covariances (1 + C, F, F) of (N, K, F), of all windows and without each of C > 1 clips."""
+    """Return means (1 + C, F) and covariances (1 + C, F, F) of (N, K, F).
+
+    The first is of all windows, the others without each of C > 1 clips.
+    """
 
     def sums(values: Tensor) -> Tensor:
         by_clip = values.new_zeros(int(places.max()) + 1, *values.shape[1:]).index_add_(0, places, values)
@@ -400,26 +407,29 @@ def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Te
 
 
 CACHED = 2**17
-"""Numbers that a processor's cache holds."""
+"""Number of values that fit in a processor's cache."""
 
 
 def _places(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """(..., T, D), how many samples are below the truth, and in how many ranks it may be: one, and one for each tie."""
+    """Return the number of samples below the truth, and of possible ranks: one plus one for each tie, (..., T, D)."""
     actual = truth.unsqueeze(-3)
     low, equal = (compared.sum(-3).double() for compared in (samples < actual, samples == actual))
     return low.masked_fill(truth.isnan(), torch.nan), equal + 1
 
 
 def _beyond(samples: Tensor, level: float) -> float:
-    """How many of the K + 1 ranks lie on either side of a central interval."""
+    """Return how many of the K + 1 ranks lie on either side of a central interval."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
-    found = (samples.shape[-3] + 1) * (1 - level) / 2  # of .9 and K = 19 not quite 1
+    found = (samples.shape[-3] + 1) * (1 - level) / 2  # for .9 and K = 19 not exactly 1
     return float(round(found)) if math.isclose(found, round(found)) else found
 
 
 def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
-    """A score of distances over what there is of a truth (T, D): frames that have something, 0 where they have not."""
+    """Return a score of distances restricted to the observed part of a truth (T, D).
+
+    It uses frames with observations, with 0 at missing numbers.
+    """
 
     def counted(samples: Tensor, truth: Tensor) -> Tensor:
         missing = truth.isnan()
@@ -437,9 +447,9 @@ def displacement(samples: Tensor, truth: Tensor) -> Tensor:
 
 
 def mean_pairwise_distance(samples: Tensor) -> Tensor:
-    """Mean distance over pairs of (K, T, D), each a vector of T * D numbers."""
+    """Return the mean distance over pairs of (K, T, D), each a vector of T * D numbers."""
     rows = samples.flatten(1)
-    if rows.isnan().any():  # the mean square of what both have stands for all; NaN where no two share anything
+    if rows.isnan().any():  # the mean square over common numbers is used for all; NaN if no two samples share any
         apart = [(rows[k + 1 :] - row).square().nanmean(1) for k, row in enumerate(rows[:-1])]
         return (rows.shape[1] * torch.cat(apart)).sqrt().nanmean()
     return torch.pdist(rows).mean() if len(rows) > 1 else samples.new_zeros(())

@@ -1,4 +1,4 @@
-"""Figures that a notebook shows, whether or not pyplot is imported."""
+"""Figures that a notebook displays even if pyplot is not imported."""
 
 from io import BytesIO
 
@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 
 class Picture(Figure):
-    """A matplotlib figure that shows itself as PNG."""
+    """Matplotlib figure that displays itself as PNG."""
 
     def _repr_png_(self) -> bytes:
         file = BytesIO()

@@ -24,18 +24,19 @@ import numpy as np
 from ...options import problem
 
 MODELS = "model"
-"""Marks a mapping by name of the model."""
+"""Mark of a mapping whose keys are names of models."""
 
 _Path = tuple[str, ...]
 
 
 @dataclass(frozen=True, init=False)
 class Dims:
-    """Marks an array, or a mapping to arrays.
+    """Mark of an array, or of a mapping to arrays.
 
     Args:
-        names: of the dimensions. Arrays that share one need not have the same size.
-        name: of the variable, "{0}" being the last key, "{1}" that before it. By default all fields and keys.
+        names: names of the dimensions. Arrays that share one may differ in its size.
+        name: name of the variable, where "{0}" is the last key and "{1}" the one before. By default all fields and
+            keys.
         kind: type of the numbers.
     """
 
@@ -50,11 +51,11 @@ class Dims:
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """An array of the result, or the stacked arrays of all models.
+    """Array of the result, or the stacked arrays of all models.
 
     Args:
-        dims: names of its dimensions.
-        data: the numbers.
+        dims: names of the dimensions.
+        data: values of the array.
         path: fields and keys that lead to the array, without the name of the model.
     """
 
@@ -65,13 +66,13 @@ class Variable:
 
 @dataclass(frozen=True)
 class Flat:
-    """A result as variables and attributes.
+    """Result as variables and attributes.
 
     Args:
-        variables: name to variable.
+        variables: variables by name.
         models: names of the models, in the order of the dimension "model".
-        attributes: everything else, in JSON's types. In place of an array they hold its shape.
-        sizes: dimension to the sizes of the arrays in it.
+        attributes: everything else, as JSON types. They contain the shape of each array in its place.
+        sizes: sizes of the arrays, by dimension.
     """
 
     variables: dict[str, Variable]
@@ -81,7 +82,7 @@ class Flat:
 
 
 def plain(value: Any) -> Any:
-    """Return the value in JSON's types: tuples and arrays become lists, NaN None, and infinity a text."""
+    """Return the value as JSON types: tuples and arrays become lists, NaN None, and infinity a text."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -97,7 +98,7 @@ def flatten(result: Any) -> Flat:
     """Return the variables and attributes of a dataclass.
 
     Raises:
-        TypeError: an array has other dimensions than its field declares.
+        TypeError: when an array has other dimensions than its field declares.
     """
     found: dict[_Path, dict[str | None, np.ndarray]] = {}
     marks: dict[_Path, Dims] = {}
@@ -148,10 +149,10 @@ def flatten(result: Any) -> Flat:
 
 
 def unflatten(kind: Any, record: Flat) -> Any:
-    """Return the dataclass of a kind from its variables and attributes.
+    """Return the dataclass of type `kind` from its variables and attributes.
 
     Raises:
-        TypeError, ValueError: a field is missing, or has another type or shape.
+        TypeError, ValueError: when a field is missing, or has another type or shape.
     """
     variables = {each.path: each for each in record.variables.values()}
 
@@ -199,7 +200,7 @@ def _array(shape: Any, mark: Dims, variable: Variable | None, place: int | None,
         raise ValueError(f"{said} has no numbers of dimensions {mark.names}")
     if not isinstance(shape, list) or len(shape) != len(mark.names) or not all(type(size) is int for size in shape):
         raise ValueError(f"{said} has no shape")
-    if 0 in shape and min(shape) == 0:  # lists in JSON do not tell the other sizes
+    if 0 in shape and min(shape) == 0:  # nested lists in JSON lose the other sizes
         return np.zeros(shape, mark.kind)
     data = variable.data if place is None else variable.data[place]
     if data.ndim != len(shape) or not all(0 < size <= most for size, most in zip(shape, data.shape, strict=True)):

@@ -1,4 +1,4 @@
-"""Reference forecasts of any sequences, which need no model."""
+"""Reference forecasts for any sequences, without a model."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,23 +20,23 @@ from ...options import nearest
 from .held import Held
 
 Forecaster = Callable[[slice], Tensor]
-"""Which windows to (K, B, H, D)."""
+"""Function from a slice of windows to forecasts (K, B, H, D)."""
 OF_ARRAYS = ("last value", "nearest neighbours")
 """Reference rows of windows without named columns."""
 OF_TABLES = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
-"""Reference rows of windows that name their columns."""
+"""Reference rows of windows with named columns."""
 
 _EXACT = "donot_use_mm_for_euclid_dist"
 
 
 def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
-    """The last observed frame `(B, D)`, and which of its coordinates were observed at all, None for all of them.
+    """Return the last observed frame `(B, D)`, and a mask of the coordinates that were observed at all (None: all).
 
-    Where a coordinate is missing in the last frame it is where it was last, and 0 if it was nowhere.
+    A coordinate that is missing in the last frame has its last observed value, or 0 if it was never observed.
 
     Args:
-        batch: x `(B, T, D)`, with or without a mask of it.
-        observed: O.
+        batch: batch with x `(B, T, D)`, and optionally its mask.
+        observed: O, number of observed frames.
     """
     x, mask = batch["x"][:, :observed], batch.mask()
     if mask is None:
@@ -46,22 +46,22 @@ def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
 
 
 def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: Tensor | None = None) -> Tensor:
-    """Euclidean distances `(N, M)` of `(N, D)` and `(M, D)`.
+    """Return Euclidean distances `(N, M)` between `(N, D)` and `(M, D)`.
 
-    Where coordinates are missing, the mean square over those that both have stands for all of them; two that share none
-    are infinitely far apart.
+    With missing coordinates, the mean square over the common ones is scaled to all of them. Points without a common
+    coordinate are infinitely far apart.
 
     Args:
-        first, second: the points, anything where a coordinate is missing.
-        seen, also: `(N, D)` and `(M, D)`, True where the coordinates of each were observed; None for all.
+        first, second: points, with any value at a missing coordinate.
+        seen, also: masks `(N, D)` and `(M, D)`, True where coordinates of each were observed; None for all.
     """
     if seen is None and also is None:
-        # Matrix-product distances would lose what tells poses apart that lie far from the origin, or at a threshold.
+        # Matrix-product distances would be too inexact for poses far from the origin, or at a threshold.
         return torch.cdist(first, second, compute_mode=_EXACT)
     here = torch.ones_like(first, dtype=torch.bool) if seen is None else seen
     there = torch.ones_like(second, dtype=torch.bool) if also is None else also
     ours, theirs = here.to(first), there.to(second)
-    centre = (torch.where(there, second, 0.0).sum(0) / theirs.sum(0).clamp(min=1)).double()  # or digits cancel
+    centre = (torch.where(there, second, 0.0).sum(0) / theirs.sum(0).clamp(min=1)).double()  # otherwise digits cancel
     a, b = (torch.where(m, x.double() - centre, 0.0) for m, x in ((here, first), (there, second)))
     ours, theirs = ours.double(), theirs.double()
     shared = ours @ theirs.T
@@ -74,10 +74,10 @@ def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Te
     """Repeat the last observed frame: the forecast that any method should beat.
 
     Args:
-        observed: `(B, O, D)`.
-        horizon: frames H to predict.
-        mask: `(B, O, D)`, True where a coordinate was observed; one that is missing in the last frame is where it was
-            last.
+        observed: observed frames `(B, O, D)`.
+        horizon: H, number of frames to predict.
+        mask: `(B, O, D)`, True where a coordinate was observed; one that is missing in the last frame has its last
+            observed value.
 
     Returns:
         One forecast, `(1, B, H, D)`, laid out like those of a model.
@@ -86,20 +86,20 @@ def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Te
 
 
 def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = None) -> Tensor:
-    """The last period repeated: every value is the one that was there a whole number of periods before.
+    """Repeat the last period: every value is the one a whole number of periods earlier.
 
     Args:
-        observed: `(B, O, D)`.
-        horizon: frames H to predict.
-        season: frames of a period, at most O; 1 is the last value repeated.
-        mask: `(B, O, D)`, True where a coordinate was observed. Where the last period lacks a value it is that of the
-            latest period that has it, and where all of them do, on the straight line between its neighbours in time.
+        observed: observed frames `(B, O, D)`.
+        horizon: H, number of frames to predict.
+        season: number of frames in a period, at most O; 1 repeats the last value.
+        mask: `(B, O, D)`, True where a coordinate was observed. A value that is missing in the last period comes from
+            the latest period with it, or else from linear interpolation in time.
 
     Returns:
         One forecast, `(1, B, H, D)`.
 
     Raises:
-        ValueError: a season that is not from 1 to O.
+        ValueError: when the season is not from 1 to O.
     """
     frames = observed.shape[1]
     if not 1 <= season <= frames:
@@ -113,16 +113,16 @@ def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = 
 
 
 def climatology(futures: Tensor, count: int, samples: int, seed: int = 0) -> Callable[[slice], Tensor]:
-    """Futures of training windows drawn at random: what a forecaster says who knows the data and not the past.
+    """Return a forecaster that draws futures of training windows at random, whatever the past.
 
     Args:
-        futures: `(N, H, D)`, of training windows.
-        count: of windows to forecast.
-        samples: K, draws for each of them, independent and with replacement.
-        seed: of the draws.
+        futures: futures `(N, H, D)` of training windows.
+        count: number of windows to forecast.
+        samples: K, number of draws for each of them, independent and with replacement.
+        seed: seed of the draws.
 
     Returns:
-        Which of the windows to `(K, B, H, D)`.
+        Function from a slice of the windows to `(K, B, H, D)`.
     """
     drawn = torch.randint(len(futures), (samples, count), generator=torch.Generator().manual_seed(seed))
     return lambda part: futures[drawn[:, part]]
@@ -135,20 +135,20 @@ def nearest_neighbours(
     mask: Tensor | None = None,
     training_mask: Tensor | None = None,
 ) -> Tensor:
-    """The futures of the training windows whose last observed poses are closest: memory without a model.
+    """Return the futures of the training windows whose last observed poses are closest.
 
     Args:
-        observed: `(B, O, D)`.
-        training: `(N, O + H, D)`, training windows observed for as many frames.
-        samples: K, the number of neighbours.
-        mask, training_mask: of both, True where a coordinate was observed. Poses are those of `last_places`, and the
-            gaps of futures are bridged.
+        observed: observed frames `(B, O, D)`.
+        training: training windows `(N, O + H, D)` with as many observed frames.
+        samples: K, number of neighbours.
+        mask, training_mask: masks of both, True where a coordinate was observed. Poses are from `last_places`, and
+            missing values of futures are interpolated.
 
     Returns:
         `(K, B, H, D)`, the closest neighbour first.
 
     Raises:
-        ValueError: training windows of another size or without a future, or fewer of them than K.
+        ValueError: when training windows have another size or no future, or are fewer than K.
     """
     frames, size = observed.shape[1:]
     if training.ndim != 3 or training.shape[2] != size or training.shape[1] <= frames:
@@ -172,25 +172,24 @@ class References:
     |---|---|---|
     | last value | the last frame repeated | |
     | seasonal | the last period repeated | a season that was observed |
-    | mean | of every column in the training windows, at all frames | training windows |
+    | mean | the mean of every column in the training windows, at all frames | training windows |
     | climatology | K futures of training windows, drawn at random for each window | training windows |
     | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
 
-    Windows may give names of their own to some of them: `windows.references`, {name: one of these}, which then are the
-    usual rows.
+    Windows may rename some of these in `windows.references`, {name: one of these}, which are then the default rows.
 
-    All but the last two are points: their energy score is a distance, their CRPS an absolute error, and intervals they
-    have none. Climatology is the distribution of what is forecast, by one who knows the data and not the past.
+    All but the last two are point forecasts: their energy score is a distance, their CRPS an absolute error, and they
+    have no intervals. Climatology is the distribution of futures without knowledge of the past.
 
     Args:
         held: windows to forecast.
-        samples: K.
-        seed: of draws.
-        training: what may be known.
-        season: frames of a period; by default what the windows' description says.
+        samples: K, number of forecasts.
+        seed: seed of the draws.
+        training: training windows.
+        season: number of frames in a period; by default from the windows' description.
 
     Raises:
-        ValueError: by the index: no such reference, or one that cannot be had.
+        ValueError: on indexing, when there is no such reference, or it is not available.
     """
 
     held: Held
@@ -200,10 +199,10 @@ class References:
     season: int | None = None
 
     def lacking(self, name: str) -> str:
-        """What a reference needs and has not; empty where it can be had.
+        """Return what a reference needs but is missing; empty if the reference is available.
 
         Raises:
-            ValueError: no such reference.
+            ValueError: when there is no such reference.
         """
         name = self._names.get(name, name)
         if name not in self._makers:
@@ -225,7 +224,7 @@ class References:
 
     @property
     def usual(self) -> list[str]:
-        """The rows that an evaluation shows: those of the windows, or else of their kind, where they can be had."""
+        """Default rows of an evaluation: those of the windows, or else of their kind, if available."""
         names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
         return [name for name in names if not self.lacking(name)]
 
@@ -291,7 +290,7 @@ class References:
 
     @cached_property
     def _training(self) -> tuple[Tensor, Tensor | None]:
-        """As much of training windows as those to forecast have, and its mask."""
+        """Training windows, cut to the length of those to forecast, and their mask."""
         listed, frames = self._known, self.held.x.shape[1]
         mask = listed.mask()
         return listed["x"][:, :frames], None if mask is None else mask[:, :frames]

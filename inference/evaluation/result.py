@@ -1,4 +1,4 @@
-"""What every result is: a table on a terminal, in print and in a notebook, and a file. And the bar while one waits."""
+"""Base class of results, with tables, JSON and netCDF files; progress bars."""
 
 import io
 import json
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LARGEST = 2**28
-"""Bytes of a result."""
+"""Largest size of a result file, in bytes."""
 
 
 class Table(rich.table.Table):
-    """A rich table that shows texts as they are: names of clips, labels and models hold no markup and no emoji."""
+    """Rich table that prints text literally: names of clips, labels and models contain no markup and no emoji."""
 
     def __init__(self, *, title: str = "", caption: str = "", **options: Any) -> None:
         super().__init__(**options)
@@ -48,7 +48,7 @@ class Table(rich.table.Table):
 
 
 class Plain(Console):
-    """A console that prints texts as they are: paths, names and messages hold no markup and no emoji.
+    """Console that prints text literally: paths, names and messages contain no markup and no emoji.
 
     It stops printing when the reader closes the pipe, as in `dvae evaluate RUN | head`. The command continues.
     """
@@ -76,33 +76,33 @@ def _as_it_is(cell: Any) -> Any:
 
 
 def _shown(text: str) -> str:
-    """The text, which cannot command the terminal: rich drops the other control characters."""
+    """Return the text with escape characters made visible; rich drops the other control characters."""
     return text.replace("\x1b", r"\x1b")
 
 
 def reason(error: BaseException) -> str:
-    """What an error says, without the table of shapes that Pyro appends where it passes a program."""
+    """Return the message of an error, without the table of shapes that Pyro appends."""
     return SHAPES.sub("", str(error))
 
 
 def canvas(width: float, height: float) -> "Figure":
-    """An empty figure, in inches; matplotlib is imported by whoever draws."""
+    """Return an empty figure with a size in inches; matplotlib is imported only on use."""
     from .picture import Picture
 
     return Picture(figsize=(width, height), layout="constrained")
 
 
 def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:
-    """Have matplotlib draw texts as they are: dollar signs in a name enclose no formula."""
+    """Make matplotlib draw texts literally: dollar signs in a name enclose no formula."""
     for text in texts:
         text.set_parse_math(False)
 
 
 class Shown:
-    """What has a `table` shows itself as that, in a terminal and in a notebook."""
+    """Base class that displays its `table` in a terminal and in a notebook."""
 
     def table(self) -> RenderableType:
-        """Everything that matters, with its uncertainty."""
+        """Return the main values with their uncertainty."""
         raise NotImplementedError
 
     def __rich__(self) -> RenderableType:
@@ -126,13 +126,13 @@ class Shown:
 
 
 class Result(Shown):
-    """Numbers with named dimensions, and the settings they were measured with.
+    """Numbers with named dimensions, and the settings of their measurement.
 
     A subclass is a dataclass. `record.Dims` marks its arrays; `dataset`, JSON and netCDF follow from these marks.
     """
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of the table in JSON's types, for readers of the file without this library."""
+        """Return the numbers of the table as JSON types, for readers of the file without this library."""
         return {}
 
     def labels(self) -> dict[str, Sequence[str]]:
@@ -143,12 +143,12 @@ class Result(Shown):
         """Refuse fields that contradict each other, as in an altered file.
 
         Raises:
-            ValueError: they do; the message names them.
+            ValueError: naming the fields.
         """
 
     @property
     def extents(self) -> Mapping[str, set[int]]:
-        """Sizes of the arrays by dimension; more than one where arrays differ in it."""
+        """Sizes of the arrays by dimension; several if arrays differ in it."""
         return flatten(self).sizes
 
     @property
@@ -168,7 +168,7 @@ class Result(Shown):
         )
 
     def document(self) -> dict[str, Any]:
-        """Return everything in JSON's types: a summary, variables with their dimensions, and all attributes."""
+        """Return everything as JSON types: a summary, variables with their dimensions, and all attributes."""
         found = flatten(self)
         return {
             "kind": type(self).__name__,
@@ -186,7 +186,7 @@ class Result(Shown):
         """Return the result from its `document`.
 
         Raises:
-            ValueError: the document is not one of this kind of result.
+            ValueError: when the document is not of this kind of result.
         """
         try:
             if document["kind"] != cls.__name__:
@@ -202,7 +202,7 @@ class Result(Shown):
         return found
 
     def to_json(self) -> str:
-        """`document` as text."""
+        """Return `document` as text."""
         return json.dumps(self.document(), allow_nan=False)
 
     @classmethod
@@ -210,7 +210,7 @@ class Result(Shown):
         """Return the result that `to_json` wrote.
 
         Raises:
-            ValueError: the text is not such a document.
+            ValueError: when the text is not such a document.
         """
         try:
             document = json.loads(text)
@@ -219,10 +219,10 @@ class Result(Shown):
         return cls.of(document)
 
     def save(self, path: str | Path) -> None:
-        """Write `to_json()` to a file, which replaces an older one once it is whole.
+        """Write `to_json()` to a file, which replaces an older one only when it is complete.
 
         Raises:
-            OSError, ValueError: it cannot be written.
+            OSError, ValueError: when it cannot be written.
         """
         with files.written(path) as file:
             file.write((self.to_json() + "\n").encode())
@@ -232,7 +232,7 @@ class Result(Shown):
         """Read the file that `save` wrote.
 
         Raises:
-            OSError, ValueError: there is no such file, or it is no plain one, or no result of this kind.
+            OSError, ValueError: when the file is missing, no plain file, or no result of this kind.
         """
         return cls.from_json(files.read(path, LARGEST, links=True).decode())
 
@@ -240,7 +240,7 @@ class Result(Shown):
         """Write `dataset` for other tools, with its attributes as JSON.
 
         Raises:
-            OSError, ValueError: it cannot be written.
+            OSError, ValueError: when it cannot be written.
         """
         found = self.dataset
         found.attrs = {name: json.dumps(value) for name, value in found.attrs.items()}
@@ -249,11 +249,11 @@ class Result(Shown):
 
 
 def progress_bar(shown: bool) -> Progress:
-    """A bar that goes when the work is done; hidden where nobody would see it move (notebooks need ipywidgets)."""
+    """Return a progress bar that disappears at the end; hidden where it cannot move (notebooks need ipywidgets)."""
     console = Console()
     moves = find_spec("ipywidgets") is not None if console.is_jupyter else console.is_terminal
     return Progress(
-        TextColumn("{task.description}", "progress.description", markup=False),  # it may be the name of a model
+        TextColumn("{task.description}", "progress.description", markup=False),  # may contain the name of a model
         *Progress.get_default_columns()[1:],
         transient=True,
         console=console,

@@ -1,15 +1,15 @@
-"""Scores of forecasts as small objects, for any sequences; an application adds its own to those here.
+"""Scores of forecasts as small objects, for any sequences; an application adds its own.
 
-A `Measure` is a function of forecasts and truth with a name, a unit and the direction that is better. A set of them is
-a function of the windows that are evaluated on:
+A `Measure` is a function of forecasts and truth with a name, a unit and the direction that is better. A set of scores
+is a function of the evaluated windows:
 
     speed = Measure("speed error", lambda forecasts, truth, past, index: ..., unit="m/s")
     dvae.evaluate(model, windows, scores=lambda windows: [*proper(windows), speed])
 
-`proper` are proper scoring rules, and `calibrated` adds coverage, sharpness, PIT and TARP: what there is to know of
-forecasts of any data. `by_column` has a score of every column alone, in its own unit, `by_frame` one of some frames,
-and `over_horizon` calibration at these. What a model explains (bound, importance bound, k-hat, KL, log score) needs the
-model and no forecasts; `dvae.evaluate` has options for it.
+`proper` returns proper scoring rules, and `calibrated` adds coverage, sharpness, PIT and TARP, for data of any kind.
+`by_column` scores every column alone, in its own unit, `by_frame` scores some frames, and `over_horizon` assesses
+calibration at these. Bounds, k-hat, KL and the log score need the model instead of forecasts; `dvae.evaluate` has
+options for them.
 """
 
 import math
@@ -29,13 +29,13 @@ from . import metrics
 
 @dataclass(frozen=True)
 class Metric:
-    """How a score is to be read.
+    """Description of how to read a score.
 
     Args:
-        unit: of the score.
+        unit: unit of the score.
         program: "free-running" or "teacher-forced".
         better: "lower", "higher", or "" for neither.
-        partial: it is NaN of clips of which it says nothing, and they are left out.
+        partial: whether the score is NaN for some clips, which are then omitted.
     """
 
     unit: str = ""
@@ -54,11 +54,11 @@ KL = Metric("nats/frame", "teacher-forced", "")
 
 
 def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
-    """Means over the windows of each clip.
+    """Return means over the windows of each clip.
 
     Args:
-        values: `(N, ...)`, the score of every window.
-        clips: `(N,)`, the clip of every window, from 0 to C - 1.
+        values: score of every window, `(N, ...)`.
+        clips: clip of every window, from 0 to C - 1, `(N,)`.
     """
     places = clips.numpy()
     found: list[Any] = (_sums(values.double().numpy(), places).T / np.bincount(places)).T.tolist()
@@ -66,11 +66,11 @@ def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
 
 
 def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
-    """Of scores that are NaN of windows that do not count: the mean over windows is that over those that do.
+    """Return clip values of a score that is NaN for some windows; their mean is that over the other windows.
 
-    R + N / M (s_c - R m_c) / n_c for each clip, s_c the sum over those m_c of its n_c windows that count, M of all N,
-    and R the mean over these M: a ratio of sums, linearised, so that errors are those of a ratio (Cochran 1977). NaN of
-    all clips where no window counts.
+    The value of a clip is R + N / M (s_c - R m_c) / n_c. Here s_c is the sum over the m_c of its n_c windows with a
+    score, M the number of all such windows among N, and R the mean over these M. This is a linearised ratio of sums, so
+    its errors are those of a ratio (Cochran 1977). All clips are NaN if no window has a score.
     """
     places, known = clips.numpy(), ~values.isnan().numpy()
     if not known.any():
@@ -83,34 +83,34 @@ def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
 
 
 def _sums(values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """(C, ...), of values (N, ...) over the windows of each clip."""
+    """Return sums (C, ...) of values (N, ...) over the windows of each clip."""
     columns = values.reshape(len(values), -1).T
     return np.stack([np.bincount(places, weights=each) for each in columns], -1).reshape(-1, *values.shape[1:])
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A score of free-running forecasts.
+    """Score of free-running forecasts.
 
     Args:
-        name: of the score.
-        function: of forecasts `(B, K, H, D)`, true futures `(B, H, D)`, NaN where they were not observed, the past (x
-            `(B, O, D)`, its mask if there is one, and context) and the places `(B,)` of these windows among all, to the
-            score `(B,)`, on the CPU.
+        name: name of the score.
+        function: function of forecasts `(B, K, H, D)`, true futures `(B, H, D)` with NaN where they were not observed,
+            the past (x `(B, O, D)`, its mask if there is one, and context) and the indices `(B,)` of these windows
+            among all; it returns the score `(B,)`, on the CPU.
         unit, better, partial: see `Metric`.
-        pool: from what `function` gave of all windows, `(N, ...)`, and the clip of each, to a value for each clip, of
-            which the score is the mean weighted by windows. A score of the whole set gives pseudo-values, a histogram
+        pool: function of the scores of all windows, `(N, ...)`, and the clip of each; it returns a value for each clip,
+            whose mean weighted by windows is the score. A score of the whole set returns pseudo-values, a histogram
             lists of shares.
         headline: whether a comparison shows it in its table.
-        truth: name of a reference row that forecasts the true futures, where these are needed to read the score.
-        note: a line below the table.
-        basis: what the score rests on, by name, for the record, in JSON's types.
-        bins: 0 of a score; of a histogram, which is in `Row.histograms` and in no table, the number of its bins, and
-            `function` gives shares `(B, bins)`.
-        least: forecasts of a window that it needs; rows with fewer, such as points, are left without it.
-        of_draws: whether it scores the distribution of the data. A note says so where forecasts are means.
-        of_means: whether it is published for means of the emission. Forecasts are then means
-            by default; otherwise they are draws.
+        truth: name of a reference row that forecasts the true futures, if the score needs it as a comparison.
+        note: line below the table.
+        basis: requirements of the score by name, such as a seed, as JSON types, for the result.
+        bins: 0 for a score; for a histogram, the number of its bins. A histogram is in `Row.histograms` and in no
+            table, and `function` returns shares `(B, bins)`.
+        least: fewest forecasts of a window for this score; rows with fewer, such as point forecasts, omit it.
+        of_draws: whether it scores the distribution of the data; a note warns if forecasts are means.
+        of_means: whether it is published for means of the emission. Forecasts are then means by default; otherwise they
+            are draws.
     """
 
     name: str
@@ -130,12 +130,12 @@ class Measure:
 
     @property
     def metric(self) -> Metric:
-        """How it is to be read."""
+        """Description of how to read the score."""
         return Metric(self.unit, "free-running", self.better, self.partial)
 
 
 def paired(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor, Batch, Tensor], Tensor]:
-    """The function of a measure from a score of samples `(..., K, T, D)` and truth `(..., T, D)`, as in `metrics`."""
+    """Return a measure's function from a score of samples `(..., K, T, D)` and truth `(..., T, D)`, as in `metrics`."""
     return lambda forecasts, truth, past, index: score(forecasts, truth)
 
 
@@ -145,10 +145,10 @@ CRPS = Measure("CRPS", paired(metrics.continuous_ranked_probability_score), head
 
 
 def proper(windows: HeldOutWindows) -> list[Measure]:
-    """Proper scoring rules: of the future as one vector, of dependence between coordinates, of each number alone.
+    """Return proper scoring rules of the whole future, of dependence between coordinates, and of single numbers.
 
-    In the unit of the columns, if windows name them and they share one; else, where windows tell the scales of columns,
-    of numbers in these, which have no unit. A single column has no dependence to score.
+    If the windows name columns that share a unit, scores are in this unit. If the windows define the scales of columns,
+    scores are of scaled numbers without a unit. A single column has no dependence to score.
     """
     columns = columns_of(windows)
     alone = (len(columns) or windows.all()["x"].shape[-1]) == 1
@@ -156,7 +156,7 @@ def proper(windows: HeldOutWindows) -> list[Measure]:
 
 
 def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
-    """A score in the unit of the data, of all columns together."""
+    """Return the score of all columns together, in the unit of the data."""
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
         note = "scores of all columns together are of numbers in the scales of their columns, in the training data"
@@ -179,7 +179,7 @@ def _in_scales(
 
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
-"""Of the intervals whose coverage is scored."""
+"""Levels of the intervals whose coverage is scored."""
 _CALIBRATED: dict[str, Any] = {
     "better": "",
     "of_draws": True,
@@ -189,13 +189,13 @@ _CALIBRATED: dict[str, Any] = {
 
 
 def coverage_at(level: float) -> Measure:
-    """Coverage of the central interval of a level (`metrics.coverage`), of as many forecasts as reach around it."""
+    """Return the coverage of the central interval of a level (`metrics.coverage`)."""
     function = paired(partial(metrics.coverage, level=level))
     return Measure(f"coverage {100 * level:g} %", function, "share", **_CALIBRATED, least=reaching(level))
 
 
 def width_at(level: float) -> Measure:
-    """Width of the central interval of a level (`metrics.interval_width`), where there is a truth."""
+    """Return the width of the central interval of a level (`metrics.interval_width`), at observed numbers."""
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return metrics.interval_width(forecasts.masked_fill(truth[:, None].isnan(), torch.nan), level)
@@ -204,7 +204,7 @@ def width_at(level: float) -> Measure:
 
 
 def reaching(level: float) -> int:
-    """The fewest samples of which some lie beyond a central interval of this level."""
+    """Return the fewest samples of which some lie outside a central interval of this level."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
     return math.ceil(round(2 / (1 - level) - 1, 9))
@@ -219,22 +219,21 @@ PIT_VARIANCE = Measure("PIT variance", paired(metrics.pit_variance), "1/12", **_
 
 
 def calibrated(windows: HeldOutWindows) -> list[Measure]:
-    """Proper scores, and whether forecasts are calibrated and how sharp they are, for any data.
+    """Return proper scores, and scores of calibration and sharpness, for data of any kind.
 
-    Coverage at 50, 80, 90 and 95 %, width of the intervals of 90 %, mean and variance of the PIT, and the histograms of
-    PIT and TARP, for `Evaluation.plot_calibration`. Coverage at 95 % needs 39 forecasts of a window.
+    They are coverage at 50, 80, 90 and 95 %, width of the 90 % intervals, mean and variance of the PIT, and the
+    histograms of PIT and TARP, for `Evaluation.plot_calibration`. Coverage at 95 % needs 39 forecasts of a window.
     """
     width = _of_all(width_at(0.9), windows)
     return [*proper(windows), *map(coverage_at, LEVELS), width, PIT_MEAN, PIT_VARIANCE, PIT, tarp(windows)]
 
 
 def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
-    """TARP of whole futures (`metrics.tarp_histogram`), one number of a window, as a histogram.
+    """Return TARP of whole futures (`metrics.tarp_histogram`), one number per window, as a histogram.
 
-    The point of a window is its last observed frame (or where each number was last seen), repeated, with a normal step
-    away from it at every frame and number, drawn from `seed`: it depends on the past and on no forecast, so that
-    forecasts which do not heed the past are told too. Steps and distances are in standard deviations of each column's
-    observed frames.
+    The reference point of a window repeats its last observed frame (or last observed values), with a normal step added
+    at every frame and number, drawn from `seed`. It depends on the past and on no forecast, so the score also detects
+    forecasts that ignore the past. Steps and distances are in standard deviations of each column's observed frames.
     """
     batch, observed = Batch(windows.all()), windows.protocol.observed
     past = batch.mask_to_nan()[:, :observed].double()
@@ -249,21 +248,21 @@ def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return metrics.tarp_histogram(forecasts / scale, truth / scale, points[index], BINS)
 
-    told = {"TARP": {"numbers": 1, "seed": seed}}  # of a window
+    told = {"TARP": {"numbers": 1, "seed": seed}}  # numbers per window
     return Measure("TARP", function, "share", **_CALIBRATED, bins=BINS, least=BINS - 1, basis=told)
 
 
 def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
-    """A score of every column alone, named "CRPS, speed", in the column's unit where the score's is that of the data.
+    """Return a score of every column alone, named "CRPS, speed".
 
     Args:
-        measure: of forecasts of any number of columns, whose unit is "" or that of the data, such as `CRPS` or
-            `width_at(0.9)`; one in a unit of its own, such as a share, keeps it.
-        columns: {name: unit} of all columns, in the order of the data, "" for none; windows that name theirs have them
-            as `description["columns"]`.
+        measure: score for any number of columns, such as `CRPS` or `width_at(0.9)`. If its unit is "", the column's
+            unit replaces it; another unit, such as a share, stays.
+        columns: {name: unit} of all columns, in the order of the data, "" for no unit; windows with named columns have
+            them as `description["columns"]`.
 
     Raises:
-        ValueError: other columns than forecasts have.
+        ValueError: when the number of columns differs from that of the forecasts.
 
     Example:
         >>> [each.name for each in by_column(CRPS, {"speed": "m/s", "load": "kN"})]
@@ -289,15 +288,15 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
 
 
 def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> list[Measure]:
-    """A score at some frames of the future alone, named "PIT, frame 30"; `Evaluation.plot_horizon` draws them.
+    """Return a score at some single frames of the future, named "PIT, frame 30", for `Evaluation.plot_horizon`.
 
     Args:
-        measure: of forecasts of any number of frames.
-        frames: which, the first of the future being 1.
-        frame: what one is called.
+        measure: score for any number of frames.
+        frames: frames to score; the first of the future is 1.
+        frame: word for a frame.
 
     Raises:
-        ValueError: a frame beyond the future.
+        ValueError: when a frame is beyond the future.
 
     Example:
         >>> [each.name for each in by_frame(CRPS, (1, 30))]
@@ -318,7 +317,7 @@ def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> l
 def _part(
     measure: Measure, function: Callable[[Tensor, Tensor, Batch, Tensor], Tensor], part: Callable[[Tensor], Tensor]
 ) -> Measure:
-    """A score of a part of the future, of those windows of which something of it was observed."""
+    """Return a score of a part of the future, for the windows where some of this part was observed."""
 
     def known(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         found = function(forecasts, truth, past, index)
@@ -330,11 +329,11 @@ def _part(
 
 
 def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -> list[Measure]:
-    """Whether forecasts are calibrated, as a whole and at some frames of the future alone; see `calibrated`.
+    """Return scores of calibration of the whole future and of single frames; see `calibrated`.
 
     Args:
-        windows: that are evaluated on.
-        frames: which frames of the future, from 1; by default six, evenly spread from the first to the last.
+        windows: evaluated windows.
+        frames: frames of the future, from 1; by default six, evenly spread from the first to the last.
     """
     horizon = windows.all()["x"].shape[1] - windows.protocol.observed
     frames = frames or sorted({round(place) for place in np.linspace(1, horizon, 6)})
@@ -344,4 +343,4 @@ def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -
 
 
 Scores = Callable[[HeldOutWindows], Sequence[Measure]]
-"""A set of scores: from the windows that are evaluated on, whose order its measures may know, to the measures."""
+"""Function from the evaluated windows to the measures, which may depend on the windows and their order."""

@@ -1,4 +1,4 @@
-"""Run directories: weights, the state that training resumes from, and what was run.
+"""Run directories: weights, the state for resuming training, and a description of the run.
 
     config.json        what was run: method, schema, data, training options
     best.safetensors   weights at the best unweighted validation bound (absent without validation data)
@@ -6,12 +6,11 @@
     last.state.safetensors  optimiser, random number generators and the state of an objective
     state.json         step, best step and bound, status, and the SHA-256 of the three files above
 
-`state.json` is the commit record. New files are first written whole under a temporary name, then `state.json`
-is replaced, then they take their names; whenever a run is killed, the files that match `state.json` are on
-the disk.
+`state.json` is the commit record. New files are first written completely under a temporary name, then `state.json` is
+replaced, then they are renamed. If a run is killed at any time, the files that match `state.json` are on the disk.
 
-The directory may come from anybody. Its files are opened as `files` does, never through a link, and read up to the size
-that the model gives them.
+The directory may come from an untrusted source. Its files are opened as in `files`, never through a link, and read only
+up to the size that the model implies.
 """
 
 import hashlib
@@ -38,21 +37,21 @@ from ... import files
 
 try:
     import fcntl
-except ImportError:  # no locks on Windows
+except ImportError:  # no file locks on Windows
     fcntl = None  # type: ignore[assignment]
 
 BEST, LAST, OPTIMISER = "best.safetensors", "last.safetensors", "last.state.safetensors"
 STATE, CONFIG, LOCK = "state.json", "config.json", ".lock"
 LARGEST_TEXT = 2**24
-"""Bytes of `config.json` and `state.json`."""
+"""Largest size of `config.json` and `state.json`, in bytes."""
 LARGEST_WEIGHTS = 2**32
-"""Bytes of a model's weights."""
+"""Largest size of a model's weights, in bytes."""
 
 OPTIMISERS = ("adam", "adamw", "sgd")
 ENDED: tuple[str, ...] = ("finished", "stopped early")
 STATUSES: tuple[str, ...] = ("running", *ENDED, "interrupted", "failed")
 
-# what state.json holds of a run, and what makes a value of it sound
+# fields of state.json, each with a test of its value and a description of valid values
 _NUMBER = "a whole number from 0"
 _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "step": (lambda value: _count(value), _NUMBER),
@@ -75,7 +74,7 @@ class CheckpointError(RuntimeError):
 
 
 class Run:
-    """A run directory.
+    """Run directory.
 
     Args:
         path: the directory; it need not exist before the first `write_config` or `commit`.
@@ -96,7 +95,7 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """What was run."""
+        """Description of the run."""
         return self._json(CONFIG)
 
     @property
@@ -104,7 +103,7 @@ class Run:
         """Step, best step and bound, status, and the fingerprints of the checkpoint's files.
 
         Raises:
-            CheckpointError: when the file is missing, damaged, or leaves a file of the checkpoint unverified.
+            CheckpointError: when the file is missing or damaged, or has no fingerprint of a file of the checkpoint.
         """
         state = self._json(STATE)
         fingerprints = state.get("fingerprints")
@@ -127,10 +126,10 @@ class Run:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the directory for one process, which writes to it; the lock goes with the process, however it ends.
+        """Lock the directory for one process that writes to it; the lock is released when the process ends.
 
         Raises:
-            CheckpointError: when another process holds it.
+            CheckpointError: when another process has locked it.
         """
         with files.made(self.path), self._opened_lock() as file:
             if fcntl is not None:
@@ -153,7 +152,7 @@ class Run:
             return files.open_plain(self.path / LOCK, os.O_RDWR | os.O_CREAT)
 
     def _write_new(self, name: str, content: bytes) -> None:
-        """Write a file under the name that it has until it is whole."""
+        """Write a file under its temporary name."""
         with files.naming(self.path / name, self.path / f"{name}.new"):
             files.write(self.path / f"{name}.new", content)
 
@@ -161,7 +160,7 @@ class Run:
         """Write `config.json`.
 
         Raises:
-            TypeError: when the config is not made of JSON's types.
+            TypeError: when the config contains other than JSON types.
         """
         content = json.dumps(config, indent=2).encode()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -169,7 +168,7 @@ class Run:
         os.replace(self.path / f"{CONFIG}.new", self.path / CONFIG)
 
     def commit(self, state: Mapping[str, Any], contents: Mapping[str, bytes]) -> None:
-        """Replace files by `contents`, and `state.json` with them; files of earlier commits that are not given stay."""
+        """Replace files by `contents`, and `state.json` with them; other files of earlier commits stay."""
         self.path.mkdir(parents=True, exist_ok=True)
         fingerprints = self.state["fingerprints"] if self.exists else {}
         for name in fingerprints:
@@ -181,14 +180,14 @@ class Run:
         os.replace(self.path / f"{STATE}.new", self.path / STATE)
         for name in contents:
             os.replace(self.path / f"{name}.new", self.path / name)
-        for name in {BEST, LAST, OPTIMISER} - contents.keys():  # of a process that was killed while it wrote one
+        for name in {BEST, LAST, OPTIMISER} - contents.keys():  # left by a process that was killed while writing
             (self.path / f"{name}.new").unlink(missing_ok=True)
 
     def read(self, name: str, most: int = LARGEST_WEIGHTS) -> bytes:
-        """Return a file of the checkpoint, of at most so many bytes, after checking its fingerprint.
+        """Return a file of the checkpoint, of at most `most` bytes, after checking its fingerprint.
 
         Raises:
-            CheckpointError: when the file is missing, no plain file, too large, or is not the one that was written.
+            CheckpointError: when the file is missing, no plain file, too large, or its fingerprint differs.
         """
         expected = self.state["fingerprints"].get(name)
         if expected is None:
@@ -206,7 +205,7 @@ class Run:
         return content
 
     def size(self) -> int:
-        """Bytes of the weights that `load_weights` takes.
+        """Return the size in bytes of the weights that `load_weights` reads.
 
         Raises:
             CheckpointError: when there are none.
@@ -229,7 +228,7 @@ class Run:
         return _tensors(self.read(OPTIMISER, most), self.path / OPTIMISER)
 
     def _settle(self, name: str, expected: str, most: int = LARGEST_WEIGHTS) -> None:
-        """Give a committed file its name, if the process was killed between the commit and the renaming."""
+        """Rename a committed file if the process was killed between commit and renaming."""
         new = self.path / f"{name}.new"
         content = _content(new, most)
         if content is not None and hashlib.sha256(content).hexdigest() == expected:
@@ -270,15 +269,15 @@ def save_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
 
 
 def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
-    """Load weights into a model, in place; the names and shapes must agree exactly.
+    """Load weights into a model, in place; the names and shapes must match exactly.
 
     Args:
-        model: the module to fill.
-        path: a run directory (its best weights, or the last without validation data) or a safetensors file;
-            in a run directory, fingerprints are checked.
+        model: module to load into.
+        path: a run directory (its best weights, or the last without validation data) or a safetensors file; in a run
+            directory, fingerprints are checked.
 
     Raises:
-        CheckpointError: when the file is missing, damaged, of another model, or holds a number that is not finite.
+        CheckpointError: when the file is missing, damaged or of another model, or contains a number that is not finite.
     """
     path = Path(path)
     most = state_bytes(model)
@@ -295,10 +294,10 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
 
 
 def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tensor]:
-    """The weights that a safetensors file of this path holds, which are a model's in names, shapes and kinds.
+    """Return the weights in the content of a safetensors file, after a check of names, shapes and types.
 
     Raises:
-        CheckpointError: when they are not, or one is not finite.
+        CheckpointError: when they do not match the model, or a weight is not finite.
     """
     tensors = _tensors(content, path)
     _check_names_and_shapes(model, tensors, path)
@@ -317,25 +316,25 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
 def _tensors(content: bytes, path: Path) -> dict[str, Tensor]:
     try:
         return load_tensors(content)
-    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for types it has none for
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for unknown types
         raise CheckpointError(f"{path} is damaged or no safetensors file ({error}); copy or fit it again") from error
 
 
 def state_bytes(model: nn.Module, copies: int = 1) -> int:
-    """Bytes that so many copies of a model's weights can take in a file, in any floating type, with their names."""
+    """Return an upper limit on the file size of copies of a model's weights with names, in any floating type."""
     state = model.state_dict()
     return copies * sum(8 * value.numel() + 1024 + 4 * len(name) for name, value in state.items()) + 2**16
 
 
 @contextmanager
 def at_most(size: int, what: str) -> Iterator[None]:
-    """Within it, this thread makes no modules whose parameters and buffers outnumber the bytes of a file of weights.
+    """Prevent this thread from building modules with more parameters and buffers than `size` allows.
 
-    A file of weights tells how large the model is that it is of. What is shared or made anew counts several times; a
-    number takes four bytes in a file, or two.
+    The size in bytes of a file of weights limits the size of its model. Shared and rebuilt tensors count several times,
+    but a number takes four bytes in a file, or two.
 
     Raises:
-        CheckpointError: when they do.
+        CheckpointError: when the limit is exceeded.
     """
     if size > LARGEST_WEIGHTS:
         raise CheckpointError(f"{what} has {size} bytes of weights, and can have {LARGEST_WEIGHTS} at most")
@@ -389,7 +388,7 @@ def _count(value: Any) -> bool:
 
 
 def _depth(value: Any) -> int:
-    """How deep lists and objects nest."""
+    """Return the nesting depth of lists and objects."""
     depth, level = 0, [value]
     while level := [each for each in level if isinstance(each, dict | list)]:
         depth += 1
@@ -398,7 +397,7 @@ def _depth(value: Any) -> int:
 
 
 def _content(path: Path, most: int, links: bool = False) -> bytes | None:
-    """What a file holds; None if there is none."""
+    """Return the content of a file; None if there is none."""
     try:
         with _refusing():
             return files.read(path, most, links)
@@ -408,7 +407,7 @@ def _content(path: Path, most: int, links: bool = False) -> bytes | None:
 
 @contextmanager
 def _refusing() -> Iterator[None]:
-    """What is no plain file, or too large, is no part of a checkpoint."""
+    """Raise `CheckpointError` for a file that is not a plain file, or too large."""
     try:
         yield
     except files.FileRefused as error:

@@ -1,7 +1,7 @@
-"""The shared loop, for every method: batches, validations, checkpoints and a log, until the last step.
+"""The training loop of every method: batches, validations, checkpoints and a log.
 
-`fit` is written with the steps of `SVI`, and nothing else moves the weights. Whatever a step depends on is in a
-checkpoint: a resumed run repeats, bit for bit on a CPU, what the uninterrupted run would have done.
+`fit` is written with the steps of `SVI`; no other code changes the weights. A checkpoint contains everything that a
+step depends on. On a CPU, a resumed run therefore repeats the uninterrupted run bit for bit.
 """
 
 import os
@@ -42,39 +42,39 @@ if TYPE_CHECKING:
 
 
 class Callback:
-    """Hooks of `fit`. Subclass it and define those you need; numbers by name that one returns are a row of the log."""
+    """Hooks of `fit`. Subclass it and define those you need; a returned dict of numbers becomes a row of the log."""
 
     def on_step(self, state: State) -> Mapping[str, float] | None:
-        """Run after each step; `state.terms` holds the terms of its batch."""
+        """Run after each step; `state.terms` contains the terms of its batch."""
         return None
 
     def on_validation(self, state: State) -> Mapping[str, float] | None:
-        """Run after each validation; `state.row` holds its numbers."""
+        """Run after each validation; `state.row` contains its numbers."""
         return None
 
     def on_end(self, state: State) -> Mapping[str, float] | None:
-        """Run once after the last step, also of an interrupted run, before the best weights are put back."""
+        """Run once after the last step, even after an interruption, before the best weights are restored."""
         return None
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What a run leaves.
+    """Result of a run.
 
     Args:
-        history: the rows of the log, in nats per frame (see `trackers`).
-        step: the last step.
-        best_step: the step of the best unweighted validation bound; None without validation data.
-        best_bound: that bound, in nats per frame; of the self-fed program in a run with scheduled sampling. For a model
-            without a likelihood, minus its objective.
+        history: rows of the log, in nats per frame (see `trackers`).
+        step: last step.
+        best_step: step of the best unweighted validation bound; None without validation data.
+        best_bound: best validation bound, in nats per frame; with scheduled sampling, of the program that reads its own
+            output; for a model without a likelihood, minus its objective.
         status: "finished", "stopped early" or "interrupted".
-        run: the run directory, if there is one.
-        per: what bounds are per: a frame, unless the model has another word in `per`.
-        model: what was fitted, with the best weights; None where only the log of a run was read.
-        processor_seconds: of all threads of the first process, validation and checkpoints included; of a resumed run in
-            all.
-        last_value: the bound of repeating the last value on the validation windows, to be compared with `best_bound`
-            (see `last_value`); None where these have no horizon, or the model has no likelihood of the data as given.
+        run: run directory, or None.
+        per: unit that bounds are divided by: a frame, unless the model's `per` names another.
+        model: fitted model with the best weights; None if only the log of a run was read.
+        processor_seconds: processor time of all threads of the first process, with validation and checkpoints; of a
+            resumed run, the total.
+        last_value: bound of repeating the last value on the validation windows, for comparison with `best_bound` (see
+            `last_value`); None if the windows have no horizon, or the model has no likelihood of the data as given.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -96,7 +96,10 @@ class Fit:
 
     @property
     def best(self) -> str:
-        """What is best, where, in words, and whether the last value is better; empty without validation data."""
+        """Best value and its step in words; empty without validation data.
+
+        If repeating the last value is better, the text gives advice.
+        """
         if self.best_bound is None:
             return ""
         if any("validation/loss" in row for row in self.history):
@@ -121,7 +124,7 @@ class Fit:
     def plot(self) -> "Figure":
         """Draw the learning curves: the bound, and the KL of each latent, in nats per frame.
 
-        Of a model without a likelihood, the loss and its energies, per frame.
+        For a model without a likelihood, draw the loss and its energies, per frame.
         """
         from matplotlib import pyplot as plt
 
@@ -142,15 +145,15 @@ class Fit:
                 as_they_are(terms.legend().get_texts())
         terms.set(xlabel="step", ylabel="KL (nats per frame)" if likelihood else "energies (per frame)")
         if not likelihood:
-            terms.set_yscale("log")  # their scales differ by orders of magnitude; weights make up for it
+            terms.set_yscale("log")  # scales of energies differ by orders of magnitude, which weights compensate
         return figure
 
 
 class Interrupted(KeyboardInterrupt):
-    """The run was stopped by Ctrl-C or SIGTERM, after a whole step and a checkpoint.
+    """The run was stopped by Ctrl-C or SIGTERM, after a complete step and a checkpoint.
 
     Args:
-        fit: what the run leaves.
+        fit: result of the run.
         signal: number of the signal; a command line exits with 128 + signal.
     """
 
@@ -165,7 +168,7 @@ class Interrupted(KeyboardInterrupt):
         self.signal = signal
 
 
-@torch.inference_mode(False)  # which enables gradients too
+@torch.inference_mode(False)  # also enables gradients
 def fit(
     model: nn.Module | Trainable,
     data: Any,
@@ -182,43 +185,45 @@ def fit(
 ) -> Fit:
     """Fit a model and its guide, or build and fit a method.
 
-    Afterwards the model is in evaluation mode and holds the weights of the best unweighted validation bound,
-    or without validation data the last ones. The caller's random state is left as it was. Threads take turns, as Pyro's
-    handlers and torch's random state are the process's: another fit or forecast waits for a step of this one.
+    Afterwards the model is in evaluation mode. It has the weights of the best unweighted validation bound, or the last
+    weights without validation data. The caller's random state is restored. Threads share Pyro's handlers and torch's
+    random state, so another fit or forecast waits until the current step is done.
 
     Args:
-        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes; or a method, such as `dvae.method("srnn")`,
-            whose model is built for the data and trained by its recipe, with its own defaults of `Training`.
-        data: x as a tensor (N, T, D), a batch of N sequences, an object with `sample(batch_size, generator)`, or
-            data with parts, such as `dvae.tables.PanelData`, whose validation windows are used too; or a `Recipe`,
-            which says what is trained, on which data.
-        validation: x as a tensor, a batch, or an object whose `all()` returns a batch, or whose `batches(size)` are
-            some sequences after the others.
-        objective: what to minimise; `Evidence()` by default.
-        stages: objectives one after the other, in place of `objective`; their steps are those of the run.
-        out: run directory for checkpoints and `log.jsonl` (see `checkpoints`). A method that was fitted to data which
-            can be opened again leaves a run that `dvae.load` and `dvae.resume` read.
-        resume: continue the run in `out` from its last checkpoint up to `steps`.
-        config: what is run, in JSON's types, for `config.json`, to which the training options are added; a resumed run
-            keeps its own where none is given.
-        trackers: further receivers of the log's rows.
+        model: a `DynamicalVAE`, or any module that `SequenceELBO` accepts; or a method, such as `dvae.method("srnn")`.
+            The model of a method is built for the data and trained by its recipe, with the method's own defaults of
+            `Training`.
+        data: x as a tensor (N, T, D), a batch of N sequences, an object with `sample(batch_size, generator)`, or data
+            with parts, such as `dvae.tables.PanelData`, whose validation windows are used too; or a `Recipe`, which
+            includes its data.
+        validation: x as a tensor, a batch, or an object whose `all()` returns a batch or whose `batches(size)` yields
+            batches in order.
+        objective: objective to minimise; `Evidence()` by default.
+        stages: consecutive stages with their own objectives, instead of `objective`; their steps add up to those of the
+            run.
+        out: run directory for checkpoints and `log.jsonl` (see `checkpoints`). If a method is fitted to data that can
+            be opened again, `dvae.load` and `dvae.resume` read the run.
+        resume: whether to continue the run in `out` from its last checkpoint up to `steps`.
+        config: description of the run in JSON types, for `config.json`; training options are added to it. A resumed run
+            keeps its own if none is given.
+        trackers: additional receivers of the log's rows.
         callbacks: hooks after steps, after validations and at the end.
-        **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3. The seed of a method is
-            that of its initial weights too.
+        **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3. For a method, the seed
+            also determines its initial weights.
 
     Returns:
         The history, the best bound and its step, and the `model`.
 
     Raises:
-        NonFiniteError: when a loss or gradient is NaN or infinite, naming step, site and term; the last
-            checkpoint stays.
-        Interrupted: after Ctrl-C or SIGTERM; the step is complete, the checkpoint written.
-        CheckpointError: when `out` holds a run and `resume` is False, or a run that cannot be resumed, such as one
+        NonFiniteError: when a loss or gradient is NaN or infinite, naming step, site and term; the last checkpoint
+            stays.
+        Interrupted: after Ctrl-C or SIGTERM; the step is complete and the checkpoint written.
+        CheckpointError: when `out` contains a run and `resume` is False, or a run that cannot be resumed, such as one
             fitted on training data with another `fingerprint`.
-        TypeError: a model or data of another kind, such as a table, whose columns need roles.
-        ValueError: the first batch varies by less than float32 resolves; options that a method or a recipe sets itself;
-            or data without windows of some part.
-        LostProcess: another one of several processes has ended, or does not answer; the last checkpoint stays.
+        TypeError: when the model or the data are of another kind, such as a table, whose columns need roles.
+        ValueError: when the first batch varies by less than float32 resolves, an option is set by the method or recipe
+            itself, or a part of the data has no windows.
+        LostProcess: when another process of the run has ended or does not answer; the last checkpoint stays.
 
     Example:
         >>> import torch, dvae
@@ -261,7 +266,7 @@ def fit(
 
 
 def _prepared(recipe: Recipe, model: nn.Module, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Prepare a model as a recipe says, unless a run is resumed, and return the options of its fit."""
+    """Prepare a model for a recipe, unless a run is resumed, and return the options of its fit."""
     steps = sum(stage.steps for stage in recipe.stages)
     if options.get("steps", steps) != steps:
         raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
@@ -271,7 +276,7 @@ def _prepared(recipe: Recipe, model: nn.Module, options: Mapping[str, Any]) -> d
             f"{options['self_feeding']} here write dvae.method(…, self_feeding=…)"
         )
     if not options["resume"]:
-        run_directory(options["out"], False, {})  # which is refused before what may take long
+        run_directory(options["out"], False, {})  # refuses a directory before a preparation that may take long
         with seeded(None):
             recipe.prepare(model)
     own = {"steps": steps, "self_feeding": recipe.feeding, "stages": recipe.stages, "objective": None}
@@ -302,7 +307,7 @@ def _fit(
     held_out = None if validation is None else in_batches(validation)
     if training.patience is not None and held_out is None:
         raise ValueError("patience counts validations; give validation data, or leave patience out")
-    # a hash of all the data, for a run that is kept
+    # hashing all data takes time, so only for a run that is stored
     fingerprint = train.fingerprint if out is not None and isinstance(train, Fingerprinted) else None
     record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
     run = run_directory(out, resume, record)
@@ -312,10 +317,10 @@ def _fit(
         state, first = svi.init(), svi.fabric.is_global_zero
         if run is not None and first:
             stack.enter_context(run.locked())
-        processes.wait(svi.fabric)  # every process has looked for an earlier run before the first one writes
+        processes.wait(svi.fabric)  # every process must look for an earlier run before the first one writes
         if run is not None and resume:
             restore(svi, run)
-            processes.wait(svi.fabric)  # every process has read the checkpoint before the first one writes
+            processes.wait(svi.fabric)  # every process must read the checkpoint before the first one writes
         history, receivers = InMemory(), list[Tracker]()
         if first:
             if run is not None:
@@ -332,10 +337,10 @@ def _fit(
         signals = stack.enter_context(Signals())
         before, state.status = state.status, _status(state, training)
         if run is not None and (not resume or state.status not in ("running", before)):
-            store(svi, run)  # also of a run that was interrupted at its last step
+            store(svi, run)  # even if the run was interrupted at its last step
         observed = None if validation is None else _observed(svi.model, take_split(validation, "validation"))
         _train(svi, source, held_out, observed, run, receivers, callbacks, signals)
-        processes.wait(svi.fabric)  # whoever goes on may read what the first one has written
+        processes.wait(svi.fabric)  # the caller may read what the first process has written
         if state.best is not None:
             model.load_state_dict(state.best)
     path = run.path if run else None
@@ -347,7 +352,10 @@ def _fit(
 
 
 def _observed(model: nn.Module, validation: Any) -> int | None:
-    """Observed steps of validation windows with a horizon, if the bound of the model is of the data as given."""
+    """Return the number of observed steps of validation windows with a horizon.
+
+    Return None without a horizon, or if the bound of the model is not of the data as given.
+    """
     if not isinstance(model, DynamicalVAE) or not model.likelihood or model.view.measured:
         return None
     if WHOLE not in (*model.observed, *model.view.names):
@@ -356,7 +364,7 @@ def _observed(model: nn.Module, validation: Any) -> int | None:
 
 
 def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
-    """The run directory, refused where `fit` would lose a run, find none, or go on with data known to be others."""
+    """Return the run directory; raise if `fit` would overwrite a run, find none, or resume on other data."""
     run = None if out is None else Run(out)
     if resume and (run is None or not run.exists):
         raise CheckpointError(f"no run to resume in {out}; give its directory as out=…, or leave out resume=True")
@@ -386,7 +394,7 @@ def _train(
     callbacks: Sequence[Callback],
     signals: Signals,
 ) -> None:
-    """Steps, rows, validations and checkpoints, until the run ends."""
+    """Run steps, log rows, validate and write checkpoints until the run ends."""
     state, training = svi.state, svi.training
 
     def log(row: Mapping[str, float]) -> None:
@@ -402,11 +410,11 @@ def _train(
             for callback in callbacks:
                 if row := getattr(callback, hook)(state):
                     log(row)
-        except KeyboardInterrupt:  # the step is complete, so this is as good a place to stop as any
+        except KeyboardInterrupt:  # the step is complete, so the run can stop here
             signals.received = signal.SIGINT
 
     def asked_to_stop() -> bool:
-        """Whether a signal has come to any process; a callback's `stop` in one of them is one in all."""
+        """Return whether a signal has reached any process; share a callback's `stop` among all processes."""
         asked = torch.tensor([bool(signals.received), state.stop]).int()
         stopped, state.stop = (svi.total(asked) > 0).tolist()
         return bool(stopped)
@@ -416,7 +424,7 @@ def _train(
     unchecked = isinstance(model, DynamicalVAE) and like(model).dtype is not torch.float64
     while state.status == "running":
         batch = source.sample(training.batch_size, svi.generator)
-        if unchecked:  # once, as it waits for the device
+        if unchecked:  # only once, as the check synchronises with the device
             check_scale(batch, {WHOLE, *model.observed})
             unchecked = False
         svi.step(batch)
@@ -442,7 +450,7 @@ def _train(
 
 
 def _status(state: State, training: Training) -> str:
-    """Whether the run is "finished", "stopped early" or "running"."""
+    """Return "finished", "stopped early" or "running"."""
     if state.step >= training.steps:
         return "finished"
     impatient = training.patience is not None and state.waited >= training.patience

@@ -1,18 +1,18 @@
-"""GradNorm: weights of losses that adapt so that all train at one pace (Chen et al. 2018, arXiv 1711.02257).
+"""GradNorm: adaptive weights that balance the training rates of losses (Chen et al. 2018, arXiv 1711.02257).
 
-Of tasks with losses L_i and weights w_i, n of them, and parameters W that they share:
+For n tasks with losses L_i, weights w_i and shared parameters W:
 
     G_i = |grad_W w_i L_i|                                norms of gradients, and Gbar their mean
     r_i = (L_i / L_i(0)) / mean_j (L_j / L_j(0))          relative inverse training rates
     L_grad = sum_i |G_i - Gbar r_i^a|                     with the targets Gbar r_i^a held constant
 
-The weights descend L_grad and are then scaled to the sum n. As W is reached by w_i L_i in proportion to w_i, the
-derivative of G_i by log w_i is G_i itself, and no second backward pass is needed. We go down in log w, not in w, and by
-L_grad / Gbar:
+The weights descend L_grad and are then scaled to the sum n. G_i is proportional to w_i, so its derivative with respect
+to log w_i is G_i itself, and no second backward pass is needed. We descend L_grad / Gbar in log w instead of L_grad in
+w:
 
     log w_i <- log w_i - rate sign(G_i - Gbar r_i^a) G_i / Gbar
 
-so that weights are positive without being clipped, and the rate means the same whatever unit the losses are in.
+Weights are then positive without clipping, and the rate does not depend on the units of the losses.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,28 +31,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GradNorm:
-    """Named log-likelihoods and energies with adaptive weights, beside all other terms, which have those of `others`.
+    """Objective with adaptive weights for named log-likelihoods and energies; `others` weighs all other terms.
 
     With L_i minus a log-likelihood, or an energy, summed over the batch and divided by its frames,
 
         loss = sum_tasks w_i L_i + others(the other terms).
 
-    The weights begin at 1 at every stage and are part of the checkpoint; `log.jsonl` has a step's as "weight/NAME".
-    Called itself, as a validation by "loss" does, all of them are 1, so that losses can be compared. In several
-    processes gradients are means over them, as those of the model are.
+    The weights are reset to 1 at each stage and are part of the checkpoint; `log.jsonl` records them as "weight/NAME".
+    Called directly, for example by a validation with "loss", the objective uses weights of 1, so that losses can be
+    compared. With several processes, gradients are averaged over them, as for the model.
 
     Args:
         tasks: names of log-likelihoods and energies, at least two.
-        shared: W, the trained parameters whose names start with it, such as a last layer that all tasks go through.
-        others: what weighs all other terms, the KL among them, and tells draws and selection.
-        asymmetry: a, how strongly tasks that train slowly are favoured. At 0 norms of gradients are brought together;
-            above, losses must be positive, which those of densities need not be. The paper has .12, and 1.5 where
-            tasks differ more.
-        learning_rate: of log w: what a weight with the mean gradient gains or loses in a step.
+        shared: prefix of the names of the parameters W, such as a last layer that all tasks use.
+        others: objective that weighs all other terms, including the KL, and sets draws and selection.
+        asymmetry: a, how strongly tasks that train slowly are favoured. At 0, norms of gradients are equalised. Above
+            0, losses must be positive, which negative log densities need not be. The paper uses 0.12, and 1.5 if tasks
+            differ more.
+        learning_rate: learning rate of log w: change per step of a weight with the mean gradient.
 
     Raises:
-        ValueError: less than two tasks, or one twice; on the first call, a task that is no such term, or that does not
-            go through the shared parameters; when a run is laid out, a model without them.
+        ValueError: with fewer than two tasks, or a repeated one; on the first call, if a task is no such term or does
+            not depend on the shared parameters; before training, if the model has no such parameters.
 
     Example:
         >>> weighing = dvae.GradNorm(("pose", "time"), shared="generator.x.", others=dvae.Evidence(kl_weight=0.01))
@@ -76,12 +76,12 @@ class GradNorm:
 
     @property
     def draws(self) -> Mapping[str, int]:
-        """Those of `others`."""
+        """Draws that `others` needs."""
         return self.others.draws
 
     @property
     def select(self) -> Literal["bound", "loss"]:
-        """That of `others`."""
+        """Score by which `others` selects the best weights."""
         return self.others.select
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
@@ -89,7 +89,7 @@ class GradNorm:
         return self.weighted(terms, step, torch.ones(len(self.tasks)))
 
     def weighted(self, terms: "Terms", step: int, weights: Tensor) -> Tensor:
-        """The loss with such weights (tasks,) of the tasks, a scalar."""
+        """Return the loss with the given weights (tasks,), a scalar."""
         rest = [
             {name: value for name, value in table.items() if name not in self.tasks}
             for table in (terms.log_likelihood, terms.energies)
@@ -100,7 +100,7 @@ class GradNorm:
         return loss
 
     def losses(self, terms: "Terms") -> list[Tensor]:
-        """The losses of the tasks in their order, scalars."""
+        """Return the losses of the tasks in their order, scalars."""
         costs = {name: -value for name, value in terms.log_likelihood.items()} | terms.energies
         if unknown := [task for task in self.tasks if task not in costs]:
             raise ValueError(
@@ -110,7 +110,7 @@ class GradNorm:
         return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
 
     def begin(self, model: nn.Module) -> "Balance":
-        """The objective in a stage of a run, with weights of its own, that begin at 1."""
+        """Return the objective for a stage of a run, with its own weights, which start at 1."""
         trained = {name: value for name, value in model.named_parameters() if value.requires_grad}
         shared = [value for name, value in trained.items() if name.startswith(self.shared)]
         if not shared:
@@ -127,8 +127,8 @@ class Balance:
     """Weights of a `GradNorm` in a stage of a run; see `objectives.Adapting`.
 
     Args:
-        objective: whose weights they are.
-        shared: the parameters W.
+        objective: objective that the weights belong to.
+        shared: shared parameters W.
     """
 
     def __init__(self, objective: GradNorm, shared: list[nn.Parameter]) -> None:
@@ -142,7 +142,7 @@ class Balance:
         return self.objective.weighted(terms, step, self.weights)
 
     def measure(self, terms: "Terms") -> None:
-        """Take the losses of the tasks, and their gradients by W, of a batch."""
+        """Store the losses of the tasks for a batch, and their gradients with respect to W."""
         losses = self.objective.losses(terms)
         self._losses = torch.stack([loss.detach() for loss in losses])
         self._gradients = torch.stack(
@@ -150,13 +150,13 @@ class Balance:
         )
 
     def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
-        """Take a step of the weights, which the loss of the next step has.
+        """Update the weights, for the loss of the next step.
 
         Raises:
-            ValueError: losses without a training rate.
+            ValueError: when a loss has no training rate.
         """
         norms = torch.linalg.vector_norm(mean(self._gradients), dim=1, dtype=torch.float64)
-        losses, norms = torch.stack([mean(self._losses).double(), norms]).cpu()  # at once, as it is waited for
+        losses, norms = torch.stack([mean(self._losses).double(), norms]).cpu()  # one copy, one synchronisation
         first, asymmetry = self.first if self.first.any() else losses, self.objective.asymmetry
         for task, start, now in zip(self.objective.tasks, first.tolist(), losses.tolist(), strict=True):
             if asymmetry and (start <= 0 or now < 0):
@@ -165,7 +165,7 @@ class Balance:
                     "losses above 0; give asymmetry=0, which needs none"
                 )
         self.first = first
-        smallest = torch.finfo(torch.float64).tiny  # where all losses or all gradients are 0
+        smallest = torch.finfo(torch.float64).tiny  # if all losses or all gradients are 0
         ratios = losses / first if asymmetry else torch.ones_like(losses)
         norms = self.weights * norms
         target = norms.mean() * (ratios / ratios.mean().clamp(min=smallest)) ** asymmetry
@@ -175,24 +175,24 @@ class Balance:
 
     @property
     def row(self) -> dict[str, float]:
-        """The weights by name, for the log."""
+        """Weights by name, for the log."""
         return {
             f"weight/{task}": weight for task, weight in zip(self.objective.tasks, self.weights.tolist(), strict=True)
         }
 
     @property
     def state(self) -> dict[str, Tensor]:
-        """The weights, and the losses of the first step."""
+        """Weights, and the losses of the first step."""
         named = {"weight": self.weights, "first": self.first}
         return {
             f"{name}/{task}": value[i] for name, value in named.items() for i, task in enumerate(self.objective.tasks)
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on with the state of a checkpoint.
+        """Continue with the state of a checkpoint.
 
         Raises:
-            ValueError: weights that are not positive, or whose sum is not their number.
+            ValueError: when a weight is not positive, or the weights do not add up to the number of tasks.
         """
         tasks = self.objective.tasks
         weights, first = (torch.stack([state[f"{name}/{task}"] for task in tasks]) for name in ("weight", "first"))
@@ -201,7 +201,7 @@ class Balance:
         self.weights, self.first = weights, first
 
     def _gradient(self, task: str, loss: Tensor) -> Tensor:
-        """Of a task's loss by the shared parameters, flat; zeros where this batch has no loss that could have one."""
+        """Return the gradient of a task's loss with respect to W, flat; zeros if this batch's loss is a constant."""
         none = [torch.zeros_like(value) for value in self.shared]
         found = (
             torch.autograd.grad(loss, self.shared, retain_graph=True, allow_unused=True) if loss.requires_grad else none

@@ -2,11 +2,12 @@
 
     x_t ~ N(x_s, v_{t-s}),    s: the last step before t at which the coordinate was observed
 
-v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. The reference of a model that reads
-the true past is this density given all steps before t. A model trained with scheduled sampling reads its own means:
-in its reference, observed steps have their mean and variance over training windows, and x_s is the last observed value
-at all future steps. A discrete value has the probability of the interval around it. A class has the probability that it
-does not change.
+v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. For a model that reads the true
+past, the reference is this density given all steps before t.
+
+A model trained with scheduled sampling reads its own means. In its reference, observed steps have their mean and
+variance over training windows, and x_s is the last observed value at all future steps. A discrete value has the
+probability of the interval around it. A class has the probability that it does not change.
 """
 
 from __future__ import annotations
@@ -25,24 +26,25 @@ from ...networks.loop import valid_steps
 from ...program.model import DynamicalVAE
 
 WINDOWS = 128
-"""Training windows from which variances are estimated."""
+"""Number of training windows used to estimate variances."""
 _FLOOR = 1e-3
-"""Least deviation of a difference, in deviations of the coordinate."""
+"""Smallest standard deviation of a difference, in standard deviations of the coordinate."""
 _ONE_HOT = type(constraints.one_hot)
 
 
 def last_value_bound(
     model: DynamicalVAE, train: Source, validation: InBatches, observed: int, *, fed: bool, batch_size: int
 ) -> float:
-    """Return the log density of validation windows by their last values, in nats per frame.
+    """Return the log density of validation windows under the last-value forecast, in nats per frame.
 
     Args:
-        model: its view tells which first frames no bound scores, and its laws which coordinates are discrete.
-        train: windows of which the spread of differences is estimated.
+        model: model whose view defines the first frames that no bound scores, and whose distributions define which
+            coordinates are discrete.
+        train: training windows, for the variances of differences.
         validation: windows to score.
-        observed: O, the steps before the horizon.
-        fed: whether the model is fed its own means, and not the true steps.
-        batch_size: windows at once.
+        observed: O, number of steps before the horizon.
+        fed: whether the model reads its own means instead of the true steps.
+        batch_size: number of windows in a batch.
     """
     classes, discrete = _discrete(model)
     mean, spreads = _spreads(*_values(train.sample(WINDOWS, torch.Generator().manual_seed(0))), classes, discrete)
@@ -50,7 +52,7 @@ def last_value_bound(
     for batch in validation.batches(batch_size):
         x, seen = _values(batch)
         steps = torch.arange(x.shape[1])
-        known = torch.where(seen, steps[:, None], -1).cummax(1).values  # the last observed step up to each
+        known = torch.where(seen, steps[:, None], -1).cummax(1).values  # last observed step up to each step
         before = torch.where(steps < observed, -1, observed - 1) if fed else steps - 1
         source = torch.where(before[:, None] < 0, -1, known[:, before.clamp(min=0)])
         lag = torch.where(source < 0, 0, steps[:, None] - source).clamp(max=len(spreads) - 1)
@@ -68,8 +70,8 @@ def last_value_bound(
 
 
 def _discrete(model: DynamicalVAE) -> tuple[list[list[int]], Tensor]:
-    """Coordinates of x that are one class each, and (D,) where single ones have discrete values."""
-    if WHOLE not in model.observed:  # its parts are seen
+    """Return the coordinates of x grouped by the class they encode, and a mask (D,) of other discrete coordinates."""
+    if WHOLE not in model.observed:  # the model observes only parts of x
         return [], torch.tensor(False)
     conditional = model.generator[WHOLE]
     parts = getattr(conditional.support, "parts", [(range(conditional.size), conditional.support)])
@@ -81,9 +83,10 @@ def _discrete(model: DynamicalVAE) -> tuple[list[list[int]], Tensor]:
 
 
 def _spreads(x: Tensor, seen: Tensor, classes: Sequence[list[int]], discrete: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (D,), and (T, D) the deviation from it, then that of differences over 1 to T - 1 steps.
+    """Return the mean (D,) and standard deviations (T, D).
 
-    Of a class its first coordinate has the probability of staying, and first that of each class.
+    Row 0 holds deviations from the mean, row h those of differences over h steps. For a class, the first coordinate
+    holds the probability of each class in row 0, and the probability of no change in later rows.
     """
     count = seen.sum((0, 1)).clamp(min=1)
     mean = x.sum((0, 1)) / count
@@ -105,7 +108,7 @@ def _spreads(x: Tensor, seen: Tensor, classes: Sequence[list[int]], discrete: Te
 
 
 def _log_density(away: Tensor, spread: Tensor, discrete: Tensor) -> Tensor:
-    """Of each entry, by how far it is from its location; of discrete ones that of the interval around them."""
+    """Return the log density of each entry at its distance from the location; for a discrete one, of its interval."""
     density = -0.5 * (away / spread).square() - spread.log() - 0.5 * math.log(2 * math.pi)
     if not discrete.any():
         return density
@@ -114,7 +117,7 @@ def _log_density(away: Tensor, spread: Tensor, discrete: Tensor) -> Tensor:
 
 
 def _values(given: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-    """x (B, T, D) in double precision, and where it was observed."""
+    """Return x (B, T, D) in double precision and the mask of its observed entries."""
     batch = Batch(given)
     x, mask = torch.as_tensor(batch[WHOLE]).double().cpu(), batch.mask()
     seen = torch.ones_like(x, dtype=torch.bool) if mask is None else torch.as_tensor(mask).cpu()

@@ -1,18 +1,18 @@
-"""Many models at once: all their differences, those that may be the best, and what would tell two of them apart.
+"""Comparison of many models: all paired differences, the model confidence set, and sample sizes.
 
-Of twenty differences one is beyond its 95 % by chance alone. `pairs` has p-values by Holm's step-down procedure (1979),
-which are right for all pairs at once whatever their dependence. `confidence_set` is the model confidence set (Hansen,
-Lunde and Nason, 2011): models of which none is significantly worse than another one, found by leaving out the one that
-is most surely worse until that holds. It holds the best one with at least its level, and the less the data tell, the
-more models. `required` is the power of a paired difference at other numbers of seeds and clips.
+With many pairs, some 95 % intervals exclude 0 by chance alone. `pairs` has p-values adjusted by Holm's step-down
+procedure (1979), which are valid for all pairs at once under any dependence. `confidence_set` is the model confidence
+set (Hansen, Lunde and Nason, 2011): models that are not significantly worse than one another. It repeatedly drops the
+model that is most clearly worse, and contains the best model with at least its level. The less informative the data,
+the more models it contains. `required` computes the power of a paired difference for other numbers of seeds and clips.
 
-Errors are those of `estimates`: over clips, which models share, and over training seeds, which they do not. Few seeds
-tell little of their variances, and where these are small by chance, differences look sure that are not. The null
-distribution of the confidence set is therefore of draws with variances drawn first, each the measured one times f over
-chi-squared of its f degrees of freedom: of a single difference that is Student's t (the fiducial distribution of
-Behrens and Fisher; the paper's block bootstrap has nothing to draw from of two or three seeds). Each pair is judged by
-its own distribution, and the least of these p-values by that of the least (Westfall and Young, 1993), where the paper
-takes the largest t of all pairs.
+Errors are those of `estimates`: over clips, which models share, and over training seeds, which they do not. Variances
+over few seeds are uncertain, and if they are small by chance, differences look significant that are not. The null
+distribution of the confidence set therefore draws variances first, each the measured one times f over chi-squared with
+its f degrees of freedom. For a single difference this is Student's t (the fiducial distribution of Behrens and Fisher).
+The paper's block bootstrap is not possible with two or three seeds. Each pair has its own null distribution, and the
+smallest of these p-values is compared with its null distribution (Westfall and Young, 1993); the paper uses the largest
+t of all pairs.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from ..evaluation.result import Shown, Table
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
-    """P-values for all hypotheses at once, by Holm's step-down procedure; NaN where one is, which counts for none.
+    """Return p-values adjusted for all hypotheses by Holm's step-down procedure; a NaN stays NaN and is not counted.
 
     Args:
-        p_values: (N,).
+        p_values: unadjusted p-values (N,).
 
     Returns:
-        (N,), each at least its own, in the same order.
+        Adjusted p-values (N,) in the same order, each at least the unadjusted one.
 
     >>> holm([0.01, 0.04, 0.03]).round(2).tolist()
     [0.03, 0.06, 0.06]
@@ -56,15 +56,15 @@ class Pairs(Shown):
     """All paired differences of some models, first minus second.
 
     Attributes:
-        differences: (first, second) to the estimate.
-        p_values: (first, second) to the p-value of no difference, for all pairs at once (`holm`).
+        differences: estimate for each (first, second).
+        p_values: p-value of no difference for each (first, second), adjusted for all pairs (`holm`).
     """
 
     differences: dict[tuple[str, str], Estimate]
     p_values: dict[tuple[str, str], float]
 
     def table(self) -> Table:
-        """A line for each pair, the surest first."""
+        """Return a table with a row for each pair, in the order of p-values."""
         table = Table(
             title="paired differences",
             caption="mean ± standard error over sequences ± over seeds; p: for all pairs at once, by Holm's procedure",
@@ -79,13 +79,13 @@ class Pairs(Shown):
 
 
 def pairs(contenders: Mapping[str, Crossed]) -> Pairs:
-    """All paired differences, with p-values for as many as there are.
+    """Return all paired differences, with p-values adjusted for their number.
 
     Args:
-        contenders: name to a score on the same clips.
+        contenders: score on the same clips for each name.
 
     Returns:
-        Differences of each with those after it; p-values are NaN where a model has one seed.
+        Differences of each model with all later ones; p-values are NaN if a model has one seed.
     """
     found = {
         (first, second): contenders[first].estimate(contenders[second]) for first, second in combinations(contenders, 2)
@@ -99,9 +99,9 @@ class ConfidenceSet(Shown):
     """Models that may be the best.
 
     Attributes:
-        p_values: name to the largest level at which a model is left out, less 1: it is in the set of level L where this
-            is at least 1 - L. The last that is left has 1. Those that are left out first come first.
-        level: of `members`.
+        p_values: p-value of each model by name, in the order of elimination: a model is in the set of level L if p >= 1
+            - L. The last remaining model has 1.
+        level: level of `members`.
     """
 
     p_values: dict[str, float]
@@ -109,11 +109,11 @@ class ConfidenceSet(Shown):
 
     @property
     def members(self) -> list[str]:
-        """Names of those that may be the best, the likeliest first."""
+        """Names of the models that may be the best, the likeliest first."""
         return [name for name, p in reversed(self.p_values.items()) if p >= 1 - self.level]
 
     def table(self) -> Table:
-        """A line for each model, those that may be the best first."""
+        """Return a table with a row for each model, those that may be the best first."""
         table = Table(
             title=f"models that may be the best, at {100 * self.level:g} %",
             caption=f"p: of none being the worse, when it would be left out; in the set from {1 - self.level:.3g} on",
@@ -134,19 +134,19 @@ def confidence_set(
     draws: int = 10_000,
     seed: int = 0,
 ) -> ConfidenceSet:
-    """The model confidence set, by the differences of all pairs that are left.
+    """Return the model confidence set, based on the differences of all remaining pairs.
 
     Args:
-        contenders: name to a score on the same clips.
+        contenders: score on the same clips for each name.
         better: "lower" or "higher".
-        level: with which the best model is in the set.
-        over_seeds: whether another training seed may change what is best; without, of these very weights.
-        draws: of the null distribution.
-        seed: of the draws.
+        level: probability that the best model is in the set.
+        over_seeds: whether to account for other training seeds; if False, the set is for these very weights.
+        draws: number of draws of the null distribution.
+        seed: seed of the draws.
 
     Raises:
-        ValueError: no models; a level that is not between 0 and 1; one clip; scores on other clips, or that are not
-            finite; with `over_seeds`, a model of one seed; a score that is neither the lower nor the higher the better.
+        ValueError: when there are no models, `level` is not between 0 and 1, there is one clip, scores are on different
+            clips or not finite, a model has one seed with `over_seeds`, or `better` is neither "lower" nor "higher".
     """
     if not contenders or not 0 < level < 1 or draws < 1:
         raise ValueError(
@@ -178,7 +178,7 @@ def confidence_set(
     variances = np.maximum(between * freedom / random.chisquare(freedom, (draws, len(rows))) - rest, 0)
     drawn = together + np.sqrt(variances) * random.standard_normal((draws, len(rows)))
 
-    worse, other = (places.ravel() for places in np.indices((len(rows), len(rows))))  # than which, of all pairs
+    worse, other = (places.ravel() for places in np.indices((len(rows), len(rows))))  # all ordered pairs of models
     null = drawn[:, worse] - drawn[:, other]
     single = (null >= means[worse] - means[other]).mean(0)
     null = scipy.stats.rankdata(-null, "max", axis=0) / draws
@@ -194,10 +194,10 @@ def confidence_set(
 
 
 def _check(rows: Mapping[str, Crossed]) -> int:
-    """The number of clips of scores that can be compared.
+    """Return the number of clips of comparable scores.
 
     Raises:
-        ValueError: scores on other clips, or that are not finite.
+        ValueError: when scores are on different clips, or not finite.
     """
     counts = {name: len(row.deviations) for name, row in rows.items()}
     if len(set(counts.values())) > 1:
@@ -210,15 +210,16 @@ def _check(rows: Mapping[str, Crossed]) -> int:
 
 @dataclass(frozen=True, repr=False)
 class Requirement(Shown):
-    """What it takes to tell two models apart.
+    """Numbers of seeds and clips that are needed to distinguish two models.
 
     Attributes:
-        difference: that is to be found.
-        power: with which it is to be found.
-        level: of the two-sided interval that is not to hold 0.
-        clips: number of training seeds of each model to that of clips, infinite where no number is enough.
-        now: the numbers of clips, and of seeds of the two, that there are.
-        achieved: the power of these; for the measured difference it follows from the p-value and adds nothing to it.
+        difference: difference to detect.
+        power: probability of detecting it.
+        level: level of the two-sided interval that must exclude 0.
+        clips: number of clips for each number of training seeds per model, infinite if no number is enough.
+        now: present numbers of clips, and of seeds of the two models.
+        achieved: power with the present numbers; for the measured difference it follows from the p-value and adds no
+            information.
     """
 
     difference: float
@@ -229,7 +230,7 @@ class Requirement(Shown):
     achieved: float
 
     def table(self) -> Table:
-        """A line for each number of seeds."""
+        """Return a table with a row for each number of seeds."""
         clips, *seeds = self.now
         table = Table(
             title=f"to find a difference of {number(self.difference, 4)} with a probability of {100 * self.power:g} %",
@@ -256,21 +257,21 @@ def required(
     level: float = 0.95,
     seeds: Sequence[int] = (2, 3, 4, 5, 7, 10, 15, 20),
 ) -> Requirement:
-    """How many training seeds and clips would tell two models apart, from the variances of those that there are.
+    """Return how many training seeds and clips would distinguish two models, from their measured variances.
 
-    The variances are themselves estimates: of three seeds, one of them may well be off by a factor of two. Clips are
-    taken to be as long as these.
+    The variances are estimates themselves: with three seeds, a variance may well be off by a factor of two. New clips
+    are assumed to be as long as the present ones.
 
     Args:
-        first, second: a score of two models on the same clips, with at least two seeds each.
-        difference: to be found; by default the one that was measured.
-        power: probability of finding it.
-        level: of the interval that is not to hold 0.
-        seeds: of each model, for which clips are counted.
+        first, second: scores of two models on the same clips, with at least two seeds each.
+        difference: difference to detect; the measured one by default.
+        power: probability of detecting it.
+        level: level of the interval that must exclude 0.
+        seeds: numbers of seeds per model for which clips are computed.
 
     Raises:
-        ValueError: a model of one seed; scores on other clips, or that are not finite; a difference that is 0 or not
-            finite; seeds below 2; a power or level that is not between 0 and 1.
+        ValueError: when a model has one seed, scores are on different clips or not finite, the difference is 0 or not
+            finite, seeds are below 2, or power or level is not between 0 and 1.
     """
     if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(
@@ -290,7 +291,7 @@ def required(
     common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
 
     def reached(clips: int, *numbers: int) -> float:
-        """As `Crossed.estimate` will judge: errors and degrees of freedom are drawn as they will be measured."""
+        """Return the power of `Crossed.estimate`: errors and degrees of freedom are drawn as they would be measured."""
         both = [*zip(rest, own, numbers, strict=True)]
         over = (common + sum(r / n for r, _, n in both)) / clips
         between = [(o + r / clips) / n for r, o, n in both]
@@ -328,10 +329,10 @@ def required(
 
 
 FEWEST, MOST_CLIPS = 5, 10**7
-"""Clips of which errors can be told, and beyond which no number counts as enough."""
+"""Fewest clips with an estimate of errors, and the number above which no number counts as enough."""
 
 
 @cache
 def _ranks() -> np.ndarray:
-    """Of the measured variances over clips and of two models' seeds, over which power is averaged."""
+    """Return quasi-random ranks of the variances over clips and over two models' seeds, for averaging the power."""
     return scipy.stats.qmc.Halton(3, seed=0).random(2000).T

@@ -1,12 +1,12 @@
-"""Objectives: from the terms of a bound to the number that training minimises.
+"""Objectives: functions from the terms of a bound to the loss that training minimises.
 
-An objective is a function of `Terms` and the global step. `Evidence` is the negative evidence lower bound
-with a weight on each KL term (warm-up; Bowman et al. 2016, arXiv 1511.06349; beta-VAE, Higgins et al. 2017)
-and free bits (Kingma et al. 2016, arXiv 1606.04934). The weights never touch the bound that is recorded:
-model selection reads `Terms.bound`.
+An objective is a function of `Terms` and the global step. `Evidence` is the negative evidence lower bound with a weight
+on each KL term (warm-up; Bowman et al. 2016, arXiv 1511.06349; beta-VAE, Higgins et al. 2017) and free bits (Kingma et
+al. 2016, arXiv 1606.04934). The weights never change the recorded bound: model selection reads `Terms.bound`.
 
-An objective with a state, such as weights that adapt (`gradnorm`), is `Adaptive`: a description, which a stage of a run
-begins as `Adapting`. The state is the run's own, in its checkpoints, and two runs may have one description.
+An objective with a state, such as adaptive weights (`gradnorm`), is `Adaptive`: a description without state. Each stage
+of a run turns it into an `Adapting` objective. The state belongs to the run and its checkpoints, so two runs may share
+one description.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Objective(Protocol):
-    """A scalar to minimise, in nats per frame, from the terms of a batch."""
+    """Function that returns the loss of a batch, in nats per frame, from its terms."""
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
         """Return the loss of a batch at a global step."""
@@ -31,76 +31,74 @@ class Objective(Protocol):
 
 @runtime_checkable
 class Asking(Protocol):
-    """An objective that says what draws it needs, and what tells the best weights; see `Evidence`."""
+    """Objective that declares the draws it needs and the score that selects the best weights; see `Evidence`."""
 
     @property
     def draws(self) -> Mapping[str, int]:
-        """Of a latent, by name, for each sequence."""
+        """Number of draws of each latent for each sequence, by name."""
 
     @property
     def select(self) -> Literal["bound", "loss"]:
-        """What tells the best weights."""
+        """Score that selects the best weights."""
 
 
 @runtime_checkable
 class Adapting(Objective, Protocol):
-    """An objective in a stage of a run, with a state of its own; see `gradnorm.Balance`.
+    """Objective with a state within a stage of a run; see `gradnorm.Balance`.
 
-    A step asks it to `measure`, for its loss, and to `adapt`, in this order.
+    Each step calls `measure`, the objective itself for the loss, and `adapt`, in this order.
     """
 
     @property
     def state(self) -> Mapping[str, Tensor]:
-        """All that a later call depends on, by name, finite; their names, shapes and types stay as they begin."""
+        """All values that later calls depend on, by name. They are finite and keep their names, shapes and types."""
 
     @property
     def row(self) -> Mapping[str, float]:
-        """Numbers for the log, by name, as they are in the step."""
+        """Current values for the log, by name."""
 
     def measure(self, terms: "Terms") -> None:
-        """Take what it needs of gradients of a batch, whose graph has to be kept, before the backward pass."""
+        """Compute gradients of a batch before the backward pass; the graph must be retained."""
 
     def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
-        """Change the state, after the backward pass and before the optimiser's step, which is sure to be taken.
+        """Update the state, after the backward pass and before the optimiser's step, once that step is certain.
 
         Args:
-            mean: of a tensor over the processes, for which all of them have to ask.
+            mean: function that averages a tensor over the processes; every process must call it.
         """
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on with a checkpoint's state, which has the names, shapes and types of this one, or raise ValueError."""
+        """Continue from a checkpoint's state with the same names, shapes and types, or raise ValueError."""
 
 
 @runtime_checkable
 class Adaptive(Protocol):
-    """An objective that each stage begins anew; called itself, it is the one whose losses validation compares."""
+    """Objective whose state starts anew in each stage; a direct call gives the losses that validation compares."""
 
     def begin(self, model: nn.Module) -> Adapting:
-        """The objective in a stage of a run of this model, or ValueError: it lacks what is needed."""
+        """Return the objective with its state for a stage; raise ValueError if the model is missing what it needs."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Minus the weighted evidence lower bound, in nats per frame, so that learning rates do not depend on the
-    length.
+    """Negative weighted evidence lower bound, in nats per frame.
 
-    With sums over the sequences of the batch, and F their number of frames,
+    Division by the number of frames F makes learning rates independent of sequence length. With sums over the sequences
+    of the batch,
 
         loss = - weight * sum log p / F + sum_latents weight * max(KL / F, free bits) + sum_energies weight * energy /
         F.
 
     Args:
-        kl_weight: weight of the KL terms, a number or a schedule; or one for each latent by name (others
-            weigh 1).
-        free_bits: nats per frame, averaged over the batch, below which a latent's KL costs nothing more; a
-            number for every latent, or one for each latent by name (others have none).
-        energy_weights: weight of each energy by name (others weigh 1).
-        likelihood_weight: of the log-likelihood. Where energies train the locations, and it fits no more than scales,
-            whose steps an adaptive optimiser takes at any weight, a small one leaves the loss to the energies.
-        draws: of a latent, by name, for each sequence: energies that compare samples, such as that of the best of
-            many, need several (see `DynamicalVAE.model`). The terms of the bound are means over them.
-        select: what tells the best weights: the unweighted "bound", or the "loss" itself, where energies are what is
-            trained.
+        kl_weight: weight of the KL terms, a number or a schedule; or one for each latent by name (default 1).
+        free_bits: nats per frame, averaged over the batch, below which a latent's KL is not penalised; a number for all
+            latents, or one for each latent by name (default 0).
+        energy_weights: weight of each energy by name (default 1).
+        likelihood_weight: weight of the log-likelihood. If energies train the locations and the likelihood only the
+            scales, a small weight leaves the loss to the energies; an adaptive optimiser fits the scales at any weight.
+        draws: number of draws of a latent for each sequence, by name. Energies that compare samples, such as best of
+            many, need several (see `DynamicalVAE.model`). The terms of the bound are means over the draws.
+        select: score that selects the best weights: the unweighted "bound", or the "loss" if energies are trained.
 
     Raises:
         ValueError: on the first call, when a name is not among the terms.
@@ -130,7 +128,7 @@ class Evidence:
         loss = -self.likelihood_weight * likelihood / frames
         for latent, kl in terms.kl.items():
             rate = kl.sum() / frames
-            if free_bits[latent] > 0:  # at zero there is no floor: an unbiased estimate of a KL may be negative
+            if free_bits[latent] > 0:  # no floor at zero: an unbiased estimate of a KL may be negative
                 rate = rate.clamp(min=free_bits[latent])
             loss = loss + schedule(kl_weight[latent])(step) * rate
         for name, energy in terms.energies.items():
@@ -143,7 +141,7 @@ class Evidence:
 
 
 def _by_name(option: str, value: Any, names: Iterable[str], default: float) -> dict[str, Any]:
-    """One value for each name, from one value for all or from a mapping with some of the names."""
+    """Return one value for each name, from a single value or a mapping of some names."""
     names = list(names)
     if not isinstance(value, Mapping):
         return dict.fromkeys(names, value)

@@ -1,4 +1,4 @@
-"""What a run is told: the options of the optimiser's steps, and stages with objectives of their own."""
+"""Training options, and stages with their own objectives."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,26 +17,26 @@ class Training:
     """Options of `fit`.
 
     Args:
-        steps: optimiser steps in all.
-        batch_size: sequences in a batch, in each process.
+        steps: total number of optimiser steps.
+        batch_size: number of sequences in a batch, in each process.
         learning_rate: step size of the optimiser, a number or a schedule.
-        decay: last share of the run over which a learning rate that is a number falls linearly to 0; a resumed run
-            with more steps falls later.
+        decay: last share of the run over which a constant learning rate falls linearly to 0; a resumed run with more
+            steps falls later.
         optimizer: "adam", "adamw" or "sgd".
-        momentum: of "sgd", the share of the last step that the next one goes on with.
+        momentum: momentum of "sgd", the share of the last step added to the next one.
         weight_decay: the optimiser's weight decay.
         gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
-        self_feeding: probability that a frame of x's history is replaced by the program's own mean (scheduled
-            sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. Of a model that is fed noisy data
-            (`InputNoise`), the share of that noise. The best weights are then by the bound of the program that is fed
-            so, from when the schedule has reached its last value.
-        particles: draws from the guide for each sequence and step.
-        validate_every: steps from one validation and checkpoint to the next.
-        patience: validations without a better bound after which the run stops; None to run all steps.
-        log_every: steps from one row of the log to the next.
-        seed: seed of batches and latent draws, from which each of several processes has its own.
+        self_feeding: probability that a frame of x's history is replaced by the program's own mean (scheduled sampling,
+            Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. For a model trained on noisy inputs
+            (`InputNoise`), the share of that noise. The best weights are then selected with this feeding, once the
+            schedule has reached its last value.
+        particles: number of draws from the guide for each sequence and step.
+        validate_every: number of steps between validations and checkpoints.
+        patience: number of validations without a better bound after which the run stops; None to run all steps.
+        log_every: number of steps between rows of the log.
+        seed: seed of batches and latent draws; each of several processes derives its own seed from it.
         accelerator: where to run: "auto", "cpu", "gpu", "cuda" or "mps".
-        devices: number of devices, with one process each; under torchrun, which starts them, as many as these are.
+        devices: number of devices, with one process each; under torchrun, the number of processes that it started.
         precision: precision of the computation; "32-true" leaves the model's own.
         progress: whether to show the terms on the terminal.
 
@@ -84,7 +84,7 @@ class Training:
 
     @property
     def rate(self) -> Schedule:
-        """The learning rate with its decay laid out over `steps`."""
+        """Learning rate as a schedule over `steps`, with its decay."""
         rate = schedule(self.learning_rate)
         if not self.decay:
             return rate
@@ -93,16 +93,16 @@ class Training:
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of a run with its own objective, for training in phases. Schedules still see the global step.
+    """Part of a run with its own objective, for training in phases. Schedules still read the global step.
 
     Args:
-        steps: length of the stage.
-        objective: what it minimises.
-        learning_rate: that of `Training` if None.
-        self_feeding: that of `Training` if None.
-        curriculum: how far what comes gradually has come, from 0 to 1, such as draws of what sequences share
-            (`distributions.Subset`); all the way if None.
-        frozen: parameters whose names start with one of these stay as they are.
+        steps: number of steps in the stage.
+        objective: objective to minimise.
+        learning_rate: learning rate; None for the value in `Training`.
+        self_feeding: probability of scheduled sampling; None for the value in `Training`.
+        curriculum: progress, from 0 to 1, of parts that are introduced gradually, such as draws of variables that
+            sequences share (`distributions.Subset`); None for 1.
+        frozen: prefixes of names of parameters that are not trained.
 
     Example:
         >>> import dvae
@@ -129,11 +129,11 @@ class Stage:
 def lay_out(
     options: Mapping[str, Any], objective: Objective | None, stages: Sequence[Stage]
 ) -> tuple[Training, list[Stage]]:
-    """The training options and the stages, with schedules that end in time.
+    """Return the training options and the stages, with schedules that end within the run.
 
     Raises:
-        TypeError: an option that `Training` does not have.
-        ValueError: both an objective and stages, or steps that are not those of the stages.
+        TypeError: when `Training` has no such option.
+        ValueError: when both an objective and stages are given, or `steps` differs from the total of the stages.
     """
     known = [option.name for option in fields(Training)]
     for name in options:
@@ -150,7 +150,7 @@ def lay_out(
     plan: list[Stage] = []
     end = last = total
     for stage, following in zip(reversed(stages), [None, *reversed(stages[1:])], strict=True):
-        # schedules run on through a next stage that differs in length and frozen parameters alone
+        # schedules continue into a next stage that differs only in length and frozen parameters
         if following is None or replace(following, steps=stage.steps, frozen=stage.frozen) != stage:
             last = end
         plan.insert(0, clamp(stage, last))
@@ -159,7 +159,7 @@ def lay_out(
 
 
 def stage_at(plan: Sequence[Stage], step: int) -> tuple[int, Stage]:
-    """The first step and the stage that a global step belongs to; after the last step, of the last one."""
+    """Return the first step and the stage of a global step; after the last step, of the last stage."""
     first = 0
     for stage in plan[:-1]:
         if step < first + stage.steps:
@@ -169,7 +169,7 @@ def stage_at(plan: Sequence[Stage], step: int) -> tuple[int, Stage]:
 
 
 def recorded(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
-    """The options and the stages in JSON's types."""
+    """Return the options and the stages as JSON types."""
 
     def config(stage: Stage) -> dict[str, Any]:
         objective = stage.objective

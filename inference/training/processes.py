@@ -1,11 +1,11 @@
-"""One run in several processes, of one machine or of many: what they exchange, and what happens where one is gone.
+"""Training in several processes on one machine or many: exchange of gradients, and errors when a process is lost.
 
-Every process draws batches of its own, and before a step of the optimiser gradients become those that one process would
-have with all these batches (synchronous data parallelism). They are sent at once, with the loss: models are small, and
-exchanges cost by their number more than by their bytes. (torch's own wrapper sends them in buckets, copies buffers at
-every pass, and refuses a parameter without a gradient.)
+Each process draws its own batches (synchronous data parallelism). Before a step of the optimiser, gradients are
+replaced by those of one process with all these batches. They are sent together with the loss in one message: models are
+small, so the number of messages costs more than their size. torch's own wrapper sends gradients in buckets, copies
+buffers at every pass, and refuses a parameter without a gradient.
 
-lightning-fabric starts the processes of one machine, torchrun those of several (`docs/scaling.md`).
+lightning-fabric starts the processes on one machine, torchrun those on several (`docs/scaling.md`).
 """
 
 import atexit
@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
 LONGEST_WAIT = timedelta(minutes=10)
-"""For a process that does not answer, as where a host has lost its network; one that has ended is noticed at once."""
+"""Time limit for a process that does not answer, for example after a network failure.
+
+A process that has ended is noticed at once.
+"""
 
 
 class LostProcess(RuntimeError):
@@ -37,11 +40,11 @@ def launched(training: Training) -> "Fabric":
     """Start the processes of a run, or join those that torchrun has started.
 
     Raises:
-        ValueError: torchrun has started another number of processes than `devices`, or there is no program that could
-            be started as often, or no such accelerator.
+        ValueError: when torchrun has started another number of processes than `devices`, when the program is in no file
+            and cannot be started again, or when the accelerator is not available.
     """
     _check(training)
-    from lightning_fabric import Fabric  # over a second to import, half of what `import dvae` would take
+    from lightning_fabric import Fabric  # the import takes over a second, half the time of `import dvae`
     from lightning_fabric.strategies.ddp import DDPStrategy
 
     class Unwrapped(DDPStrategy):
@@ -64,43 +67,43 @@ def launched(training: Training) -> "Fabric":
 
 
 def by_torchrun() -> bool:
-    """Whether torchrun has started this process."""
+    """Return whether torchrun has started this process."""
     return distributed.is_available() and distributed.is_torchelastic_launched()
 
 
 def restartable() -> bool:
-    """Whether torchrun starts the processes again when one of them has ended (`--max-restarts`).
+    """Return whether torchrun restarts the processes when one of them has ended (`--max-restarts`).
 
-    It counts restarts, but not those that another host has asked for.
+    torchrun counts restarts, except those that another host has asked for.
     """
     return by_torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
 
 
 def seed_of(seed: int, process: int) -> int:
-    """The seed of a process: the run's own for the first, streams that no run of another seed has for the others."""
+    """Return the seed of a process: the run's seed for the first, independent derived seeds for the others."""
     return int(np.random.SeedSequence([seed % 2**64, process]).generate_state(1)[0]) if process else seed
 
 
 def summed(fabric: "Fabric", value: Tensor) -> Tensor:
-    """The sum over the processes."""
+    """Return the sum over the processes."""
     return _all_reduce(value.to(fabric.device, copy=True)) if fabric.world_size > 1 else value
 
 
 def together(
     fabric: "Fabric", parameters: Sequence[nn.Parameter], loss: Tensor, frames: Tensor
 ) -> tuple[Tensor, Tensor | float]:
-    """Has gradients be those of the batches of all processes as one, whose loss is per frame.
+    """Replace gradients by those of the joint batch of all processes, whose loss is per frame.
 
-    A parameter has none where it has none in any process.
+    A parameter without a gradient in every process keeps none.
 
     Args:
-        fabric: of the processes.
-        parameters: that the optimiser is to move, after the backward pass.
-        loss: of this process's batch, a scalar.
-        frames: of this process's batch, a scalar.
+        fabric: fabric of the processes.
+        parameters: trained parameters, after the backward pass.
+        loss: loss of this process's batch, a scalar.
+        frames: number of frames in this process's batch, a scalar.
 
     Returns:
-        The loss of all batches, and the share that this process's has of their frames.
+        The loss of the joint batch, and this process's share of its frames.
     """
     if fabric.world_size == 1:
         return loss.detach(), 1.0
@@ -118,7 +121,7 @@ def together(
 
 
 def agree(fabric: "Fabric", values: Iterable[Tensor]) -> None:
-    """Give every process the values that the first one has, in place."""
+    """Copy the first process's values to every process, in place."""
     if fabric.world_size > 1:
         with _answered():
             for value in values:
@@ -128,27 +131,27 @@ def agree(fabric: "Fabric", values: Iterable[Tensor]) -> None:
 
 
 def gathered(fabric: "Fabric", value: Tensor) -> Tensor:
-    """The values (N,) of all processes, (processes, N), on the CPU."""
+    """Return the values (N,) of all processes, as (processes, N) on the CPU."""
     rows = value.new_zeros(fabric.world_size, *value.shape)
     rows[fabric.global_rank] = value
     return summed(fabric, rows).cpu()
 
 
 def wait(fabric: "Fabric") -> None:
-    """Go on when every process has come here."""
+    """Wait until every process has reached this call."""
     with _answered():
         fabric.barrier()
 
 
 def _all_reduce(value: Tensor) -> Tensor:
-    """The sum over the processes, in place of the value."""
+    """Replace a value by its sum over the processes, and return it."""
     with _answered():
-        distributed.all_reduce(value)  # fabric's own has them wait for one another first, in a message more
+        distributed.all_reduce(value)  # fabric's own adds a barrier, which is one more message
     return value
 
 
 def _check(training: Training) -> None:
-    """Refuses an accelerator that is not there, and more processes of a program that cannot be started again."""
+    """Refuse an unavailable accelerator, and several processes of a program that cannot be started again."""
     accelerator, devices = training.accelerator, training.devices
     there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     there["gpu"] = any(there.values())
@@ -160,7 +163,7 @@ def _check(training: Training) -> None:
 
 
 def _places(devices: int) -> tuple[int, int]:
-    """Processes on this host, and hosts."""
+    """Return the numbers of processes on this host and of hosts."""
     if not by_torchrun():
         return devices, 1
     here, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
@@ -171,7 +174,7 @@ def _places(devices: int) -> tuple[int, int]:
 
 @contextmanager
 def _answered() -> Iterator[None]:
-    """What fails within it is another process: torch names the connection, and a cause that is none of the user's."""
+    """Raise `LostProcess` for errors of communication, as torch's messages only name the connection."""
     try:
         yield
     except RuntimeError as error:
@@ -183,6 +186,6 @@ def _answered() -> Iterator[None]:
 
 
 def _leave() -> None:
-    """Leave the group of processes: threads of it that outlive the interpreter abort it. For NCCL Fabric does so."""
+    """Leave the process group: its threads would abort the interpreter at exit. For NCCL, Fabric does this."""
     if distributed.is_initialized():
         distributed.destroy_process_group()

@@ -1,4 +1,4 @@
-"""Recipes: how a model is trained on some data; and methods, which build a model and its recipe."""
+"""Recipes, which describe how to train a model on data, and methods, which build a model and its recipe."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from .options import Stage, Training
 from .schedules import Schedule
 
 FORMAT = 2
-"""Format of the config of a run."""
+"""Format version of the config of a run."""
 
 
 def _as_it_is(model: nn.Module) -> None:
-    """Nothing is taken from the data beforehand."""
+    """Leave the model unchanged."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a model is trained: `dvae.fit(model, recipe)` follows it.
+    """Description of how a model is trained; `dvae.fit(model, recipe)` follows it.
 
     Args:
-        batches: where training draws from: the data, and what the objective needs beside them.
-        validation: what the weights are judged by, or None.
-        stages: what is minimised, one after the other.
-        feeding: probability of self-feeding over the run, or share of the noise (see `Training`).
-        prepare: has the model take from the training data what its weights keep, before it is fitted.
+        batches: source of training batches, with everything that the objective needs.
+        validation: validation data for selecting the best weights, or None.
+        stages: consecutive stages, each with its objective.
+        feeding: probability of scheduled sampling over the run, or share of the noise (see `Training`).
+        prepare: called before fitting; stores statistics of the training data in the model.
     """
 
     batches: Source
@@ -44,15 +44,15 @@ class Recipe:
 
     @property
     def objective(self) -> Objective:
-        """What the last stage minimises."""
+        """Objective of the last stage."""
         return self.stages[-1].objective
 
 
 @dataclass(frozen=True)
 class Trainable:
-    """What builds a model for data and says how it is trained; its fields are its options.
+    """Base class of methods: builds a model for data and describes its training. Its fields are its options.
 
-    A subclass gives `build` and `train`, and `suited` where options may be left open.
+    A subclass implements `build` and `train`, and `suited` if an option may be left open.
 
     Raises:
         ValueError: when an option is out of range.
@@ -61,55 +61,55 @@ class Trainable:
     name: ClassVar[str]
     source: ClassVar[str]
     fitted_on: ClassVar[str] = "windows"
-    """What it is fitted on: "windows" of any kind of data, or the name of one kind (`dvae.runs.kinds.DATA`)."""
+    """Kind of training data: "windows" of any kind of data, or the name of one kind (`dvae.runs.kinds.DATA`)."""
     trainings: ClassVar[Mapping[str, Training]] = {"": Training(decay=0.5)}
-    """How it is fitted where nothing else is said, by the preset of data (`Schema.preset`), and "" for all others."""
+    """Default training options for each data preset (`Schema.preset`); "" is for all other data."""
 
     def __post_init__(self) -> None:
         check(self)
 
     def suited(self, data: Any) -> Self:
-        """With what its options leave open chosen for these data; itself, where nothing is open."""
+        """Return a copy whose open options are chosen for these data, or the method itself if none is open."""
         return self
 
     def build(self, data: Any) -> nn.Module:
-        """The model for data: their windows, their `Schema`, or sizes by name such as {"x": 60}.
+        """Build the model for data: windows, a `Schema`, or sizes by name such as {"x": 60}.
 
         Raises:
-            SchemaError: more has to be known of the data.
+            SchemaError: when the model needs to know more about the data.
         """
         raise NotImplementedError
 
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """How the model is trained on these data, in so many steps."""
+        """Return the recipe that trains the model on these data for `steps` steps."""
         raise NotImplementedError
 
     def training(self, data: Any) -> Training:
-        """How the model is fitted to these data, where nothing else is said."""
+        """Return the default training options for these data."""
         return self.trainings.get(Schema.of(data).preset, self.trainings[""])
 
     def check(self) -> None:
-        """Refuses options that do not fit together, before any data are read.
+        """Refuse options that do not fit together, before any data are read.
 
         Raises:
-            ValueError: saying which.
+            ValueError: naming the options that conflict.
         """
         with suppress(SchemaError):
             self.build(Schema({"x": 1}))
 
     def config(self) -> dict[str, Any]:
-        """Name and options in JSON's types."""
+        """Return name and options as JSON types."""
         return {"method": self.name, **asdict(self)}
 
 
 def run_config(method: Trainable, schema: Schema, kind: str, source: Any) -> dict[str, Any]:
-    """Return what `config.json` of a method's run says, but for the options of training, which `fit` adds.
+    """Return the content of `config.json` for a run of a method, without the training options, which `fit` adds.
 
     Args:
-        method: with its options.
-        schema: of the data.
-        kind: of the data, by its name.
-        source: a dataclass that says where the data are.
+        method: method with its options.
+        schema: schema of the data.
+        kind: name of the kind of data.
+        source: dataclass that describes where the data are stored.
     """
     described = {"kind": schema.kind, **schema.config()}
     return {"format": FORMAT, "method": method.config(), "schema": described, "data": {"kind": kind, **asdict(source)}}

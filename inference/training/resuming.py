@@ -1,6 +1,6 @@
-"""Checkpoints of the loop: what a step depends on goes to a run directory, and comes back checked.
+"""Checkpoints of the training loop: write everything that a step depends on, and restore it after checks.
 
-A run that is restored repeats, bit for bit on a CPU, what the uninterrupted one would have done.
+On a CPU, a restored run repeats the uninterrupted one bit for bit.
 
 Example:
     run = Run("runs/mine")
@@ -24,16 +24,16 @@ from .objectives import Adapting
 from .options import stage_at
 from .svi import SVI, NonFiniteError
 
-# what an optimiser needs of every parameter that it has moved
+# state that an optimiser needs for every parameter it has moved
 _KEPT: dict[str, set[str]] = {"adam": {"step", "exp_avg", "exp_avg_sq"}, "sgd": set()}
 _KEPT["adamw"] = _KEPT["adam"]
 
-# what state.json holds of `State`
+# fields of `State` in state.json
 _STORED = ("step", "best_step", "best_bound", "last_value", "waited", "status", "processor_seconds")
 
 
 def store(svi: SVI, run: Run) -> None:
-    """Write a checkpoint of where a run stands; every process calls it, and the first one writes."""
+    """Write a checkpoint of a run; every process calls it, and the first one writes."""
     state = svi.state
     random = {name: processes.gathered(svi.fabric, value) for name, value in _random(svi).items()}
     svi.settle()
@@ -53,12 +53,12 @@ def store(svi: SVI, run: Run) -> None:
 
 
 def restore(svi: SVI, run: Run) -> None:
-    """Return to the last checkpoint of a run, after `SVI.init`.
+    """Restore the last checkpoint of a run, after `SVI.init`.
 
     Raises:
-        CheckpointError: when its files are damaged, of another model, another optimiser, another objective with a
-            state or another number of processes.
-        ValueError: when it has taken more steps than it is to take.
+        CheckpointError: when its files are damaged, or of another model, optimiser, objective with a state, or number
+            of processes.
+        ValueError: when the run has taken more steps than `steps`.
     """
     stored, state, model, training = run.state, svi.state, svi.model, svi.training
     if stored["step"] > training.steps:
@@ -82,7 +82,7 @@ def restore(svi: SVI, run: Run) -> None:
             f"{run.path} was fitted by {count} processes, not {svi.fabric.world_size}; resume with as many, as each "
             f"has random numbers of its own: with devices={count} on one host, or by torchrun on several"
         )
-    # a copy: set_state reads the storage, so it takes another row's bytes for a view, or crashes
+    # a copy: set_state reads the whole storage, so a view would give another row's bytes, or crash
     random = {name: value[svi.fabric.global_rank].clone() for name, value in parts["random"].items()}
     try:
         # options such as the weight decay are those of this call
@@ -90,12 +90,12 @@ def restore(svi: SVI, run: Run) -> None:
         svi.optimizer.load_state_dict({"state": moments, "param_groups": options})
         svi.generator.set_state(random.pop("generator"))
         svi.random |= {name: value for name, value in random.items() if name in svi.random}
-        with svi.drawing():  # which fails where these are no states
+        with svi.drawing():  # fails if these are not states of a generator
             pass
     except (RuntimeError, TypeError, ValueError) as error:
         raise _damaged(run, str(error)) from error
     for name in _STORED:
-        setattr(state, name, stored.get(name, getattr(state, name)))  # earlier versions kept no time
+        setattr(state, name, stored.get(name, getattr(state, name)))  # earlier versions stored no time
     if isinstance(svi.objective, Adapting) and state.step > stage_at(svi.plan, state.step)[0]:
         _take_up(svi.objective, run, parts["objective"])
     if BEST in stored["fingerprints"]:
@@ -104,7 +104,7 @@ def restore(svi: SVI, run: Run) -> None:
 
 @contextmanager
 def marking_failure(svi: SVI, run: Run) -> Iterator[None]:
-    """A `NonFiniteError` within it is noted beside the last checkpoint, whose files stay as they are."""
+    """Store the status "failed" with the last checkpoint on a `NonFiniteError`; its files do not change."""
     try:
         yield
     except NonFiniteError:
@@ -114,12 +114,12 @@ def marking_failure(svi: SVI, run: Run) -> Iterator[None]:
 
 
 def _random(svi: SVI) -> dict[str, Tensor]:
-    """The states of the random number generators by name."""
+    """Return the states of the random number generators by name."""
     return {"generator": svi.generator.get_state(), **svi.random}
 
 
 def _parts(run: Run, content: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Tensors by part and by the rest of their path."""
+    """Return the tensors by part and by the rest of their path."""
     parts: dict[str, dict[str, Tensor]] = {"optimizer": {}, "random": {}, "objective": {}}
     for path, value in content.items():
         part, _, name = path.partition("/")
@@ -130,10 +130,10 @@ def _parts(run: Run, content: Mapping[str, Tensor]) -> dict[str, dict[str, Tenso
 
 
 def _moments(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> dict[int, dict[str, Tensor]]:
-    """The state of the optimiser by the place of a parameter.
+    """Return the state of the optimiser by index of the parameter.
 
     Raises:
-        CheckpointError: it is not what the optimiser writes of this model at its step, naming what is wrong.
+        CheckpointError: when it is not what the optimiser writes for this model at its step, naming what is wrong.
     """
     places = {str(place): place for place in range(len(svi.parameters))}
     moments: dict[int, dict[str, Tensor]] = {}
@@ -153,7 +153,7 @@ def _moments(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> dict[int, dict[
 
 
 def _check_random(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> None:
-    """Refuse what is no state of the run's random number generators.
+    """Refuse values that are not states of the run's random number generators.
 
     Raises:
         CheckpointError: naming what is wrong.
@@ -172,10 +172,10 @@ def _check_random(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> None:
 
 
 def _take_up(objective: Adapting, run: Run, found: Mapping[str, Tensor]) -> None:
-    """Has an objective go on with the state that a checkpoint holds of it.
+    """Restore the state of an objective from a checkpoint.
 
     Raises:
-        CheckpointError: it is of another objective, or no state that one writes.
+        CheckpointError: when the state is of another objective, or damaged.
     """
     own = objective.state
     if found.keys() != own.keys():
@@ -198,7 +198,7 @@ def _take_up(objective: Adapting, run: Run, found: Mapping[str, Tensor]) -> None
 
 
 def _sound(key: str, value: Tensor, parameter: Tensor, step: int) -> bool:
-    """Whether a value of the optimiser's state is one: its count of steps, or a moment of the parameter."""
+    """Return whether a value is a valid step count, or a valid moment of the parameter."""
     if not value.is_floating_point():
         return False
     if key == "step":

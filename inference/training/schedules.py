@@ -1,15 +1,14 @@
-"""Schedules: values that depend on the training step, such as a KL weight, a learning rate, a self-feeding
-probability.
+"""Schedules: values that depend on the training step, such as a KL weight, learning rate or probability.
 
-A schedule is a frozen dataclass called on the global step, so it carries no state: a resumed run continues
-where it stood.
+A schedule is a frozen dataclass that is called with the global step. It has no state, so a resumed run continues its
+schedules.
 
 >>> warm_up = dvae.schedules.Ramp(0.0, 1.0, steps=100)
 >>> warm_up(25), warm_up(500)
 (0.25, 1.0)
 
-KL warm-up is due to Bowman et al. (2016, arXiv 1511.06349), cosine annealing to Loshchilov
-and Hutter (2017, arXiv 1608.03983), cyclical annealing (a `Piecewise`) to Fu et al. (2019, arXiv 1903.10145).
+KL warm-up is due to Bowman et al. (2016, arXiv 1511.06349), cosine annealing to Loshchilov and Hutter (2017, arXiv
+1608.03983), cyclical annealing (a `Piecewise`) to Fu et al. (2019, arXiv 1903.10145).
 """
 
 import math
@@ -41,7 +40,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class _Rise:
-    """From `start` to `end` in `steps` steps, after `delay` steps at `start`; then constant."""
+    """Change from `start` to `end` in `steps` steps, after `delay` steps at `start`; then constant."""
 
     start: Level
     end: Level
@@ -64,13 +63,13 @@ class _Rise:
         return (1 - share) * self.start + share * self.end
 
     def _share(self, elapsed: float) -> float:
-        """Share of the way from start to end after `elapsed` (0 to 1) of the steps."""
+        """Return the share of the change after `elapsed` (0 to 1) of the steps."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Ramp(_Rise):
-    """A line from `start` to `end` in `steps` steps after `delay` steps at `start`, then constant."""
+    """Linear change from `start` to `end` in `steps` steps, after `delay` steps at `start`; then constant."""
 
     def _share(self, elapsed: float) -> float:
         return elapsed
@@ -86,14 +85,14 @@ class Cosine(_Rise):
 
 @dataclass(frozen=True)
 class Logistic(_Rise):
-    """A logistic curve from `start` to `end`, stretched so that both ends are reached exactly.
+    """Logistic curve from `start` to `end`, rescaled to reach both ends exactly.
 
     Args:
         start: value before and at `delay`.
         end: value from `delay + steps` on.
-        steps: length of the rise.
-        delay: steps at `start` before the rise.
-        steepness: slope in the middle; the curve is linear as it goes to 0 and a jump as it grows.
+        steps: number of steps of the change.
+        delay: number of steps at `start` before the change.
+        steepness: slope in the middle; towards 0 the curve becomes linear, for large values a jump.
     """
 
     steepness: Annotated[float, Range(1e-9, 1e9)] = 10.0
@@ -105,17 +104,18 @@ class Logistic(_Rise):
 
 @dataclass(frozen=True)
 class Saturating(_Rise):
-    """Fast at first and ever slower: 1 - e^{-steepness s} of the way at a share s of the steps, stretched to its end.
+    """Exponential saturation from `start` to `end`: 1 - e^{-steepness s} at a share s of the steps, rescaled.
 
-    A weight 1 - q^step, which has no end, is that of `Saturating(0.0, 1 - q**n, n, steepness=-n * log(q))` in n steps.
+    The first n steps of a weight 1 - q^step, which has no end, are `Saturating(0.0, 1 - q**n, n, steepness=-n *
+    log(q))`.
 
     Args:
         start: value before and at `delay`.
         end: value from `delay + steps` on.
-        steps: length of the rise.
-        delay: steps at `start` before the rise.
-        steepness: how many times the distance to where it tends falls by a factor of e; the curve is linear as it goes
-            to 0.
+        steps: number of steps of the change.
+        delay: number of steps at `start` before the change.
+        steepness: number of time constants in `steps`: the distance to the asymptote falls by a factor of e in each.
+            Towards 0 the curve becomes linear.
     """
 
     steepness: Annotated[float, Range(1e-9, 1e9)] = 3.0
@@ -126,9 +126,9 @@ class Saturating(_Rise):
 
 @dataclass(frozen=True)
 class Piecewise:
-    """Straight lines through `(step, value)` points; two points at one step make a jump.
+    """Linear interpolation of `(step, value)` points; two points at one step make a jump.
 
-    Before the first and after the last point it is constant.
+    The value is constant before the first and after the last point.
 
     Example:
         Piecewise(((0, 0.0), (500, 1.0), (1000, 1.0), (1000, 0.0), (1500, 1.0)))  # two annealing cycles
@@ -159,11 +159,11 @@ class Piecewise:
 Schedule = Constant | Ramp | Cosine | Logistic | Saturating | Piecewise
 _SCHEDULES = {kind.__name__: kind for kind in (Constant, Ramp, Cosine, Logistic, Saturating, Piecewise)}
 _FORMER = {"Linear": "Ramp"}
-"""Names in configs of before to those of now."""
+"""Former names of schedules in configs."""
 
 
 def schedule(value: float | Schedule) -> Schedule:
-    """Return a number as a `Constant` schedule, a schedule as it is.
+    """Return a number as a `Constant` schedule, and a schedule unchanged.
 
     Raises:
         TypeError: for anything else.
@@ -176,7 +176,7 @@ def schedule(value: float | Schedule) -> Schedule:
 
 
 def levels(value: float | Schedule) -> tuple[float, ...]:
-    """Values between which, ends included, a number or schedule always stays."""
+    """Return values whose range, ends included, contains all values of a number or schedule."""
     match schedule(value):
         case Constant(level):
             return (level,)
@@ -187,10 +187,10 @@ def levels(value: float | Schedule) -> tuple[float, ...]:
 
 
 def clamp(value: Any, steps: int, name: str = "") -> Any:
-    """Return `value` with every schedule in it finished by step `steps`, with a warning for each change.
+    """Return `value` with every schedule in it shortened to end by `steps`; warn about each change.
 
-    A schedule that is too long is compressed as a whole, delay and steps in proportion, so that its end value
-    is reached. Mappings and dataclasses are searched for schedules; anything else is returned as it is.
+    A schedule that is too long is compressed as a whole, delay and steps in proportion, so that it reaches its end
+    value. Mappings and dataclasses are searched for schedules; anything else is returned unchanged.
     """
     if isinstance(value, Schedule):
         end = _end(value)
@@ -217,7 +217,7 @@ def clamp(value: Any, steps: int, name: str = "") -> Any:
 
 
 def _end(value: Schedule) -> int:
-    """First step from which the schedule is constant."""
+    """Return the first step from which the schedule is constant."""
     match value:
         case Constant():
             return 0
@@ -242,10 +242,10 @@ def _compress(value: Schedule, steps: int) -> Schedule:
 def to_config(value: Any) -> Any:
     """Return a schedule as a JSON object whose key "schedule" names its class.
 
-    Numbers, text and None are returned as they are; mappings and sequences are searched.
+    Numbers, text and None are returned unchanged; mappings and sequences are searched.
 
     Raises:
-        TypeError: for a value that JSON has no form for.
+        TypeError: for a value that JSON cannot represent.
     """
     if isinstance(value, Schedule):
         arguments = {field.name: to_config(getattr(value, field.name)) for field in fields(value)}
@@ -260,7 +260,7 @@ def to_config(value: Any) -> Any:
 
 
 def from_config(config: Any) -> Any:
-    """Return what `to_config` was given.
+    """Return the value that `to_config` converted.
 
     Raises:
         ValueError: when "schedule" names no schedule, or its arguments do not fit.

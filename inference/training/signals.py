@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, kept until the step that they come in is done."""
+"""Handler of Ctrl-C and SIGTERM that lets the current step finish."""
 
 import signal
 import threading
@@ -8,10 +8,12 @@ from typing import Any
 
 
 class Signals:
-    """Remembers the first Ctrl-C or SIGTERM in `received`, for a loop to stop after its step; a second acts at once.
+    """Context manager that stores the first Ctrl-C or SIGTERM in `received`; a second one acts at once.
+
+    A loop reads `received` after each step and stops.
 
     Args:
-        then: what else the first one does.
+        then: called when the first signal arrives.
     """
 
     def __init__(self, then: Callable[[], object] = lambda: None) -> None:

@@ -1,9 +1,9 @@
-"""Stochastic variational inference (Hoffman et al. 2013, arXiv 1206.7051), a step at a time.
+"""Stochastic variational inference (Hoffman et al. 2013, arXiv 1206.7051), one step at a time.
 
-`SVI` draws from the guide, asks the bound for its terms and the objective for a number, and takes a step of a torch
-optimiser. lightning-fabric runs the same code on a CPU, a GPU, in bfloat16, or in several processes. Whatever varies
-over time is a schedule of the global step, and random numbers are the run's own: what the caller draws between steps
-changes nothing, nor the reverse.
+`SVI` draws from the guide, computes the terms of the bound and the loss of the objective, and takes a step of a torch
+optimiser. lightning-fabric runs the same code on a CPU, on a GPU, in bfloat16, or in several processes. Everything that
+varies over time is a schedule of the global step. The run has its own random state: draws of the caller between steps
+do not affect it, nor the reverse.
 """
 
 import math
@@ -35,7 +35,7 @@ from .schedules import schedule
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-# each of them can be fused
+# only optimisers with a fused implementation
 OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD}
 
 
@@ -45,7 +45,7 @@ class NonFiniteError(FloatingPointError):
 
 @dataclass
 class State:
-    """Where a run stands. Callbacks of `fit` read it, and set `stop` to end the run after the step."""
+    """State of a run. Callbacks of `fit` read it, and set `stop` to end the run after the step."""
 
     model: nn.Module
     step: int = 0
@@ -62,25 +62,26 @@ class State:
 
     @property
     def per(self) -> str:
-        """What bounds are per: a frame, unless the model has another word."""
+        """Unit that bounds are divided by: a frame, unless the model names another."""
         return self.model.per if isinstance(self.model, Program) else "frame"
 
 
 class SVI:
-    """Stochastic variational inference by hand: what `fit` is made of, for an epoch of one's own.
+    """Stochastic variational inference step by step, for a training loop of your own; `fit` is written with it.
 
-    On a CPU, steps on the batches that `fit` draws repeat its numbers bit for bit: `train.sample(batch_size,
-    svi.generator)`. To end and go on later, see `resuming`.
+    On a CPU, steps on the batches that `fit` draws, `train.sample(batch_size, svi.generator)`, repeat its numbers bit
+    for bit. To stop and continue later, see `resuming`.
 
     Args:
-        model: a `DynamicalVAE`, or any module that `SequenceELBO` takes.
-        objective: what to minimise; `Evidence()` by default.
-        stages: objectives one after the other, in place of `objective`; their steps are those of the run.
-        **options: fields of `Training`. Schedules and a decay end by `steps`; when to log, to validate and to stop is
-            the caller's to say.
+        model: a `DynamicalVAE`, or any module that `SequenceELBO` accepts.
+        objective: objective to minimise; `Evidence()` by default.
+        stages: consecutive stages with their own objectives, instead of `objective`; their steps add up to those of the
+            run.
+        **options: fields of `Training`. Schedules and a decay end by `steps`; the caller decides when to log, validate
+            and stop.
 
     Raises:
-        TypeError, ValueError: an option that does not exist or is out of range, or nothing to fit.
+        TypeError, ValueError: when an option does not exist or is out of range, or there is nothing to fit.
 
     Example:
         >>> import torch, dvae
@@ -121,7 +122,7 @@ class SVI:
                     "comes; what sequences share does (DynamicalVAE(shared=...))"
                 )
             if isinstance(stage.objective, Adaptive):
-                stage.objective.begin(model)  # which is refused now, not when its stage comes
+                stage.objective.begin(model)  # refuse it now rather than when its stage begins
         self.parameters = list(trained.values())
         self.final_feeding = self.rates(self.training.steps - 1)["self_feeding"]
         self._state: State | None = None
@@ -129,14 +130,14 @@ class SVI:
 
     @property
     def state(self) -> State:
-        """Where the run stands, from `init` on."""
+        """State of the run, after `init`."""
         if self._state is None:
             raise RuntimeError("the run has not begun; call init() first, which makes its optimiser")
         return self._state
 
     @property
     def objective(self) -> Objective:
-        """What the next step minimises, with its state, where it has one, that begins with its stage."""
+        """Objective of the next step; its state, if any, starts anew in each stage."""
         first, stage = stage_at(self.plan, self.state.step)
         if first not in self._begun:
             described = stage.objective
@@ -145,9 +146,9 @@ class SVI:
 
     @torch.inference_mode(False)
     def init(self) -> State:
-        """Begin at step 0, with a new optimiser and the random numbers of the seed; the weights stay as they are."""
+        """Start at step 0 with a new optimiser and the random numbers of the seed; the weights do not change."""
         training = self.training
-        with no_fork:  # lightning-fabric, and by the first optimiser parts of torch
+        with no_fork:  # imports lightning-fabric, and the first optimiser imports parts of torch
             self.fabric: Fabric = processes.launched(training)
             torch.optim.SGD([torch.zeros(1)])
         with seeded(None, self.fabric.device):
@@ -159,7 +160,7 @@ class SVI:
             self.module, self.optimizer = self.fabric.setup(bound, optimizer)
             processes.agree(self.fabric, self.model.state_dict().values())
             self.generator = torch.Generator().manual_seed(self._seed)
-            # Another seed than the generator's own: equal seeds would tie the latent draws to the choice of the batch.
+            # Not the generator's own seed: equal seeds would tie the latent draws to the choice of the batch.
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             self.random = self._random_state()
         self._state, self._begun = State(self.model), {}
@@ -174,7 +175,7 @@ class SVI:
             batch: x as a tensor (B, T, D), or a batch.
 
         Raises:
-            NonFiniteError: the loss or a gradient is NaN or infinite; the weights stay as they are.
+            NonFiniteError: when the loss or a gradient is NaN or infinite; the weights do not change.
         """
         state, training = self.state, self.training
         (_, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
@@ -190,11 +191,11 @@ class SVI:
             self.fabric.backward(loss)
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
-                parameter.grad = None  # which the optimiser leaves out, with its state
+                parameter.grad = None  # the optimiser skips a parameter without a gradient, and keeps its state
         whole, self._share = processes.together(self.fabric, self.parameters, loss, terms.frames.sum())
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
-        # the one place where a step waits for the device, on which all is queued up to the optimiser's step
+        # the only place where a step synchronises with the device; everything up to the optimiser's step is queued
         *self._numbers, of_all = torch.stack([loss.detach(), norm, whole + norm]).tolist()
         if not math.isfinite(of_all):
             impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
@@ -225,14 +226,14 @@ class SVI:
     def evaluate(self, data: Any) -> dict[str, float]:
         """Return the terms of the unweighted bound on data, in nats per frame; the model is left in evaluation mode.
 
-        The draws from the guide are the same each time, so that bounds differ by the weights alone. Processes share
-        the data, and all have the terms of the whole. A model without a likelihood has no bound but a "loss", and so
-        has an objective that selects by it. A run with self-feeding also has "self_fed/bound": of the program fed as
-        the run ends.
+        The draws from the guide are the same at each call, so bounds differ only by the weights. Processes divide the
+        data among them, and each returns the terms of all data. The row of a model without a likelihood has a "loss"
+        instead of a bound. An objective that selects by "loss" adds it to the row. A run with scheduled sampling adds
+        "self_fed/bound", the bound with the feeding at the end of the run.
 
         Args:
-            data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch, or whose `batches(size)`
-                are some sequences after the others.
+            data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch or whose `batches(size)`
+                yields batches in order.
         """
         held_out = in_batches(data)
         row = self._score(held_out, 0.0)
@@ -242,13 +243,13 @@ class SVI:
         return row
 
     def validate(self, data: Any) -> dict[str, float]:
-        """Return what `evaluate` does, as "validation/bound" and so on; keep the weights if that is the best.
+        """Return the row of `evaluate` with the prefix "validation/"; store the weights if they are the best so far.
 
-        A run with self-feeding learns to run on its own output, which costs it bound on the true past. There
-        the best is by the bound of the self-fed program, once the schedule has reached its last value.
+        Scheduled sampling trains a model to run on its own output, which lowers the bound on the true past. Its best
+        weights are therefore selected by "self_fed/bound", once the schedule has reached its last value.
 
-        A model without a likelihood has no bound; there, and where the objective says so, the best is by the objective,
-        among those that its own stages have.
+        Without a likelihood, or if the objective selects by "loss", the best weights have the lowest loss. A stage with
+        another objective starts this comparison anew.
         """
         state, row = self.state, self.evaluate(data)
         fed = "self_fed/" if self.final_feeding else ""
@@ -256,19 +257,19 @@ class SVI:
         if not fed or self.rates(state.step - 1)["self_feeding"] == self.final_feeding:
             state.waited += 1
             if "loss" in row and state.best_step is not None and not self._alike(state.best_step, state.step):
-                state.best_bound = None  # it is another objective's
+                state.best_bound = None  # the best loss so far is of another objective
             if score > (-math.inf if state.best_bound is None else state.best_bound):  # never true of NaN
                 state.best_step, state.best_bound, state.waited = state.step, score, 0
                 state.best = weights(self.model)
         return {f"validation/{name}": value for name, value in row.items()}
 
     def _alike(self, first: int, second: int) -> bool:
-        """Whether losses at two steps are of one objective."""
+        """Return whether losses at two steps are of the same objective."""
         before, now = (stage_at(self.plan, step)[1].objective for step in (first, second))
         return before is now or before == now
 
     def rates(self, step: int) -> dict[str, float]:
-        """The learning rate, the probability of self-feeding and the curriculum, if there is one, at a global step."""
+        """Return learning rate, probability of scheduled sampling and curriculum, if there is one, at a global step."""
         _, stage = stage_at(self.plan, step)
         given = {"learning_rate": self.training.rate, "self_feeding": self.training.self_feeding}
         own = {name: getattr(stage, name) for name in given}
@@ -278,7 +279,7 @@ class SVI:
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
-        """Within it, torch draws the run's random numbers; the caller's random state is left as it was."""
+        """Use the run's random state inside the context, and restore the caller's afterwards."""
         with seeded(None, self.fabric.device):
             torch.set_rng_state(self.random["torch"])
             if "cuda" in self.random:
@@ -287,15 +288,15 @@ class SVI:
             self.random = self._random_state()
 
     def total(self, value: Tensor) -> Tensor:
-        """The sum over the processes."""
+        """Return the sum over the processes."""
         return processes.summed(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """The mean over the processes of what the last step's batches have a frame."""
+        """Return the mean over the processes of a rate per frame of the last step, weighted by their frames."""
         return self.total(value * self._share)
 
     def settle(self) -> None:
-        """Have what training moves beside parameters, such as running means, be the first process's in all of them."""
+        """Copy buffers that training changes, such as running means, from the first process to all."""
         parameters = dict(self.model.named_parameters())
         moved = [value for name, value in self.model.state_dict().items() if name not in parameters]
         processes.agree(self.fabric, moved)
@@ -310,14 +311,14 @@ class SVI:
         return {"torch": torch.get_rng_state(), **cuda}
 
     def _score(self, data: InBatches, feeding: float) -> dict[str, float]:
-        """The unweighted terms on held-out data, per frame, with the same draws each time."""
+        """Return the unweighted terms on held-out data, per frame, with the same draws at each call."""
         objective = stage_at(self.plan, self.state.step)[1].objective
-        last = self.training.steps  # of the weights, so that losses can be compared
+        last = self.training.steps  # the last weights of the schedules, so that losses can be compared
         self.settle()
         sums, fabric = dict[str, Tensor](), self.fabric
         size = min(self.training.batch_size, math.ceil(len(data) / fabric.world_size))
         shares = fabric.global_rank * size < len(data)
-        # of a process that has no batch, the first one for the names alone
+        # a process without a batch of its own scores the first one, only for the names of the terms
         first, end = (fabric.global_rank, None) if shares else (0, 1)
         own = islice(data.batches(size), first, end, fabric.world_size)
         self.module.eval()
@@ -335,10 +336,10 @@ class SVI:
     def _terms(
         self, batch: AnyBatch, objective: Objective, where: str, feeding: float, curriculum: float | None = None
     ) -> Terms:
-        """Terms of a batch that the objective needs, on the device of the model."""
+        """Return the terms of a batch that the objective needs, on the device of the model."""
         refuse_table(batch)
         placed = Batch(batch if isinstance(batch, Mapping) else {"x": batch}).map(tensor_of)
-        if not isinstance(self.model, DynamicalVAE):  # which reads in its own precision
+        if not isinstance(self.model, DynamicalVAE):  # a DynamicalVAE converts to its own precision
             dtype = self.parameters[0].dtype
             placed = placed.map(lambda v: v.to(dtype) if v.is_floating_point() else v)
         program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
@@ -348,7 +349,7 @@ class SVI:
         try:
             measure = self.objective.measure if isinstance(self.objective, Adapting) else None
             on_device = self.fabric.to_device(placed)
-            return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensors that it sees
+            return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensor arguments
         except ValueError as error:
             if not _by_distribution(error):
                 raise
@@ -356,15 +357,15 @@ class SVI:
 
 
 def _by_distribution(error: ValueError) -> bool:
-    """Return whether a distribution raised the error: torch's refuse NaN parameters and values."""
+    """Return whether a distribution raised the error: torch's distributions refuse NaN parameters and values."""
     *_, (frame, _) = walk_tb(error.__traceback__)
     return str(frame.f_globals.get("__name__")).startswith(("torch.distributions", "pyro.distributions"))
 
 
 class _Bound(nn.Module):
-    """The bound's terms as the output of a module, which is what synchronises gradients between processes.
+    """Module that returns the terms of the bound, as fabric needs a module to set up training.
 
-    Pyro's `ELBOModule` does the same for a single number; objectives need the terms.
+    Pyro's `ELBOModule` returns a single number; objectives need the terms.
     """
 
     def __init__(self, model: nn.Module, estimator: SequenceELBO) -> None:
@@ -376,7 +377,7 @@ class _Bound(nn.Module):
         self, batch: Callable[[], Batch], program: Mapping[str, Any], measure: Callable[[Terms], None] | None
     ) -> dict[str, Any]:
         terms = self.estimator.terms(self.model, batch(), **program)
-        # here, as from what leaves the module fabric alone may take gradients
+        # here, because only fabric may compute gradients from the output of the module
         if measure is not None and torch.is_grad_enabled():
             with torch.autocast(terms.frames.device.type, enabled=False):
                 measure(terms)
@@ -384,7 +385,7 @@ class _Bound(nn.Module):
 
 
 def _sums(terms: Terms) -> dict[str, Tensor]:
-    """Each term summed over the sequences of a batch, and the number of frames."""
+    """Return the sum of each term over the sequences of a batch, and the number of frames."""
     named = {
         **({"bound": terms.bound} if terms.likelihood else {}),
         **{f"log_likelihood/{name}": value for name, value in terms.log_likelihood.items()},
@@ -401,7 +402,7 @@ def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
 
 
 def _culprit(model: nn.Module, terms: Terms, loss: Tensor) -> str:
-    """The first term, or else the loss or a gradient, that is not finite."""
+    """Return a description of the first term, or else of the loss or a gradient, that is not finite."""
     groups = {"log likelihood": terms.log_likelihood, "KL": terms.kl, "energy": terms.energies}
     for group, values in groups.items():
         for name, value in values.items():

@@ -1,9 +1,8 @@
-"""Trackers: where the numbers of a run go, row by row. A history, a file of JSON lines, TensorBoard, the
-terminal.
+"""Trackers: receivers of a run's log, such as a history, a file of JSON lines, TensorBoard or the terminal.
 
-A row maps names to numbers: `bound`, `log_likelihood/x`, `kl/z` are those of a training batch, the same names
-under `validation/` those of the validation data, in nats per frame; `loss`, `gradient_norm`, `learning_rate`,
-`self_feeding` are of the step, and so is `weight/x` where an objective's weights adapt.
+A row maps names to numbers, in nats per frame. `bound`, `log_likelihood/x` and `kl/z` are of a training batch. With the
+prefix `validation/` they are of the validation data. `loss`, `gradient_norm`, `learning_rate` and `self_feeding` are of
+the step, and so is `weight/x` if an objective's weights adapt.
 """
 
 import io
@@ -23,16 +22,16 @@ from ..evaluation.result import Plain, progress_bar
 from .checkpoints import CheckpointError
 
 LARGEST_LOG = 2**25
-"""Bytes of a file of JSON lines."""
+"""Largest size of a file of JSON lines, in bytes."""
 MOST_ROWS = 200_000
-"""In a file of JSON lines; in memory, a row takes many times its bytes."""
+"""Largest number of rows in a file of JSON lines; in memory, a row takes many times its bytes."""
 
 
 class Tracker(Protocol):
-    """Receives the rows of a run."""
+    """Receiver of the rows of a run."""
 
     def start(self, step: int) -> None:
-        """Begin at a step; stored rows of later steps belong to an abandoned run and are dropped."""
+        """Start at a step; stored rows of later steps belong to an abandoned run and are dropped."""
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
         """Store a row."""
@@ -42,7 +41,7 @@ class Tracker(Protocol):
 
 
 class InMemory:
-    """Keeps the rows in `rows`, a list of dicts with the key "step".
+    """List of rows in `rows`: dicts with the key "step".
 
     Args:
         rows: rows of an earlier part of the run.
@@ -60,23 +59,23 @@ class InMemory:
         self.rows.append({"step": step, **row})
 
     def close(self) -> None:
-        """Keep the rows."""
+        """Do nothing; the rows remain."""
 
 
 class JSONLines:
-    """Appends each row to a file as one line of JSON.
+    """File with one line of JSON for each row.
 
     Args:
-        path: the file; it is made on `start`.
+        path: the file; `start` creates it.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
 
     def start(self, step: int) -> None:
-        """Drop rows after `step`, and a last line that was cut off, then open the file for appending."""
+        """Drop rows after `step`, and an incomplete last line, then open the file for appending."""
         kept = [json.dumps(row) + "\n" for row in self.read() if row["step"] <= step]
-        with files.written(self.path) as new:  # a file of its own, to which nothing else leads
+        with files.written(self.path) as new:  # a new file, which no link can share
             new.write("".join(kept).encode())
         self._file = files.open_plain(self.path, os.O_WRONLY | os.O_APPEND)
 
@@ -90,10 +89,11 @@ class JSONLines:
         self._file.close()
 
     def read(self) -> list[dict[str, Any]]:
-        """Return the rows of the file, without a last line that was cut off; none if there is no file.
+        """Return the rows of the file, without an incomplete last line; an empty list if there is no file.
 
         Raises:
-            CheckpointError: a line that is no row of numbers, too many rows or bytes, or a path that is no plain file.
+            CheckpointError: when a line is no row of numbers, there are too many rows or bytes, or the path is no plain
+                file.
         """
         try:
             content = files.read(self.path, LARGEST_LOG)
@@ -120,7 +120,7 @@ class JSONLines:
 
 
 def row_of(line: bytes) -> dict[str, Any] | None:
-    """The row of a line, if that maps "step" to a count and every name to a number."""
+    """Return the row of a line if it maps "step" to a count and every name to a number, otherwise None."""
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):
@@ -132,10 +132,10 @@ def row_of(line: bytes) -> dict[str, Any] | None:
 
 
 class TensorBoard:
-    """Writes scalars that `tensorboard --logdir DIRECTORY` shows.
+    """Writer of scalars that `tensorboard --logdir DIRECTORY` displays.
 
     Args:
-        directory: the folder of the event files.
+        directory: folder of the event files.
     """
 
     def __init__(self, directory: str | os.PathLike[str]) -> None:
@@ -144,7 +144,7 @@ class TensorBoard:
     def start(self, step: int) -> None:
         """Open an event file that hides rows after `step`."""
         optional("tensorboard", "tensorboard")
-        from torch.utils.tensorboard import SummaryWriter  # slow to import, so only where it is wanted
+        from torch.utils.tensorboard import SummaryWriter  # slow to import, so imported only on use
 
         with files.naming(self.directory):
             self._writer = SummaryWriter(self.directory, purge_step=step + 1)
@@ -162,12 +162,12 @@ class TensorBoard:
 
 
 class Bar:
-    """Shows how far a fit is, and no numbers: of one that is a part of something else.
+    """Progress bar without numbers, for a fit that is part of a larger computation.
 
     Args:
-        name: what is fitted.
+        name: name of the fit.
         steps: last step of the run.
-        shown: whether to show it.
+        shown: whether to display the bar.
     """
 
     def __init__(self, name: str, steps: int, shown: bool) -> None:
@@ -179,16 +179,16 @@ class Bar:
         self._bar.start()
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
-        """Move it on."""
+        """Advance the bar."""
         self._bar.update(self._task, completed=step)
 
     def close(self) -> None:
-        """Take it away."""
+        """Remove the bar."""
         self._bar.stop()
 
 
 class Terminal:
-    """A progress bar with the terms of the bound; away from a terminal, a line for each tenth of the run.
+    """Progress bar with the terms of the bound; if output is not a terminal, a line for each tenth of the run.
 
     Args:
         steps: last step of the run.
@@ -202,7 +202,7 @@ class Terminal:
         self._bar: Progress | None = None
 
     def start(self, step: int) -> None:
-        """Show the bar, or nothing yet."""
+        """Show the bar, or nothing yet without a terminal."""
         self._next_line = step + self.steps / 10
         if self.console.is_terminal and not self.console.is_jupyter:
             rate = TextColumn("{task.fields[rate]}")
@@ -225,7 +225,7 @@ class Terminal:
             self._print()
 
     def close(self) -> None:
-        """Leave the bar as it stands, or write the last line."""
+        """Leave the bar on the screen, or write the last line."""
         if self._bar is not None:
             self._bar.stop()
         elif self._latest:
