@@ -106,6 +106,7 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     )
 
 
+@pytest.mark.filterwarnings("always:left out of what is proposed")
 def test_what_is_proposed_of_dates_units_and_row_numbers_is_said(tmp_path, capfd):
     path, days = tmp_path / "shops.csv", pd.date_range("2024-01-01", periods=12)
     told = pd.DataFrame({"date": np.tile(days.strftime("%d/%m/%y"), 16), "sold": np.arange(16.0 * 12)})
