@@ -53,9 +53,9 @@ class AnnealedBound:
         error: standard error of the bound, (B,), from the spread of the weights, with K - 1 degrees of freedom for an
             interval by Student's t. It covers only the modes that the chains visit: if all stay in one of two equal
             modes, the bound is log 2 too low, whatever `error` and `effective` are. The upper bound on simulated data
-            reveals such a deficit. With few effective chains the error is too small. NaN for reverse chains: those of a
-            sequence start at one draw, and their spread does not include the randomness of that draw. For the error of
-            a mean over sequences, use the spread of their bounds.
+            reveals such a deficit. With few effective chains the error is too small. NaN for reverse chains: all chains
+            of a sequence start at one draw, and their spread does not include the randomness of that draw. For the
+            error of a mean over sequences, use the spread of their bounds.
         effective: effective number of chains, between 1 and K, (B,); NaN for reverse chains. It does not account for a
             mode that no chain visits.
         accepted: share of accepted proposals, (B,).
@@ -139,7 +139,7 @@ def annealed_bound(
 
 
 def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the latents from which reverse chains start, in the model's dtype and on its device.
+    """Return the starting latents of reverse chains, in the model's dtype and on its device.
 
     Raises:
         ValueError: when a latent is missing, or has another shape.

@@ -72,8 +72,8 @@ def particle_bound(
         Bound (B,), effective sample size (T, B), number of resamplings (B,).
 
     Raises:
-        ValueError: when the factorization cannot run forward step by step (the guide runs backward in time, or a factor
-            reads latents after t, such as p(x_t | z_{1:T})), or data or context are missing in the batch.
+        ValueError: when the guide runs backward in time, a factor reads latents after t, such as p(x_t | z_{1:T}), or
+            data or context are missing in the batch.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})

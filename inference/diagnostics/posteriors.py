@@ -78,7 +78,7 @@ class Posterior:
         course: energies during the search from the start that reached the lowest, (steps, B).
         left: reduction of the energy by another Newton step, in nats, if the energy were quadratic, (B,); about 0 after
             convergence.
-        bent: number of directions in which the energy is less curved than with the prior alone, (B,). There the normal
+        bent: number of directions with less curvature of the energy than with the prior alone, (B,). There the normal
             is as wide as the prior, because otherwise it would be wider or have no finite width.
         factor: lower triangular factor of the covariance of all latent numbers of a sequence, in the order of `mode`,
             (B, P, P).

@@ -177,8 +177,8 @@ def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 2
     The statistic is the share of samples in the ball around the point with the truth on its surface. It is uniform if
     samples and truth have the same distribution, for any point, any K and with ties, as in `pit_histogram`. Unlike the
     PIT of single numbers, it depends on all numbers together. If it is uniform for all points that depend on the input
-    of the forecast, the distribution of the samples is that of the truth. With points that do not depend on the input,
-    samples that ignore the input also pass.
+    of the forecast, samples and truth have the same distribution. With points that do not depend on the input, samples
+    that ignore the input also pass.
 
     Args:
         samples: samples `(..., K, T, D)`.
@@ -307,8 +307,8 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
 def frechet_distance(features: Array, other: Array) -> Tensor:
     """Return the Fréchet distance of normal fits to two sets of features: FID (Heusel et al. 2017, arXiv:1706.08500).
 
-    See `gaussian_frechet_distance`; covariances are unbiased (divided by N - 1), in double precision. The distance is
-    biased upward in small sets. It compares distributions, and ignores which features belong to which window.
+    It is `gaussian_frechet_distance` with unbiased covariances (divided by N - 1), in double precision. The distance is
+    biased upward in small sets. It compares distributions, and ignores the correspondence of features to windows.
 
     Args:
         features: features `(N, F)`, N at least 2.
@@ -358,7 +358,7 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
     """Return the Fréchet distance between features of true and generated windows, as a jackknife pseudo-value per clip.
 
-    See `jackknife_pseudo_values`.
+    The pseudo-values are those of `jackknife_pseudo_values`.
 
     Args:
         real: features `(N, F)` of the true futures.
