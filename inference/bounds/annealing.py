@@ -1,10 +1,11 @@
 """Bounds on the evidence from both sides: annealed importance sampling from guide to posterior, and in reverse.
 
     f_b(z) = q(z | x)^(1 - b) p(x, z)^b,    0 = b_0 < ... < b_L = 1,
-    log w  = sum_l (b_l - b_{l-1}) (log p(x, z_l) - log q(z_l | x)),   z_1 ~ q,   z_{l+1} by a step that leaves f_{b_l}
+    log w  = sum_l (b_l - b_{l-1}) (log p(x, z_l) - log q(z_l | x)),   z_1 ~ q,   z_{l+1} ~ T_l(z_l)
 
-The mean weight is unbiased for p(x) (Neal, 2001), so its logarithm is a lower bound on average. The larger L, the less
-the bound depends on the quality of the guide; with L = 1 it is the IWAE bound.
+The transition T_l leaves f_{b_l} invariant. The mean weight is unbiased for p(x) (Neal, 2001), so its logarithm is a
+lower bound on average. The larger L, the less the bound depends on the quality of the guide; with L = 1 it is the IWAE
+bound.
 
 If data are simulated from the model, the simulated latents are an exact draw from their posterior. Chains that start
 there and run back to the guide give weights whose mean inverse is unbiased for 1 / p(x): an upper bound (bidirectional

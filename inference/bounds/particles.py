@@ -307,7 +307,7 @@ def _log_mean(log_weights: Tensor) -> Tensor:
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the log probability (N,) of values (N, D), without entries that are not `counted`."""
     entries = conditional.distribution(parameters).log_prob(conditional.scored(value, counted))
-    if counted is not None and counted.dim() != entries.dim():  # either guide or model scores whole events
+    if counted is not None and counted.dim() != entries.dim():  # only guide or model scores whole events
         counted = counted.all(-1) if conditional.whole else counted[:, None]
     # where rather than a product: an entry that is not counted may be infinite
     entries = entries if counted is None else torch.where(counted, entries, 0.0)

@@ -354,7 +354,10 @@ def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str
 
 
 def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lower roots (B, P, P) of the inverse of the curvature, raised to the prior's, and the number of raises."""
+    """Return lower roots (B, P, P) of the inverse curvature, and the number of directions that were raised.
+
+    In directions with less curvature than the prior's, the curvature is raised to the prior's.
+    """
     kind, curvature, prior = curvature, curvature.double(), prior.double()
     root, failed = torch.linalg.cholesky_ex(prior)
     if failed.any():

@@ -174,7 +174,7 @@ class Comparison(Result):
         Args:
             metric: a metric of all models.
             level: probability that the best model is in the set.
-            over_seeds: whether to account for other training seeds; if False, the set is for these very weights.
+            over_seeds: whether to account for other training seeds; if False, the set is for these weights only.
 
         Raises:
             KeyError: when a model has no such metric.

@@ -89,7 +89,7 @@ class Evaluation(Result):
         bound_particles: number of particles of the IWAE bound, 0 if it was not computed.
         seed: seed of every method's draws.
         log_score_particles: number of particles of the log score, 0 if it was not computed.
-        basis: requirements of scores by name, such as the weights of a metric model or a ground truth.
+        basis: what scores depend on by name, such as the weights of a metric model or a ground truth.
         notes: lines below the table on how to read scores.
         options: further arguments of the models' `forecast`.
 

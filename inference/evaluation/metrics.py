@@ -5,8 +5,8 @@ are proper: no forecaster gains by spreading its samples. The Fréchet distance 
 own shapes. Applications add their own errors, such as the best of K samples.
 
 Calibration (coverage, PIT) depends on the rank of each number of the truth among the K numbers of the samples. If
-forecasts are calibrated, the truth is exchangeable with the samples. Its rank, random among ties, is then uniform on 0,
-..., K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1. This is
+forecasts are calibrated, the truth is exchangeable with the samples. Its rank, random among ties, is then uniform from
+0 to K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1. This is
 uniform on 0 to 1 for every K, and also for discrete data (Czado, Gneiting and Held 2009). Shares and moments are
 expectations over V, so nothing is drawn. Their values for calibrated forecasts are exact for every K.
 
@@ -206,10 +206,10 @@ def coverage(samples: Array, truth: Array, level: float) -> Tensor:
     is whole, the interval is from the h-th smallest sample to the h-th largest one. These contain a truth that is
     exchangeable with them with probability 1 - 2 h / (K + 1), exactly.
 
-    Otherwise, a truth in the gap between samples that contains the end counts as the part of the gap, by its rank, that
-    is inside. This equals an interval whose ends are drawn from the two samples so that their mean ranks are h. A truth
-    with ties counts as the part of its ranks that is inside, so coverage is `level` for discrete data, too. (Intervals
-    with all their ties contain more.)
+    Otherwise, each end is in a gap between two samples. A truth in this gap counts as the part of the gap, by its rank,
+    that is inside. This equals an interval whose ends are drawn from the two samples so that their mean ranks are h. A
+    truth with ties counts as the part of its ranks that is inside, so coverage is `level` for discrete data, too.
+    (Intervals with all their ties contain more.)
 
     Below h = 1, for K < 2 / (1 - level) - 1, the interval extends beyond all samples with probability 1 - h. Its mean
     is still `level` for calibrated forecasts, but it is less informative about others, and with K = 1 not at all.

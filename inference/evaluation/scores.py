@@ -66,7 +66,7 @@ def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
 
 
 def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
-    """Return clip values of a score that is NaN for some windows; their mean is that over the other windows.
+    """Return clip values of a score that is NaN for some windows; their mean is over the other windows.
 
     The value of a clip is R + N / M (s_c - R m_c) / n_c. Here s_c is the sum over the m_c of its n_c windows with a
     score, M the number of all such windows among N, and R the mean over these M. This is a linearised ratio of sums,
@@ -104,7 +104,8 @@ class Measure:
         headline: whether a comparison shows it in its table.
         truth: name of a reference row that forecasts the true futures, if the score needs it as a comparison.
         note: line below the table.
-        basis: requirements of the score by name, such as a seed, as JSON types, for the result.
+        basis: what the score depends on by name, such as a seed or the weights of a metric model, as JSON types, for
+            the result.
         bins: 0 for a score; for a histogram, the number of its bins. A histogram is in `Row.histograms` and in no
             table, and `function` returns shares `(B, bins)`.
         least: fewest forecasts of a window for this score; rows with fewer, such as point forecasts, omit it.

@@ -140,7 +140,7 @@ def confidence_set(
         contenders: score on the same clips for each name.
         better: "lower" or "higher".
         level: probability that the best model is in the set.
-        over_seeds: whether to account for other training seeds; if False, the set is for these very weights.
+        over_seeds: whether to account for other training seeds; if False, the set is for these weights only.
         draws: number of draws of the null distribution.
         seed: seed of the draws.
 
@@ -292,7 +292,7 @@ def required(
     common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
 
     def reached(clips: int, *numbers: int) -> float:
-        """Return the power of `Crossed.estimate`: errors and degrees of freedom are drawn as they would be measured."""
+        """Return the power, averaged over the errors and degrees of freedom that `Crossed.estimate` may measure."""
         both = [*zip(rest, own, numbers, strict=True)]
         over = (common + sum(r / n for r, _, n in both)) / clips
         between = [(o + r / clips) / n for r, o, n in both]

@@ -94,7 +94,7 @@ def together(
 ) -> tuple[Tensor, Tensor | float]:
     """Average gradients over processes, as for one batch of all their sequences with a loss per frame.
 
-    A parameter without a gradient in every process keeps none.
+    A parameter keeps no gradient if it has none in any process.
 
     Args:
         fabric: fabric of the processes.
