@@ -90,7 +90,7 @@ class Run:
 
     @property
     def exists(self) -> bool:
-        """Whether the directory holds a checkpoint."""
+        """Whether the directory contains a checkpoint."""
         return os.path.lexists(self.path / STATE)
 
     @property
