@@ -374,10 +374,10 @@ def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tu
 def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
     """Return the distance of a whole set of windows as a jackknife pseudo-value of each clip.
 
-    The pseudo-value is d + (1/w - 1) (d - d'), with d' the distance without the clip and w the clip's share of the
-    windows (Busing, Meijer and van der Leeden 1999). A common constant is added so that the mean over windows is d,
-    because the mean of plain pseudo-values is corrected for bias. For a mean over windows, pseudo-values are the means
-    of the clips, so the errors of both kinds of scores are computed alike.
+    The pseudo-value is d + (1/w - 1) (d - d') (Busing, Meijer and van der Leeden 1999). d' is the distance without the
+    clip, and w the clip's share of the windows. A common constant is added so that the mean over windows is d, because
+    the mean of plain pseudo-values is corrected for bias. For a mean over windows, pseudo-values are the means of the
+    clips, so the errors of both kinds of scores are computed alike.
 
     Args:
         whole: d, distance of the whole set.

@@ -68,9 +68,9 @@ def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
 def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
     """Return clip values of a score that is NaN for some windows; their mean is over the other windows.
 
-    The value of a clip is R + N / M (s_c - R m_c) / n_c. Here s_c is the sum over the m_c of its n_c windows with a
-    score, M the number of all such windows among N, and R the mean over these M. This is a linearised ratio of sums,
-    which gives the errors of a ratio (Cochran 1977). All clips are NaN if no window has a score.
+    The value of a clip is R + N / M (s_c - R m_c) / n_c. Here m_c of its n_c windows have a score, with the sum s_c. M
+    is the number of such windows among all N, and R the mean over these M. This is a linearised ratio of sums, which
+    gives the errors of a ratio (Cochran 1977). All clips are NaN if no window has a score.
     """
     places, known = clips.numpy(), ~values.isnan().numpy()
     if not known.any():

@@ -271,8 +271,8 @@ def required(
         seeds: numbers of seeds per model in the result.
 
     Raises:
-        ValueError: when a model has one seed, scores are on different clips or not finite, the difference is 0 or not
-            finite, seeds are below 2, or power or level is not between 0 and 1.
+        ValueError: when a model has one seed, or scores are on different clips or not finite. Also when the difference
+            is 0 or not finite, seeds are below 2, or power or level is not between 0 and 1.
     """
     if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(
