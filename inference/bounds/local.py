@@ -138,7 +138,7 @@ class Correction:
 
 
 class Local(nn.Module):
-    """Conditional of the guide with a correction, which replaces the conditional.
+    """Corrected conditional of the guide, which replaces the original one.
 
     Args:
         own: conditional of the guide.
