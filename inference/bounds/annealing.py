@@ -1,10 +1,11 @@
 """Bounds on the evidence from both sides: annealed importance sampling from guide to posterior, and in reverse.
 
     f_b(z) = q(z | x)^(1 - b) p(x, z)^b,    0 = b_0 < ... < b_L = 1,
-    log w  = sum_l (b_l - b_{l-1}) (log p(x, z_l) - log q(z_l | x)),   z_1 ~ q,   z_{l+1} by a step that leaves f_{b_l}
+    log w  = sum_l (b_l - b_{l-1}) (log p(x, z_l) - log q(z_l | x)),   z_1 ~ q,   z_{l+1} ~ T_l(z_l)
 
-The mean weight is unbiased for p(x) (Neal, 2001), so its logarithm is a lower bound on average. The larger L, the less
-the bound depends on the quality of the guide; with L = 1 it is the IWAE bound.
+The transition T_l leaves f_{b_l} invariant. The mean weight is unbiased for p(x) (Neal, 2001), so its logarithm is a
+lower bound on average. The larger L, the less the bound depends on the quality of the guide; with L = 1 it is the IWAE
+bound.
 
 If data are simulated from the model, the simulated latents are an exact draw from their posterior. Chains that start
 there and run back to the guide give weights whose mean inverse is unbiased for 1 / p(x): an upper bound (bidirectional
@@ -53,9 +54,9 @@ class AnnealedBound:
         error: standard error of the bound, (B,), from the spread of the weights, with K - 1 degrees of freedom for an
             interval by Student's t. It covers only the modes that the chains visit: if all stay in one of two equal
             modes, the bound is log 2 too low, whatever `error` and `effective` are. The upper bound on simulated data
-            reveals such a deficit. With few effective chains the error is too small. NaN for reverse chains: those of a
-            sequence start at one draw, and their spread does not include the randomness of that draw. For the error of
-            a mean over sequences, use the spread of their bounds.
+            reveals such a deficit. With few effective chains the error is too small. NaN for reverse chains: all chains
+            of a sequence start at one draw, and their spread does not include the randomness of that draw. For the
+            error of a mean over sequences, use the spread of their bounds.
         effective: effective number of chains, between 1 and K, (B,); NaN for reverse chains. It does not account for a
             mode that no chain visits.
         accepted: share of accepted proposals, (B,).
@@ -139,7 +140,7 @@ def annealed_bound(
 
 
 def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the latents from which reverse chains start, in the model's dtype and on its device.
+    """Return the starting latents of reverse chains, in the model's dtype and on its device.
 
     Raises:
         ValueError: when a latent is missing, or has another shape.

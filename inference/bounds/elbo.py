@@ -80,7 +80,7 @@ class SequenceELBO(ELBO):
     It can be used like any Pyro ELBO; `terms` returns it by variable and sequence. The KL of a latent is analytic per
     step if both conditionals are normal and no generative parent of the latent is its descendant in the guide.
     Otherwise it is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic
-    form is wrong: it holds parents fixed that vary with the latent.) The parents are those of the program as it runs:
+    form is wrong: it holds parents fixed that vary with the latent.) The parents are taken from the program as it runs:
     where x is missing or replaced in scheduled sampling, the model reads its own mean, which varies with the parents of
     x.
 
@@ -198,7 +198,7 @@ def site_log_prob(fn: Any, value: Tensor) -> Tensor:
 
 
 def log_densities(trace: Any) -> dict[str, Tensor]:
-    """Return the log probabilities of the sample sites of a trace, without energies; see `site_log_prob`."""
+    """Return `site_log_prob` of the sample sites of a trace, without energies."""
     sites = sites_of(trace).items()
     return {n: site_log_prob(s["fn"], s["value"]) for n, s in sites if n == "log_det" or not isinstance(s["fn"], Unit)}
 

@@ -104,7 +104,7 @@ class Correction:
     links: tuple[Link, ...]
 
     def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]]) -> Parameters:
-        """Return location and scale (k B, S, D) from those of the guide and the latents by step."""
+        """Return location and scale (k B, S, D), given the guide's own and the latents by step."""
         if len(parameters[0]) % len(self.unit):
             raise ValueError(
                 f"this guide is of {len(self.unit)} sequences of its own, and the batch has {len(parameters[0])} rows; "
@@ -138,7 +138,7 @@ class Correction:
 
 
 class Local(nn.Module):
-    """Conditional of the guide with a correction, which replaces the conditional.
+    """Corrected conditional of the guide, which replaces the original one.
 
     Args:
         own: conditional of the guide.
@@ -156,7 +156,7 @@ class Local(nn.Module):
         return super().__getattr__(name) if name == "own" else getattr(self.own, name)
 
     def forward(self, parents: Mapping[str, Tensor], *arguments: Any) -> Parameters:
-        """See `Conditional`."""
+        """Return the corrected parameters; same arguments as in `Conditional`."""
         values = {link.parent: _by_step(parents[link.parent]) for link in self.correction.links}
         own = self.own(parents, *arguments)
         if self.factor.local:
@@ -172,7 +172,7 @@ class Local(nn.Module):
         return None, self.own.start(given, batch, length, lengths), known, steps
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
-        """See `Conditional`."""
+        """Return the corrected parameters; same arguments as in `Conditional`."""
         fixed, inner, known, steps = state
         if fixed is None:
             own, inner = self.own.step(inner, t, drawn, count)
@@ -181,7 +181,7 @@ class Local(nn.Module):
         return _alone(steps[t](_with_step(own), {**drawn, **known})), (fixed, inner, known, steps)
 
     def chain(self, *_: Any) -> None:
-        """Return None: there is no fused loop."""
+        """Return None, as no fused loop exists."""
 
 
 def _by_step(value: Tensor) -> Sequence[Tensor]:
@@ -265,7 +265,7 @@ def local_guide(
 
 
 def require_local(model: DynamicalVAE) -> None:
-    """Refuse a model for which semi-amortized guides are not possible.
+    """Refuse a model without latents that allow semi-amortized guides.
 
     Raises:
         ValueError: when the model has no latents or no likelihood, or a latent is not normal in the guide.

@@ -72,8 +72,8 @@ def particle_bound(
         Bound (B,), effective sample size (T, B), number of resamplings (B,).
 
     Raises:
-        ValueError: when the factorization cannot run forward step by step (the guide runs backward in time, or a factor
-            reads latents after t, such as p(x_t | z_{1:T})), or data or context are missing in the batch.
+        ValueError: when the guide runs backward in time, a factor reads latents after t, such as p(x_t | z_{1:T}), or
+            data or context are missing in the batch.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
@@ -307,7 +307,7 @@ def _log_mean(log_weights: Tensor) -> Tensor:
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the log probability (N,) of values (N, D), without entries that are not `counted`."""
     entries = conditional.distribution(parameters).log_prob(conditional.scored(value, counted))
-    if counted is not None and counted.dim() != entries.dim():  # either guide or model scores whole events
+    if counted is not None and counted.dim() != entries.dim():  # only guide or model scores whole events
         counted = counted.all(-1) if conditional.whole else counted[:, None]
     # where rather than a product: an entry that is not counted may be infinite
     entries = entries if counted is None else torch.where(counted, entries, 0.0)

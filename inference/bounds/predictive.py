@@ -14,8 +14,8 @@ by the guide given past and future, and weighted:
 The mean of K weights is unbiased for F, so its logarithm is on average at most log F. The bound underestimates the
 score, less so with more particles, and not at all if both guides are posteriors.
 
-With missing entries, the density is of the observed entries of x_{O+1:T}, given those of x_{1:O}. A model that reads
-its own past reads its means at missing entries, as in the bounds.
+With missing entries, it is the density of the observed entries of x_{O+1:T}, given the observed ones of x_{1:O}. A
+model that reads its own past reads its means at missing entries, as in the bounds.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ def _posterior_means(model: DynamicalVAE, batch: Batch) -> dict[str, Tensor]:
 
 
 def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
-    """Return the information of each latent about which of the M sequences it is from: (T,), or (1,) if static."""
+    """Return each latent's information about the data among the M sequences, (T,), or (1,) if static."""
     batch = on_device_of(model, batch)
     size = length_of(batch)
     drawn = model.guide(batch) if size else {}

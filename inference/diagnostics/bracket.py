@@ -117,7 +117,7 @@ class Bracket(Result):
             frame: whether to return nats per frame instead of per sequence.
 
         Raises:
-            KeyError: when there is no such bound.
+            KeyError: when the bound does not exist for these data.
         """
         known = self.bounds[data]
         if lacking := [name for name in (bound, above) if name and name not in known]:
@@ -268,10 +268,10 @@ def bracket(
         data: windows, x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
         count: number of sequences, drawn at random; None for all.
         particles: K, number of draws of ELBOs and IWAE, and of particles of FIVO.
-        temperatures, chains: L and K of annealed importance sampling, see `annealed_bound`.
-        fitting: number of steps of the semi-amortized guides, see `local_guide`; 0 omits them and the parts of the gap,
+        temperatures, chains: L and K of annealed importance sampling, as in `annealed_bound`.
+        fitting: number of steps of the semi-amortized guides (`local_guide`); 0 omits them and the parts of the gap,
             and chains start at the model's own guide.
-        reach: largest distance in steps of edges in the semi-amortized guides, see `local_guide`.
+        reach: largest distance in steps of edges in the semi-amortized guides (`local_guide`).
         seed: seed of all draws.
         batch_size: number of sequences in a batch.
         progress: whether to show a progress bar.

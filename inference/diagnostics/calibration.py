@@ -425,7 +425,7 @@ def _poisson(largest: int, mean: float) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _critical(alpha: float, count: int, draws: int) -> float:
-    """Return the largest tail that is rejected at level alpha; 0 if there is none."""
+    """Return the largest tail that is rejected at level alpha; 0 if no tail is rejected."""
     candidates = np.unique(_tails(count, draws))
     place = bisect_right(candidates, alpha, key=lambda least: _ecdf_test(np.array([least]), count, draws)[0])
     return float(candidates[place - 1]) * (1 + 1e-9) if place else 0.0

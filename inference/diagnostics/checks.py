@@ -1,8 +1,8 @@
 """Predictive checks: do replicated sequences look like real ones?
 
-`predictive_checks` compares statistics of real windows with those of forecasts and of draws from the posterior
-predictive distribution (Gelman, Meng and Stern, 1996). `STATISTICS` lists statistics for any sequences, and `usual`
-returns them in the unit of the data.
+`predictive_checks` compares statistics of real windows, forecasts and draws from the posterior predictive distribution
+(Gelman, Meng and Stern, 1996). `STATISTICS` lists statistics for any sequences, and `usual` returns them in the unit of
+the data.
 """
 
 from __future__ import annotations
@@ -328,7 +328,7 @@ def predictive_checks(
     batch_size: int = 32,
     progress: bool = True,
 ) -> PredictiveChecks:
-    """Replicate windows with one or several models, and compare statistics with those of the real windows.
+    """Replicate windows with one or several models, and compare statistics of real and replicated windows.
 
     There are two kinds of replicates, both free-running. "forecast": the frames after the observed ones. The last two
     observed frames are joined to them, so that a jump counts. "posterior", the posterior predictive distribution:
@@ -341,7 +341,7 @@ def predictive_checks(
     Args:
         model: a model, or `{name: model}`.
         windows: `ArrayWindows`, or any `HeldOutWindows`.
-        statistics: `Statistic` by name, such as those of an application; `usual` by default.
+        statistics: `Statistic` by name, for example from an application; `usual` by default.
         samples: S, number of replicates of each window; at least 19, so that tail areas below .05 have a probability of
             a tenth at most.
         draw_emission: whether replicates are draws of x. Its means have no emission noise: with them, the check is of

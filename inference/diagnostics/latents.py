@@ -57,8 +57,8 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
         sequences: indices of sequences in the batch; None for all.
 
     Raises:
-        ValueError: when the model has no likelihood or latents, a latent is not any real number or is shared by
-            sequences, data are missing, or a sequence is not in the batch.
+        ValueError: when the model has no likelihood or latents, or a latent is shared by sequences or restricted to
+            some real numbers. Also when data are missing, or a sequence is not in the batch.
     """
     require_likelihood(model)
     require_latents(model)

@@ -78,7 +78,7 @@ class Posterior:
         course: energies during the search from the start that reached the lowest, (steps, B).
         left: reduction of the energy by another Newton step, in nats, if the energy were quadratic, (B,); about 0 after
             convergence.
-        bent: number of directions in which the energy is less curved than with the prior alone, (B,). There the normal
+        bent: number of directions with less curvature of the energy than with the prior alone, (B,). There the normal
             is as wide as the prior, because otherwise it would be wider or have no finite width.
         factor: lower triangular factor of the covariance of all latent numbers of a sequence, in the order of `mode`,
             (B, P, P).
@@ -354,7 +354,10 @@ def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str
 
 
 def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lower roots (B, P, P) of the inverse of the curvature, raised to the prior's, and the number of raises."""
+    """Return lower roots (B, P, P) of the inverse curvature, and the number of directions that were raised.
+
+    In directions with less curvature than the prior's, the curvature is raised to the prior's.
+    """
     kind, curvature, prior = curvature, curvature.double(), prior.double()
     root, failed = torch.linalg.cholesky_ex(prior)
     if failed.any():

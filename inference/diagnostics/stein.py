@@ -43,7 +43,7 @@ class SteinDiscrepancy(Result):
     """Distance of a guide's draws from the posterior of each of S sequences, with a test of its significance.
 
     Attributes:
-        squared: KSD^2, (S,); it may be below 0, as it is unbiased.
+        squared: KSD^2, (S,); unbiased, so it may be negative.
         critical: value that draws from the posterior exceed in 5 % of cases, (S,).
         p_values: share of the bootstrap that is not below the value, (S,).
         p_value: p-value of all sequences together, by the sum of their KSD^2.
@@ -140,8 +140,8 @@ def stein_discrepancy(
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: when the model has no latents or likelihood, a latent is shared by sequences or is not any real
-            number, a sequence is not in the batch, data are missing, or a number is too small.
+        ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or restricted to
+            some real numbers. Also when a sequence is not in the batch, data are missing, or a number is too small.
         FloatingPointError: when a gradient is not finite.
 
     Example:

@@ -142,7 +142,7 @@ class ReferencePosterior(Result):
 
     @property
     def bias(self) -> np.ndarray:
-        """Mean of the guide minus that of the reference, in standard deviations of the reference, (S, Q)."""
+        """Difference of the means of guide and reference, in standard deviations of the reference, (S, Q)."""
         return (self.guide.mean - self.reference.mean) / self.reference.deviation  # type: ignore[no-any-return]
 
     @property
@@ -152,7 +152,7 @@ class ReferencePosterior(Result):
 
     @property
     def ratio(self) -> np.ndarray:
-        """Standard deviation of the guide over that of the reference, (S, Q); below 1: too narrow."""
+        """Ratio of the standard deviations of guide and reference, (S, Q); below 1: too narrow."""
         return self.guide.deviation / self.reference.deviation  # type: ignore[no-any-return]
 
     @property
@@ -163,7 +163,7 @@ class ReferencePosterior(Result):
 
     @property
     def lack(self) -> np.ndarray:
-        """Correlations of the reference minus those of the guide, (S, Q, Q)."""
+        """Difference of the correlations of reference and guide, (S, Q, Q)."""
         return self.reference.correlation - self.guide.correlation  # type: ignore[no-any-return]
 
     @property
@@ -377,8 +377,8 @@ def reference_posterior(
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: when the model has no latents or likelihood, a latent is shared by sequences or is not any real
-            number, a sequence is not in the batch, data are missing, or a number is too small.
+        ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or restricted to
+            some real numbers. Also when a sequence is not in the batch, data are missing, or a number is too small.
         FloatingPointError: when the log joint is not finite at the start of a chain.
 
     Example:

@@ -78,12 +78,12 @@ def compare(
     Args:
         models: a model by name, or several that differ only in their training seed.
         data: windows (such as `ArrayWindows`), x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
-        scores: scores of forecasts; see `evaluate`.
+        scores: scores of forecasts, as in `evaluate`.
         particles: K of the IWAE bound. k-hat needs 25, and 100 or more to be meaningful for single sequences.
         estimates: number of independent IWAE estimates of every sequence, each with K particles. The bound is their
             mean. `Comparison.to_arviz` needs 25 or more.
-        filter_particles: K of the FIVO bound (see `particle_bound`); 0 omits it. For a model without a FIVO bound, such
-            as one with a backward guide, a note gives the reason.
+        filter_particles: K of the FIVO bound (`particle_bound`); 0 omits it. For a model without a FIVO bound, such as
+            one with a backward guide, a note gives the reason.
         contrasts: M, number of randomly drawn sequences among which information is measured; all if there are fewer, 0
             omits it.
         samples: forecasts per window for the free-running scores; 0 omits these, which take longest. Tensors, batches
@@ -98,7 +98,7 @@ def compare(
         The comparison; print it, or use its `table`, `plot`, `difference`, `to_json` and `to_arviz`.
 
     Raises:
-        ValueError: when there are no models, models in one row differ in equations or sizes, a number is out of range,
+        ValueError: when `models` is empty, models in one row differ in equations or sizes, a number is out of range,
             the data have no sequences, or windows to forecast are ragged.
         TypeError: when the data are of another kind, or a value in `models` is no model.
         FloatingPointError: when a bound is not finite, naming model and sequence.

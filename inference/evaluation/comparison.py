@@ -106,13 +106,13 @@ class Comparison(Result):
         protocol: fields of the windows' protocol; empty for tensors.
         particles: K of the IWAE bound.
         contrasts: M, number of sequences among which information was measured; its upper limit is log M.
-        samples: forecasts per window, 0 if there are no free-running scores.
+        samples: forecasts per window, 0 without free-running scores.
         emission: "mean" or "drawn": kind of forecasts.
         seed: seed of every model's draws.
         shown: unit of each free-running score in the table.
-        notes: lines below that table on how to read scores, or why there are none.
+        notes: lines below that table on how to read scores, or why they are missing.
         better: "lower", "higher" or "" for each score of that table.
-        filter_particles: K of the FIVO bound; 0 if there is none.
+        filter_particles: K of the FIVO bound; 0 if it was not computed.
 
     Example:
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
@@ -148,7 +148,7 @@ class Comparison(Result):
         return sorted(self.rows, key=lambda name: -self[name]["importance bound"].mean)
 
     def difference(self, first: str, second: str, metric: str = "importance bound") -> Estimate:
-        """Return the paired difference of two models, first minus second; see `estimates` for its standard errors.
+        """Return the paired difference of two models, first minus second; `estimates` describes its errors.
 
         Raises:
             KeyError: when a model was not compared, or one of the two has no such metric.
@@ -174,7 +174,7 @@ class Comparison(Result):
         Args:
             metric: a metric of all models.
             level: probability that the best model is in the set.
-            over_seeds: whether to account for other training seeds; if False, the set is for these very weights.
+            over_seeds: whether to account for other training seeds; if False, the set is for these weights only.
 
         Raises:
             KeyError: when a model has no such metric.
@@ -184,7 +184,7 @@ class Comparison(Result):
         return confidence_set(self._all(metric), better, level, over_seeds=over_seeds)
 
     def required(self, first: str, second: str, metric: str = "importance bound", **options: Any) -> Requirement:
-        """Return how many training seeds and clips would distinguish two models (see `many.required` for the options).
+        """Return how many training seeds and clips would distinguish two models (options as in `many.required`).
 
         Raises:
             KeyError: as `difference`.

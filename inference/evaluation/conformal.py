@@ -81,12 +81,12 @@ class Tubes(Result):
     data: Mapping[str, Any]
 
     def tube(self, forecasts: Tensor, region: str = "future") -> tuple[Tensor, Tensor]:
-        """Return the bands of forecasts that are made like those of the calibration.
+        """Return the bands of forecasts, which must be made as in the calibration.
 
         Args:
             forecasts: forecasts `(K, B, H, D)` of a model or reference.
-            region: what a band contains with probability `level`: "number", each number alone; "frame", all numbers of
-                a frame; or the whole "future".
+            region: region that a band contains with probability `level`: "number", each number alone; "frame", all
+                numbers of a frame; or the whole "future".
 
         Returns:
             Lower and upper end, `(B, H, D)` each.
@@ -244,18 +244,18 @@ def conformal(
 ) -> Tubes:
     """Calibrate prediction bands around forecasts on windows that the model was not fitted to.
 
-    The bands contain the future of new windows with probability `level` if their clips are exchangeable with those of
-    calibration, for example of the same people and styles. Calibration on clips of one person or style gives no
+    The bands contain the future of new windows with probability `level` if their clips are exchangeable with the
+    calibration clips, for example of the same people and styles. Calibration on clips of one person or style gives no
     guarantee for another. Later steps of the same sequences are not exchangeable with earlier ones, so windows divided
     by time are refused.
 
     Args:
-        model: a model (`Forecasting`), or the name of a reference row, see `References`.
+        model: a model (`Forecasting`), or the name of a reference row (`References`).
         windows: calibration windows.
         level: share of windows to contain, between 0 and 1.
         groups: name of the exchangeable group of each window, if groups are larger than clips, such as its style. A
             level of 0.9 needs 9 of them.
-        residuals: windows, such as those of training, for errors of the mean forecast. Their root mean square at each
+        residuals: windows, such as training windows, for errors of the mean forecast. Their root mean square at each
             frame and coordinate is the spread instead of the forecasts' standard deviation: for point forecasts, or a
             badly distributed spread.
         samples: K, number of drawn forecasts of a window.
@@ -266,8 +266,8 @@ def conformal(
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: when the level is invalid, there are too few clips for it, forecasts have no spread, windows cannot
-            be forecast or are one part of sequences divided by time, or `groups` and windows differ in number.
+        ValueError: when the level is invalid or needs more clips, forecasts have no spread, or `groups` and windows
+            differ in number. Also when windows cannot be forecast, or are one part of sequences divided by time.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})

@@ -127,7 +127,7 @@ class Crossed:
         return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / whole, whole)
 
     def estimate(self, other: Crossed | None = None) -> Estimate:
-        """Return the mean, or its paired difference to another model's, with the errors of the module's docstring."""
+        """Return the mean, or its paired difference to another model's, with errors as in the module docstring."""
         mean, deviations, between, rest = self.mean, self.deviations, self.seeds, self.rest
         of_seeds = [(self.seeds, self.count - 1)]
         if other is not None:

@@ -61,10 +61,10 @@ def evaluate(
 
     Args:
         model: a model (`Forecasting`), or `{name: model}`.
-        windows: `ArrayWindows`, or any `HeldOutWindows`; for data with parts, such as `dvae.tables.PanelData`, those of
-            the test split.
+        windows: `ArrayWindows`, or any `HeldOutWindows`; for data with parts, such as `dvae.tables.PanelData`, the test
+            split is used.
         scores: function from the windows to scores of forecasts: `proper` scoring rules, `calibrated`, which adds
-            coverage and PIT, or those of an application.
+            coverage and PIT, or scores of an application.
         samples: K, number of forecasts per window.
         seed: seed of every method's draws.
         batch_size: number of windows in a batch.
@@ -72,8 +72,8 @@ def evaluate(
             model's predictive distribution only if x is drawn. None for draws, or for means if a score is published for
             means (`Measure.of_means`); see `DynamicalVAE.is_drawn` for exceptions.
         bound_particles: number of particles of the IWAE bound and its k-hat; 0 omits both.
-        log_score_particles: number of particles of the log score, see `predictive_bound`; 0 omits it.
-        references: whether to add the reference rows that are available; or names of some, see `References`.
+        log_score_particles: number of particles of the log score (`predictive_bound`); 0 omits it.
+        references: whether to add the reference rows that are available; or names of some (`References`).
         training_windows: training data of "mean", "climatology" and "nearest neighbours", such as x (N, T, D); without
             it these are omitted.
         season: period of "seasonal", in frames; by default from the windows' description.
@@ -87,9 +87,9 @@ def evaluate(
 
     Raises:
         TypeError: when a model cannot forecast, or the data do not define which steps are observed.
-        ValueError: when windows are ragged or have no step to predict, a forecast has the wrong shape, a model has the
-            name of a reference row, a requested reference row is not available, `samples` is below one, or two scores
-            have one name.
+        ValueError: when windows are ragged or have no step to predict, a forecast has the wrong shape, or `samples` is
+            below one. Also when two scores, or a model and a reference row, have one name, or a requested reference row
+            is not available.
         FloatingPointError: when a forecast or bound is not finite, naming method and window.
 
     Example:

@@ -89,7 +89,7 @@ class Evaluation(Result):
         bound_particles: number of particles of the IWAE bound, 0 if it was not computed.
         seed: seed of every method's draws.
         log_score_particles: number of particles of the log score, 0 if it was not computed.
-        basis: requirements of scores by name, such as the weights of a metric model or a ground truth.
+        basis: what scores depend on by name, such as the weights of a metric model or a ground truth.
         notes: lines below the table on how to read scores.
         options: further arguments of the models' `forecast`.
 
@@ -209,7 +209,7 @@ class Evaluation(Result):
             the band, `(bins - 1,)` each; the band is NaN for one clip.
 
         Raises:
-            KeyError: when there is no such method or histogram.
+            KeyError: when the method or histogram does not exist.
         """
         shares = self._histogram(method, histogram).cumsum(1)[:, :-1].T
         points = np.arange(1, len(shares) + 1) / (len(shares) + 1)
@@ -256,7 +256,7 @@ class Evaluation(Result):
     def plot_horizon(self) -> Figure:
         """Draw PIT histograms at some frames of the future, and coverage over these frames, for each method.
 
-        Bands are two standard errors, clustered by clip; see `scores.over_horizon`.
+        Bands are two standard errors, clustered by clip. The scores come from `scores.over_horizon`.
 
         Raises:
             KeyError: when no method has a histogram of a frame.

@@ -52,7 +52,7 @@ class Held:
         return self.batch.rows(part)
 
     def past(self, part: slice) -> Batch:
-        """Return the input of forecasts for some windows: x `(B, O, D)`, see `Batch.past`."""
+        """Return the input of forecasts for some windows: x `(B, O, D)`, as in `Batch.past`."""
         return self.part(part).past(self.observed)
 
     @property
@@ -89,7 +89,7 @@ class Held:
 
 
 def hold(data: Any) -> Held:
-    """Prepare windows for evaluation; for data with parts, those of the test split.
+    """Prepare windows for evaluation; for data with parts, use the test split.
 
     Raises:
         TypeError: when the data do not define which steps are observed.

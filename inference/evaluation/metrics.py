@@ -5,8 +5,8 @@ are proper: no forecaster gains by spreading its samples. The Fréchet distance 
 own shapes. Applications add their own errors, such as the best of K samples.
 
 Calibration (coverage, PIT) depends on the rank of each number of the truth among the K numbers of the samples. If
-forecasts are calibrated, the truth is exchangeable with the samples. Its rank, random among ties, is then uniform on 0,
-..., K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1. This is
+forecasts are calibrated, the truth is exchangeable with the samples. Its rank, random among ties, is then uniform from
+0 to K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1. This is
 uniform on 0 to 1 for every K, and also for discrete data (Czado, Gneiting and Held 2009). Shares and moments are
 expectations over V, so nothing is drawn. Their values for calibrated forecasts are exact for every K.
 
@@ -177,8 +177,8 @@ def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 2
     The statistic is the share of samples in the ball around the point with the truth on its surface. It is uniform if
     samples and truth have the same distribution, for any point, any K and with ties, as in `pit_histogram`. Unlike the
     PIT of single numbers, it depends on all numbers together. If it is uniform for all points that depend on the input
-    of the forecast, the distribution of the samples is that of the truth. With points that do not depend on the input,
-    samples that ignore the input also pass.
+    of the forecast, samples and truth have the same distribution. With points that do not depend on the input, samples
+    that ignore the input also pass.
 
     Args:
         samples: samples `(..., K, T, D)`.
@@ -206,10 +206,10 @@ def coverage(samples: Array, truth: Array, level: float) -> Tensor:
     is whole, the interval is from the h-th smallest sample to the h-th largest one. These contain a truth that is
     exchangeable with them with probability 1 - 2 h / (K + 1), exactly.
 
-    Otherwise, a truth in the gap between samples that contains the end counts as the part of the gap, by its rank, that
-    is inside. This equals an interval whose ends are drawn from the two samples so that their mean ranks are h. A truth
-    with ties counts as the part of its ranks that is inside, so coverage is `level` for discrete data, too. (Intervals
-    with all their ties contain more.)
+    Otherwise, each end is in a gap between two samples. A truth in this gap counts as the part of the gap, by its rank,
+    that is inside. This equals an interval whose ends are drawn from the two samples so that their mean ranks are h. A
+    truth with ties counts as the part of its ranks that is inside, so coverage is `level` for discrete data, too.
+    (Intervals with all their ties contain more.)
 
     Below h = 1, for K < 2 / (1 - level) - 1, the interval extends beyond all samples with probability 1 - h. Its mean
     is still `level` for calibrated forecasts, but it is less informative about others, and with K = 1 not at all.
@@ -307,8 +307,8 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
 def frechet_distance(features: Array, other: Array) -> Tensor:
     """Return the Fréchet distance of normal fits to two sets of features: FID (Heusel et al. 2017, arXiv:1706.08500).
 
-    See `gaussian_frechet_distance`; covariances are unbiased (divided by N - 1), in double precision. The distance is
-    biased upward in small sets. It compares distributions, and ignores which features belong to which window.
+    It is `gaussian_frechet_distance` with unbiased covariances (divided by N - 1), in double precision. The distance is
+    biased upward in small sets. It compares distributions, and ignores the correspondence of features to windows.
 
     Args:
         features: features `(N, F)`, N at least 2.
@@ -358,7 +358,7 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
     """Return the Fréchet distance between features of true and generated windows, as a jackknife pseudo-value per clip.
 
-    See `jackknife_pseudo_values`.
+    The pseudo-values are those of `jackknife_pseudo_values`.
 
     Args:
         real: features `(N, F)` of the true futures.
@@ -374,10 +374,10 @@ def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tu
 def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
     """Return the distance of a whole set of windows as a jackknife pseudo-value of each clip.
 
-    The pseudo-value is d + (1/w - 1) (d - d'), with d' the distance without the clip and w the clip's share of the
-    windows (Busing, Meijer and van der Leeden 1999). A common constant is added so that the mean over windows is d,
-    because the mean of plain pseudo-values is corrected for bias. For a mean over windows, pseudo-values are the means
-    of the clips, so the errors of both kinds of scores are computed alike.
+    The pseudo-value is d + (1/w - 1) (d - d') (Busing, Meijer and van der Leeden 1999). d' is the distance without the
+    clip, and w the clip's share of the windows. A common constant is added so that the mean over windows is d, because
+    the mean of plain pseudo-values is corrected for bias. For a mean over windows, pseudo-values are the means of the
+    clips, so the errors of both kinds of scores are computed alike.
 
     Args:
         whole: d, distance of the whole set.

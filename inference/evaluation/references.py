@@ -80,7 +80,7 @@ def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Te
             observed value.
 
     Returns:
-        One forecast, `(1, B, H, D)`, laid out like those of a model.
+        One forecast, `(1, B, H, D)`, laid out like forecasts of a model.
     """
     return bridged(observed, mask)[None, :, -1:].expand(-1, -1, horizon, -1)
 
@@ -189,7 +189,7 @@ class References:
         season: number of frames in a period; by default from the windows' description.
 
     Raises:
-        ValueError: on indexing, when there is no such reference, or it is not available.
+        ValueError: on indexing, when the reference does not exist or is not available.
     """
 
     held: Held
@@ -199,10 +199,10 @@ class References:
     season: int | None = None
 
     def lacking(self, name: str) -> str:
-        """Return what a reference needs but is missing; empty if the reference is available.
+        """Return the missing requirement of a reference; empty if the reference is available.
 
         Raises:
-            ValueError: when there is no such reference.
+            ValueError: when the reference does not exist.
         """
         name = self._names.get(name, name)
         if name not in self._makers:
@@ -224,7 +224,7 @@ class References:
 
     @property
     def usual(self) -> list[str]:
-        """Default rows of an evaluation: those of the windows, or else of their kind, if available."""
+        """Default rows of an evaluation: defined by the windows, or else by their kind, if available."""
         names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
         return [name for name in names if not self.lacking(name)]
 

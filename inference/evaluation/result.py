@@ -76,7 +76,10 @@ def _as_it_is(cell: Any) -> Any:
 
 
 def _shown(text: str) -> str:
-    """Return the text with escape characters made visible; rich drops the other control characters."""
+    """Return the text with visible escape characters, so that it cannot control the terminal.
+
+    Rich drops the other control characters.
+    """
     return text.replace("\x1b", r"\x1b")
 
 

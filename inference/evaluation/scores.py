@@ -66,11 +66,11 @@ def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
 
 
 def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
-    """Return clip values of a score that is NaN for some windows; their mean is that over the other windows.
+    """Return clip values of a score that is NaN for some windows; their mean is over the other windows.
 
-    The value of a clip is R + N / M (s_c - R m_c) / n_c. Here s_c is the sum over the m_c of its n_c windows with a
-    score, M the number of all such windows among N, and R the mean over these M. This is a linearised ratio of sums, so
-    its errors are those of a ratio (Cochran 1977). All clips are NaN if no window has a score.
+    The value of a clip is R + N / M (s_c - R m_c) / n_c. Here m_c of its n_c windows have a score, with the sum s_c. M
+    is the number of such windows among all N, and R the mean over these M. This is a linearised ratio of sums, which
+    gives the errors of a ratio (Cochran 1977). All clips are NaN if no window has a score.
     """
     places, known = clips.numpy(), ~values.isnan().numpy()
     if not known.any():
@@ -94,9 +94,9 @@ class Measure:
 
     Args:
         name: name of the score.
-        function: function of forecasts `(B, K, H, D)`, true futures `(B, H, D)` with NaN where they were not observed,
-            the past (x `(B, O, D)`, its mask if there is one, and context) and the indices `(B,)` of these windows
-            among all; it returns the score `(B,)`, on the CPU.
+        function: function of forecasts `(B, K, H, D)`, true futures `(B, H, D)`, past, and indices `(B,)` of these
+            windows among all; it returns the score `(B,)`, on the CPU. Futures are NaN where they were not observed.
+            The past has x `(B, O, D)`, its mask if there is one, and context.
         unit, better, partial: see `Metric`.
         pool: function of the scores of all windows, `(N, ...)`, and the clip of each; it returns a value for each clip,
             whose mean weighted by windows is the score. A score of the whole set returns pseudo-values, a histogram
@@ -104,7 +104,8 @@ class Measure:
         headline: whether a comparison shows it in its table.
         truth: name of a reference row that forecasts the true futures, if the score needs it as a comparison.
         note: line below the table.
-        basis: requirements of the score by name, such as a seed, as JSON types, for the result.
+        basis: what the score depends on by name, such as a seed or the weights of a metric model, as JSON types, for
+            the result.
         bins: 0 for a score; for a histogram, the number of its bins. A histogram is in `Row.histograms` and in no
             table, and `function` returns shares `(B, bins)`.
         least: fewest forecasts of a window for this score; rows with fewer, such as point forecasts, omit it.
@@ -204,7 +205,7 @@ def width_at(level: float) -> Measure:
 
 
 def reaching(level: float) -> int:
-    """Return the fewest samples of which some lie outside a central interval of this level."""
+    """Return the fewest samples that define a central interval of this level with samples outside."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
     return math.ceil(round(2 / (1 - level) - 1, 9))
@@ -262,7 +263,7 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
             them as `description["columns"]`.
 
     Raises:
-        ValueError: when the number of columns differs from that of the forecasts.
+        ValueError: when the number of columns differs from the forecasts.
 
     Example:
         >>> [each.name for each in by_column(CRPS, {"speed": "m/s", "load": "kN"})]
@@ -329,7 +330,7 @@ def _part(
 
 
 def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -> list[Measure]:
-    """Return scores of calibration of the whole future and of single frames; see `calibrated`.
+    """Return scores of calibration of the whole future and of single frames, as in `calibrated`.
 
     Args:
         windows: evaluated windows.

@@ -1,6 +1,6 @@
 """Run directories: weights, the state for resuming training, and a description of the run.
 
-    config.json        what was run: method, schema, data, training options
+    config.json        description of the run: method, schema, data, training options
     best.safetensors   weights at the best unweighted validation bound (absent without validation data)
     last.safetensors   weights at the last checkpoint
     last.state.safetensors  optimiser, random number generators and the state of an objective
@@ -90,7 +90,7 @@ class Run:
 
     @property
     def exists(self) -> bool:
-        """Whether the directory holds a checkpoint."""
+        """Whether the directory contains a checkpoint."""
         return os.path.lexists(self.path / STATE)
 
     @property
@@ -208,7 +208,7 @@ class Run:
         """Return the size in bytes of the weights that `load_weights` reads.
 
         Raises:
-            CheckpointError: when there are none.
+            CheckpointError: when the file is missing.
         """
         name = BEST if BEST in self.state["fingerprints"] else LAST
         self._settle(name, self.state["fingerprints"][name])
@@ -397,7 +397,7 @@ def _depth(value: Any) -> int:
 
 
 def _content(path: Path, most: int, links: bool = False) -> bytes | None:
-    """Return the content of a file; None if there is none."""
+    """Return the content of a file; None if it does not exist."""
     try:
         with _refusing():
             return files.read(path, most, links)

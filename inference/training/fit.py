@@ -199,8 +199,7 @@ def fit(
         validation: x as a tensor, a batch, or an object whose `all()` returns a batch or whose `batches(size)` yields
             batches in order.
         objective: objective to minimise; `Evidence()` by default.
-        stages: consecutive stages with their own objectives, instead of `objective`; their steps add up to those of the
-            run.
+        stages: consecutive stages with their own objectives, instead of `objective`, for all steps of the run.
         out: run directory for checkpoints and `log.jsonl` (see `checkpoints`). If a method is fitted to data that can
             be opened again, `dvae.load` and `dvae.resume` read the run.
         resume: whether to continue the run in `out` from its last checkpoint up to `steps`.
@@ -297,7 +296,7 @@ def _fit(
     callbacks: Sequence[Callback],
     **options: Any,
 ) -> Fit:
-    """Run the loop; see `fit`."""
+    """Run the loop for `fit`."""
     svi = SVI(model, objective, stages, **options)
     training = svi.training
     if validation is None and is_divided(train):

@@ -85,8 +85,8 @@ def _discrete(model: DynamicalVAE) -> tuple[list[list[int]], Tensor]:
 def _spreads(x: Tensor, seen: Tensor, classes: Sequence[list[int]], discrete: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean (D,) and standard deviations (T, D).
 
-    Row 0 holds deviations from the mean, row h those of differences over h steps. For a class, the first coordinate
-    holds the probability of each class in row 0, and the probability of no change in later rows.
+    Row 0 is for deviations from the mean, row h for differences over h steps. For a class, the first coordinate has the
+    probability of each class in row 0, and the probability of no change in later rows.
     """
     count = seen.sum((0, 1)).clamp(min=1)
     mean = x.sum((0, 1)) / count

@@ -6,13 +6,13 @@ set (Hansen, Lunde and Nason, 2011): models that are not significantly worse tha
 model that is most clearly worse, and contains the best model with at least its level. The less informative the data,
 the more models it contains. `required` computes the power of a paired difference for other numbers of seeds and clips.
 
-Errors are those of `estimates`: over clips, which models share, and over training seeds, which they do not. Variances
-over few seeds are uncertain, and if they are small by chance, differences look significant that are not. The null
-distribution of the confidence set therefore draws variances first, each the measured one times f over chi-squared with
-its f degrees of freedom. For a single difference this is Student's t (the fiducial distribution of Behrens and Fisher).
-The paper's block bootstrap is not possible with two or three seeds. Each pair has its own null distribution, and the
-smallest of these p-values is compared with its null distribution (Westfall and Young, 1993); the paper uses the largest
-t of all pairs.
+Errors are computed as in `estimates`: over clips, which models share, and over training seeds, which they do not.
+Variances over few seeds are uncertain, and if they are small by chance, differences look significant that are not. The
+null distribution of the confidence set therefore draws variances first, each the measured one times f over chi-squared
+with its f degrees of freedom. For a single difference this is Student's t (the fiducial distribution of Behrens and
+Fisher). The paper's block bootstrap is not possible with two or three seeds. Each pair has its own null distribution,
+and the smallest of these p-values is compared with its null distribution (Westfall and Young, 1993); the paper uses the
+largest t of all pairs.
 """
 
 from __future__ import annotations
@@ -140,13 +140,14 @@ def confidence_set(
         contenders: score on the same clips for each name.
         better: "lower" or "higher".
         level: probability that the best model is in the set.
-        over_seeds: whether to account for other training seeds; if False, the set is for these very weights.
+        over_seeds: whether to account for other training seeds; if False, the set is for these weights only.
         draws: number of draws of the null distribution.
         seed: seed of the draws.
 
     Raises:
-        ValueError: when there are no models, `level` is not between 0 and 1, there is one clip, scores are on different
-            clips or not finite, a model has one seed with `over_seeds`, or `better` is neither "lower" nor "higher".
+        ValueError: when `contenders` is empty, `level` is not between 0 and 1, or `better` is neither "lower" nor
+            "higher". Also when scores are on one clip, on different clips or not finite, or a model has one seed with
+            `over_seeds`.
     """
     if not contenders or not 0 < level < 1 or draws < 1:
         raise ValueError(
@@ -267,11 +268,11 @@ def required(
         difference: difference to detect; the measured one by default.
         power: probability of detecting it.
         level: level of the interval that must exclude 0.
-        seeds: numbers of seeds per model for which clips are computed.
+        seeds: numbers of seeds per model in the result.
 
     Raises:
-        ValueError: when a model has one seed, scores are on different clips or not finite, the difference is 0 or not
-            finite, seeds are below 2, or power or level is not between 0 and 1.
+        ValueError: when a model has one seed, or scores are on different clips or not finite. Also when the difference
+            is 0 or not finite, seeds are below 2, or power or level is not between 0 and 1.
     """
     if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(
@@ -291,7 +292,7 @@ def required(
     common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
 
     def reached(clips: int, *numbers: int) -> float:
-        """Return the power of `Crossed.estimate`: errors and degrees of freedom are drawn as they would be measured."""
+        """Return the power, averaged over the errors and degrees of freedom that `Crossed.estimate` may measure."""
         both = [*zip(rest, own, numbers, strict=True)]
         over = (common + sum(r / n for r, _, n in both)) / clips
         between = [(o + r / clips) / n for r, o, n in both]

@@ -31,7 +31,7 @@ class Objective(Protocol):
 
 @runtime_checkable
 class Asking(Protocol):
-    """Objective that declares the draws it needs and the score that selects the best weights; see `Evidence`."""
+    """Objective that declares the draws it needs and the score that selects the best weights, such as `Evidence`."""
 
     @property
     def draws(self) -> Mapping[str, int]:
@@ -44,7 +44,7 @@ class Asking(Protocol):
 
 @runtime_checkable
 class Adapting(Objective, Protocol):
-    """Objective with a state within a stage of a run; see `gradnorm.Balance`.
+    """Objective with a state within a stage of a run, such as `gradnorm.Balance`.
 
     Each step calls `measure`, the objective itself for the loss, and `adapt`, in this order.
     """
@@ -76,7 +76,7 @@ class Adaptive(Protocol):
     """Objective whose state starts anew in each stage; a direct call gives the losses that validation compares."""
 
     def begin(self, model: nn.Module) -> Adapting:
-        """Return the objective with its state for a stage; raise ValueError if the model is missing what it needs."""
+        """Return the objective with its state for a stage; raise ValueError if the model does not fit."""
 
 
 @dataclass(frozen=True)

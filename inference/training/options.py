@@ -32,7 +32,7 @@ class Training:
             schedule has reached its last value.
         particles: number of draws from the guide for each sequence and step.
         validate_every: number of steps between validations and checkpoints.
-        patience: number of validations without a better bound after which the run stops; None to run all steps.
+        patience: number of validations without a better bound before the run stops; None to run all steps.
         log_every: number of steps between rows of the log.
         seed: seed of batches and latent draws; each of several processes derives its own seed from it.
         accelerator: where to run: "auto", "cpu", "gpu", "cuda" or "mps".

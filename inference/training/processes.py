@@ -1,7 +1,7 @@
 """Training in several processes on one machine or many: exchange of gradients, and errors when a process is lost.
 
 Each process draws its own batches (synchronous data parallelism). Before a step of the optimiser, gradients are
-replaced by those of one process with all these batches. They are sent together with the loss in one message: models are
+averaged, as if one process had all these batches. They are sent together with the loss in one message: models are
 small, so the number of messages costs more than their size. torch's own wrapper sends gradients in buckets, copies
 buffers at every pass, and refuses a parameter without a gradient.
 
@@ -92,9 +92,9 @@ def summed(fabric: "Fabric", value: Tensor) -> Tensor:
 def together(
     fabric: "Fabric", parameters: Sequence[nn.Parameter], loss: Tensor, frames: Tensor
 ) -> tuple[Tensor, Tensor | float]:
-    """Replace gradients by those of the joint batch of all processes, whose loss is per frame.
+    """Average gradients over processes, as for one batch of all their sequences with a loss per frame.
 
-    A parameter without a gradient in every process keeps none.
+    A parameter keeps no gradient if it has none in any process.
 
     Args:
         fabric: fabric of the processes.

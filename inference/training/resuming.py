@@ -85,7 +85,7 @@ def restore(svi: SVI, run: Run) -> None:
     # a copy: set_state reads the whole storage, so a view would give another row's bytes, or crash
     random = {name: value[svi.fabric.global_rank].clone() for name, value in parts["random"].items()}
     try:
-        # options such as the weight decay are those of this call
+        # options such as the weight decay come from this call
         options = svi.optimizer.state_dict()["param_groups"]
         svi.optimizer.load_state_dict({"state": moments, "param_groups": options})
         svi.generator.set_state(random.pop("generator"))
@@ -133,7 +133,7 @@ def _moments(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> dict[int, dict[
     """Return the state of the optimiser by index of the parameter.
 
     Raises:
-        CheckpointError: when it is not what the optimiser writes for this model at its step, naming what is wrong.
+        CheckpointError: when the optimiser could not have written it for this model at its step, naming the error.
     """
     places = {str(place): place for place in range(len(svi.parameters))}
     moments: dict[int, dict[str, Tensor]] = {}
@@ -156,7 +156,7 @@ def _check_random(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> None:
     """Refuse values that are not states of the run's random number generators.
 
     Raises:
-        CheckpointError: naming what is wrong.
+        CheckpointError: naming the invalid state.
     """
     own = _random(svi)
     for key, value in found.items():

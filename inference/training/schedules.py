@@ -217,7 +217,7 @@ def clamp(value: Any, steps: int, name: str = "") -> Any:
 
 
 def _end(value: Schedule) -> int:
-    """Return the first step from which the schedule is constant."""
+    """Return the step where the schedule becomes constant."""
     match value:
         case Constant():
             return 0

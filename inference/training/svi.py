@@ -70,18 +70,17 @@ class SVI:
     """Stochastic variational inference step by step, for a training loop of your own; `fit` is written with it.
 
     On a CPU, steps on the batches that `fit` draws, `train.sample(batch_size, svi.generator)`, repeat its numbers bit
-    for bit. To stop and continue later, see `resuming`.
+    for bit. `resuming` stores and restores a run.
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` accepts.
         objective: objective to minimise; `Evidence()` by default.
-        stages: consecutive stages with their own objectives, instead of `objective`; their steps add up to those of the
-            run.
+        stages: consecutive stages with their own objectives, instead of `objective`, for all steps of the run.
         **options: fields of `Training`. Schedules and a decay end by `steps`; the caller decides when to log, validate
             and stop.
 
     Raises:
-        TypeError, ValueError: when an option does not exist or is out of range, or there is nothing to fit.
+        TypeError, ValueError: when an option does not exist or is out of range, or the model has no trained parameters.
 
     Example:
         >>> import torch, dvae

@@ -89,7 +89,7 @@ class JSONLines:
         self._file.close()
 
     def read(self) -> list[dict[str, Any]]:
-        """Return the rows of the file, without an incomplete last line; an empty list if there is no file.
+        """Return the rows of the file, without an incomplete last line; an empty list without a file.
 
         Raises:
             CheckpointError: when a line is no row of numbers, there are too many rows or bytes, or the path is no plain
