@@ -276,6 +276,7 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             if truth.shape[-1] != len(columns):
                 raise ValueError(f"{len(columns)} columns ({', '.join(columns)}) are not the {truth.shape[-1]} of x")
+            past = Batch(past)
             mask = past.mask()
             seen = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
             return measure.function(forecasts[..., column], truth[..., column], past | seen, index)
