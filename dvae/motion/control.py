@@ -109,7 +109,7 @@ def bend(
 
 
 def smooth_covariance(frames: int) -> Tensor:
-    """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, with variance 1 and fixed at 0 in frame 0."""
+    """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, conditioned on 0 at frame 0."""
     frame = torch.arange(frames + 1, dtype=torch.float64)
     apart = sqrt(3) / SMOOTH * (frame[:, None] - frame).abs()
     whole = (1 + apart) * (-apart).exp()

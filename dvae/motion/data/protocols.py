@@ -650,7 +650,7 @@ class Windows:
         return self._represented(cut(self._frames, clips, starts, self.length), self.protocol.observed - 1)
 
     def _represented(self, joints: Tensor, now: int) -> Tensor:
-        """Return frames (B, T, D) of joints (B, T, J, 3); if the protocol fixes the heading, it is zero in frame `now`."""
+        """Return frames (B, T, D) of joints (B, T, J, 3); a fixed heading is zero in frame `now`."""
         root = self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, now)[:, None, None]
