@@ -1,18 +1,17 @@
 """Protocols: how motion is cut into windows, and which windows are for training, validation and test.
 
-Sources of the presets: DLow (Yuan and Kitani 2020) and GSPS (Mao, Liu and Salzmann 2021) for Human3.6M and
-HumanEva-I, TrajeVAE (Kania et al. 2021), and the READMEs of the data for bandai2 and cmu8.
+Sources of the presets: DLow (Yuan and Kitani 2020) and GSPS (Mao, Liu and Salzmann 2021) for Human3.6M and HumanEva-I,
+TrajeVAE (Kania et al. 2021), and the READMEs of the data for bandai2 and cmu8.
 
 Decisions where papers and code differ:
 
-* A window may start at every frame from 0 to F - T *inclusive*. The public code of DLow and GSPS draws and
-  lists starts below F - T, so it never uses a clip's last frame and drops clips of exactly T frames.
+* A window may start at every frame from 0 to F - T *inclusive*. The public code of DLow and GSPS draws and lists starts
+  below F - T, so it never uses a clip's last frame and drops clips of exactly T frames.
 * Validation clips are every k-th training clip in file order. Whole clips are chosen because the windows of a clip
-  overlap. They are chosen before clips that are too short are dropped, so they are the same for every window length.
-  In bandai2, neighbouring takes are near copies and all validation takes have seen styles, so validation there does
-  not replace the test.
-* References that memorise the training data (nearest neighbours) should memorise all of it:
-  `"train+validation"`.
+  overlap. They are chosen before clips that are too short are dropped, so they are the same for every window length. In
+  bandai2, neighbouring takes are near copies and all validation takes have seen styles, so validation there does not
+  replace the test.
+* References that memorise the training data (nearest neighbours) should memorise all of it: `"train+validation"`.
 """
 
 from __future__ import annotations
@@ -54,9 +53,8 @@ class Protocol:
         observed, predicted: number of observed and of predicted frames; a window contains both.
         fps: frames per second that the numbers of frames refer to.
         train_stride, test_stride: frames between the starts of listed training and test windows.
-        root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1).
-            "relative": relative to the pelvis in the first frame of the window that has it, D = 3 J; global motion is
-            kept.
+        root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1). "relative":
+            relative to the pelvis in the first frame of the window that has it, D = 3 J; global motion is kept.
         multimodal_threshold: metres; test windows whose last observed poses are closer than this share their futures.
         split_by: "split", or the label that assigns clips to splits.
         train, test: values of `split_by` for training and test.

@@ -1,10 +1,10 @@
 """Joint angles: cosines between vectors of a pose, defined for each skeleton, and their limits in real poses.
 
-Source: the angle loss of GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422) and, for Human3.6M and HumanEva-I,
-the angles of its public code. A vector is the position of a joint relative to the root, `"LHip"`, a difference of
-joints, `("LKnee", "-", "LHip")`, or a cross product of vectors, `(first, "x", second)`. The angle between a vector and
-a plane is the cosine with the plane's normal, so knees that bend forwards differ from knees that bend backwards.
-Cosines do not change when a pose is rotated, scaled, or mirrored with its sides exchanged.
+Source: the angle loss of GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422) and, for Human3.6M and HumanEva-I, the
+angles of its public code. A vector is the position of a joint relative to the root, `"LHip"`, a difference of joints,
+`("LKnee", "-", "LHip")`, or a cross product of vectors, `(first, "x", second)`. The angle between a vector and a plane
+is the cosine with the plane's normal, so knees that bend forwards differ from knees that bend backwards. Cosines do not
+change when a pose is rotated, scaled, or mirrored with its sides exchanged.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Angle:
     Args:
         name: name; angles of the same name (left and right) share their limits.
         first, second: vectors.
-        when: (u, v, sign): only poses with a negative inner product of u and v (sign -1), or with a
-            nonnegative one (sign 1), have this angle.
+        when: (u, v, sign): only poses with a negative inner product of u and v (sign -1), or with a nonnegative one
+            (sign 1), have this angle.
     """
 
     name: str
@@ -182,8 +182,8 @@ class AngleLimits:
 def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
     """Return the cosines of all angles of `ANGLES[skeleton.name]`.
 
-    An angle that a pose does not have, because of `Angle.when`, is NaN: comparisons with limits are false, and its gradient is
-    zero. A vector shorter than 1e-6 has cosine 0 with every other vector, and no gradient.
+    An angle that a pose does not have, because of `Angle.when`, is NaN: comparisons with limits are false, and its
+    gradient is zero. A vector shorter than 1e-6 has cosine 0 with every other vector, and no gradient.
 
     Args:
         poses: (..., D) in metres, D = 3 J, or 3 (J - 1) without the root.
@@ -226,8 +226,8 @@ def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0
     Args:
         poses: (..., D) in metres, as in `cosines`.
         skeleton: skeleton of the poses, in `ANGLES`.
-        quantile: fraction of the poses beyond each limit. 0 gives the smallest and the largest cosine, as in the
-            paper, where one outlier frame widens the limits; .001 ignores such frames.
+        quantile: fraction of the poses beyond each limit. 0 gives the smallest and the largest cosine, as in the paper,
+            where one outlier frame widens the limits; .001 ignores such frames.
 
     Returns:
         The limits; an angle that no pose has is unrestricted, from -1 to 1.

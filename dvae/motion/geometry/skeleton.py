@@ -1,8 +1,8 @@
 """Skeletons: the joints, the tree that connects them, and the up axis.
 
-Positions are in metres, (..., joints, 3), right-handed: with y up, a person facing +z has their left side
-towards +x. The presets are Human3.6M (17 of its 32 joints) and HumanEva-I (15 joints) as motion prediction papers use
-them (Mao, Liu and Salzmann 2021, GSPS).
+Positions are in metres, (..., joints, 3), right-handed: with y up, a person facing +z has their left side towards +x.
+The presets are Human3.6M (17 of its 32 joints) and HumanEva-I (15 joints) as motion prediction papers use them (Mao,
+Liu and Salzmann 2021, GSPS).
 """
 
 from __future__ import annotations

@@ -35,8 +35,8 @@ class Heading(View):
 
     Missing values stay missing. The two horizontal coordinates of a joint must be both observed or both missing,
     because a rotation mixes them. If hips or shoulders are missing in the pose, the heading comes from the nearest
-    earlier pose that has some of them (`Skeleton.heading_near`). Without such a pose, the window is not rotated,
-    and neither is its past in a forecast.
+    earlier pose that has some of them (`Skeleton.heading_near`). Without such a pose, the window is not rotated, and
+    neither is its past in a forecast.
 
     Args:
         skeleton: skeleton with left and right joints.
@@ -241,8 +241,8 @@ class Rotations(View):
 
     Outside the model, x is positions (B, T, D) in metres. The model sees the position of the root, if x has it, and
     then the rotation of every joint with children, in `form` and without jumps (`rotations.in_time`). Rotations are
-    taken from the data, or else estimated by `kinematics.inverse`, including the twist. Bones have their
-    mean length in the data, or their length in the rest pose if data are unavailable.
+    taken from the data, or else estimated by `kinematics.inverse`, including the twist. Bones have their mean length in
+    the data, or their length in the rest pose if data are unavailable.
 
     Densities are densities of these numbers, not of positions, which have other volumes and one more dimension per
     bone. Compare bounds only with models that use the same view.
