@@ -1,15 +1,17 @@
-"""Control: motions bent to given paths, by the most likely move of their latents and correction of their poses.
+"""Control: bend motions onto given paths by moving their latents and correcting their poses.
 
-A motion is what the decoder f makes of latents, and a correction e of its poses, x = f(z_k + s m) + e: m moves the
-latents from a draw z_k, in units of their prior's scale s, and every coordinate of e is a Gaussian process over frames
-that starts at 0 in the first pose. Minimised is
+The decoder f turns latents into a motion, and e corrects its poses: x = f(z_k + s m) + e. The move m shifts the latents
+from a draw z_k, in units of the prior's scale s. Every coordinate of e is a Gaussian process over frames that is 0 in
+the first pose. `bend` minimises
 
     |m|^2 + e' K^-1 e / c^2 + |bone lengths / first - 1|^2 / stretch^2        where x is on the paths, exactly
 
-which is the mode of a posterior whose prior is centred at each draw, so that draws stay different. On the paths e is
-what the decoder misses, and between them it goes over smoothly; elsewhere it is free, for the bones to share. So e is
-how far the motion is from what the model can make. TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351)
-names it as a limitation that given joints miss their paths; bending is ours.
+The minimum is the mode of a posterior whose prior is centred at each draw, so different draws give different motions.
+On the paths, e is the error of the decoder; between known frames it is interpolated smoothly. The other joints may be
+corrected too, which helps to keep the bone lengths. The size of e shows how far the motion is from the model.
+
+TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) names as a limitation that given joints miss their
+paths. This correction is our own addition.
 """
 
 from __future__ import annotations
@@ -25,13 +27,13 @@ from . import Skeleton
 from .geometry.skeleton import SHORTEST
 
 STRETCH = 0.02
-"""Standard deviation of a bone's length, relative."""
+"""Relative standard deviation of bone lengths."""
 CORRECTION = 0.01
-"""c, metres, standard deviation of corrections."""
+"""Standard deviation c of the corrections in metres."""
 SMOOTH = 5.0
-"""Frames over which corrections change."""
+"""Length scale of the corrections in frames."""
 ENOUGH = 0.01
-"""Change of the minimised sum in a step below which it is the last."""
+"""Smallest decrease of the minimised sum per step; the optimiser stops below it."""
 
 
 def bend(
@@ -46,26 +48,24 @@ def bend(
     steps: int = 400,
     progress: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Motions that follow the paths, each by L-BFGS.
-
-    (Longer than other functions by what its arguments mean.)
+    """Return motions that follow the paths, each fitted by L-BFGS.
 
     Args:
-        decode: motions (1, T, D) in metres of latents (1, ...).
-        latents: (S, ...), where to start from.
-        scale: of the latents, positive; broadcasts against one motion's.
-        paths: (T, D).
-        known: (T, D) 1 where the path is known, and else 0.
-        skeleton: of the poses.
-        bones: (J - 1,) lengths to keep, in metres; those without length are free.
-        steps: of the optimiser, at most, for each motion.
+        decode: function from latents (1, ...) to motions (1, T, D) in metres.
+        latents: (S, ...), starting points.
+        scale: positive scale of the latents; broadcasts against the latents of one motion.
+        paths: (T, D) in metres.
+        known: (T, D), 1 where the path is known and 0 elsewhere.
+        skeleton: skeleton of the poses.
+        bones: (J - 1,) target bone lengths in metres; bones of length zero are unconstrained.
+        steps: maximum number of optimiser steps for each motion.
         progress: whether to show a progress bar.
 
     Returns:
-        The motions (S, T, D), and their corrections (S, T, D) in metres.
+        The motions (S, T, D) and their corrections (S, T, D), both in metres.
 
     Raises:
-        ValueError: no steps.
+        ValueError: `steps` is below 1.
     """
     if steps < 1:
         raise ValueError(f"steps is at least 1, got {steps}")
@@ -109,7 +109,7 @@ def bend(
 
 
 def smooth_covariance(frames: int) -> Tensor:
-    """Covariance (T, T), over frames 1 to T, of a Matern process of order 3/2 and variance 1 that is 0 at frame 0."""
+    """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, conditioned on 0 at frame 0."""
     frame = torch.arange(frames + 1, dtype=torch.float64)
     apart = sqrt(3) / SMOOTH * (frame[:, None] - frame).abs()
     whole = (1 + apart) * (-apart).exp()
@@ -117,7 +117,10 @@ def smooth_covariance(frames: int) -> Tensor:
 
 
 def gains(covariance: Tensor, known: Tensor) -> Tensor:
-    """(D, T, T) that take a process, whose values at known[:, d] alone count, to its mean given these."""
+    """Return (D, T, T) matrices that map a process to its conditional mean.
+
+    The mean of coordinate d is conditioned on the values at known[:, d]; all other values are ignored.
+    """
     found = covariance.new_zeros(known.shape[1], *covariance.shape)
     patterns, which = known.bool().cpu().unique(dim=1, return_inverse=True)
     for n, seen in enumerate(patterns.T):

@@ -1,4 +1,4 @@
-"""Forecasts of motion, and their file, which says all that it takes to draw and to score them."""
+"""Forecasts of motion, and a file format with everything needed to draw and score them."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ from .geometry.skeleton import FIELDS, Skeleton
 
 
 def is_forecasts(path: str | Path) -> bool:
-    """Whether a file is an npz with a member `forecasts`."""
+    """Return whether a file is an npz with a member `forecasts`."""
     return holds(path, "forecasts")
 
 
 @dataclass(frozen=True, eq=False)
 class Forecasts:
-    """Sampled futures of windows beside what was observed and what happened, in metres.
+    """Sampled futures of windows, with the observed frames and the true futures, in metres.
 
     Args:
-        skeleton: the tree.
+        skeleton: skeleton of the poses.
         keys: (split, clip, first frame) of the N windows.
         forecasts: (S, N, H, J, 3), S futures of each window.
         observed: (N, O, J, 3), NaN where a joint was missing.
-        truth: (N, F, J, 3), what came after the observed frames, likewise; F is at most H.
-        emission: "drawn" where futures have the noise of the emission, "mean" where they are its means given draws of
-            latents; "" where that is unknown.
+        truth: (N, F, J, 3), true frames after the observed ones, NaN where a joint was missing; F is at most H.
+        emission: "drawn" if futures include the noise of the emission, "mean" if they are its means given draws of the
+            latents, "" if unknown.
 
     Raises:
-        ValueError: the shapes do not fit each other or the skeleton, or there is nothing.
-        FloatingPointError: a future is NaN or infinite, or another position infinite, naming window and clip.
+        ValueError: the shapes do not match each other or the skeleton, or an array is empty.
+        FloatingPointError: a future is NaN or infinite, or another position is infinite. The message names the window
+            and the clip.
     """
 
     skeleton: Skeleton
@@ -63,13 +64,16 @@ class Forecasts:
                 raise FloatingPointError(f"the {what} of clip {clip!r} ({split}), frame {start}, are NaN or infinite")
 
     def window(self, n: int, samples: int | None = None) -> Forecasts:
-        """The first of the futures, or all, of window n alone."""
+        """Return the first `samples` futures, or all futures, of window n alone."""
         one = slice(n, n + 1)
         future = self.forecasts[:samples, one]
         return Forecasts(self.skeleton, self.keys[one], future, self.observed[one], self.truth[one], self.emission)
 
     def motion(self) -> MotionSet:
-        """Every future after what was observed, as a clip named after its window and place among the samples."""
+        """Return one clip per future, including its observed frames.
+
+        Clips are named after their window and the index of the sample.
+        """
         return MotionSet(
             [
                 Clip(split, f"{clip}-{start}-{sample}".replace("/", "-"), np.concatenate([before, future]))
@@ -86,8 +90,8 @@ class Forecasts:
     def save(self, path: str | Path) -> None:
         """Write an npz of plain arrays.
 
-        Its members are `forecasts`, `observed`, `truth`; `emission`, where it is known; `split`, `clip` and `start` of
-        each window; and the skeleton as in its JSON file: `name`, `joint_names`, `parents`, `joints_left`,
+        Its members are `forecasts`, `observed` and `truth`; `emission` if known; and `split`, `clip` and `start` of
+        each window. The skeleton has the fields of its JSON file: `name`, `joint_names`, `parents`, `joints_left`,
         `joints_right`, `up_axis`, `fps`.
         """
         arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
@@ -95,11 +99,11 @@ class Forecasts:
 
     @classmethod
     def load(cls, path: str | Path) -> Forecasts:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is damaged, lacks a member, or its arrays do not fit each other.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is damaged, a member is missing, or its arrays do not match each other.
         """
         arrays = read_arrays(path)
         try:
@@ -119,14 +123,14 @@ class Forecasts:
 
 @dataclass(frozen=True, eq=False)
 class Imputed:
-    """Motion whose missing joints were filled in several times, in metres.
+    """Motion whose missing joints were imputed several times, in metres.
 
     Args:
-        skeleton: the tree.
+        skeleton: skeleton of the poses.
         keys: (split, clip, first frame) of the N windows.
-        filled: (S, N, T, J, 3), as observed, or filled in.
+        filled: (S, N, T, J, 3), observed positions, and imputed ones where joints were missing.
         observed: (N, T, J), True where a joint was observed.
-        emission: as in `Forecasts`.
+        emission: same as in `Forecasts`.
     """
 
     skeleton: Skeleton
@@ -137,7 +141,7 @@ class Imputed:
 
     @property
     def spread(self) -> np.ndarray:
-        """(N, T, J), root mean square distance of a joint's places from their mean over the samples; 0 if observed."""
+        """Root mean square distance (N, T, J) of a joint from its mean over the samples; 0 where it was observed."""
         variance: np.ndarray = self.filled.var(0).sum(-1)
         return np.where(self.observed, 0.0, variance**0.5)
 
@@ -154,7 +158,7 @@ def _write(
     skeleton: Skeleton,
     emission: str,
 ) -> None:
-    """Writes arrays beside what says which windows they are of."""
+    """Write the arrays together with the keys of their windows and the skeleton."""
     arrays |= {"emission": np.array(emission)} if emission else {}
     arrays |= zip(("split", "clip", "start"), map(np.array, zip(*keys, strict=True)), strict=True)
     for field, key in FIELDS.items():

@@ -1,4 +1,4 @@
-"""Names of joints, as people and programs write them: a side of the body and a word, in any order and spelling."""
+"""Read the side of the body and the word from joint names, whatever their order and spelling."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ _SIDE = (
     re.compile(r"^(?:(?P<l>[lL])|(?P<r>[rR]))(?=[ _.\-]|[A-Z])"),
     re.compile(r"(?<=[a-z])(?:(?P<l>L)|(?P<r>R))$"),
 )
-"""By the word, or by its letter between marks or where capitals mark it."""
+"""Patterns for the written-out side, or for its letter next to a separator or a change of case."""
 
 
 def readings(name: str) -> list[tuple[str, str]]:
-    """Side ("l", "r" or nothing) and word that a name may mean, the surest first, as "lhumerus" means l humerus."""
+    """Return the possible (side, word) readings of a name, the most likely first.
+
+    The side is "l", "r" or "". For example, "lhumerus" may mean the left humerus.
+    """
     name = _PREFIX.sub("", name)
     for pattern in _SIDE:
         found = pattern.search(name)
@@ -30,12 +33,12 @@ def readings(name: str) -> list[tuple[str, str]]:
 
 
 def letters(word: str) -> str:
-    """A word without the marks that separate its parts, in small letters."""
+    """Return the word in lower case without separators."""
     return re.sub(r"[ _.\-]", "", word).lower()
 
 
 def sides(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Joints on the left and on the right: those whose word is there on both sides."""
+    """Return the joints on the left and on the right; each of them has a counterpart on the other side."""
     there: dict[tuple[str, str], list[int]] = {}
     for joint, name in enumerate(names):
         for meant in readings(name):

@@ -1,7 +1,7 @@
-"""Motion clips and sets of clips, checked when they are made.
+"""Motion clips and sets of clips, validated when they are created.
 
-A clip is (frames, joints, 3) float32 in metres. Clip names may repeat between splits (the CMU benchmark has a
-`walking_1` in both), so whatever points at a clip does so by (split, name).
+A clip is (frames, joints, 3) float32 in metres. Two splits may contain clips of the same name (the CMU benchmark has a
+`walking_1` in both), so the key of a clip is (split, name).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from typing_extensions import override
 from ...data.blocks import blocks, hash_values, ranges
 from ...data.npy import is_mapped
 from ...data.sequences import tensor_of
-from ...inference.evaluation.result import Table  # which shows what files say as it is
+from ...inference.evaluation.result import Table  # does not interpret markup in file contents
 from ..geometry.kinematics import inverse, rest
 from ..geometry.rotations import continuous, from_matrix
 from ..geometry.skeleton import Skeleton
 
 SMALLEST, TALLEST = 0.3, 3.0
-"""Metres between which a body's largest extent must lie: room for a child, too narrow for another unit."""
+"""Range of plausible body extents in metres: wide enough for a child, too narrow for another unit."""
 
 
 MOST_FRAMES = 20_000
-"""From which a rest pose is found, and the size of a body in a clip."""
+"""Maximum number of frames used to estimate a rest pose or the size of a body."""
 
 STIFF = 1e-3
-"""Metres of deviation, in a clip, below which a distance between joints is taken for constant."""
+"""Standard deviation in metres below which the distance of two joints in a clip counts as constant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,13 @@ class Clip:
     """One recording.
 
     Args:
-        split: what the archive files it under: "train" and "test", or a subject.
-        name: its name, unique within the split.
-        positions: (F, J, 3) in metres, global; NaN where a joint was not observed (see `MotionSet`).
-        labels: what is known about it, as text.
-        truth: what a simulator knows about it, as arrays; real clips have none.
-        rotations: (F, J, 4), of every joint against its parent, as quaternions w x y z; of files that have them, and
-            of `MotionSet.with_rotations`. An end, from which nothing hangs, has no turn that could be seen.
+        split: split in the archive: "train", "test", or a subject.
+        name: name, unique within the split.
+        positions: (F, J, 3) in metres, global; NaN where a joint was not observed.
+        labels: text labels.
+        truth: true variables of a simulator, as arrays; empty for real clips.
+        rotations: (F, J, 4), rotation of each joint relative to its parent, as quaternions w x y z; from the file or
+            from `MotionSet.with_rotations`. The rotation of a joint without children is not observable.
     """
 
     split: str
@@ -74,15 +74,16 @@ class Clip:
         return len(self.positions)
 
     def between(self, start: int, end: int) -> Clip:
-        """Frames from one to before another."""
+        """Return the frames from `start` to before `end`."""
         turns = None if self.rotations is None else self.rotations[start:end]
         truth = {k: v[start:end] if v.shape[:1] == (self.frames,) else v for k, v in self.truth.items()}
         return replace(self, positions=self.positions[start:end], rotations=turns, truth=truth)
 
     def resampled(self, ratio: float) -> Clip:
-        """One frame for every so many: these frames where that is whole, else between them.
+        """Return the clip with one frame for every `ratio` frames, a real number.
 
-        Positions are interpolated linearly and rotations along the shortest arc; what a simulator knows is left out.
+        A whole ratio selects frames. Otherwise positions are interpolated linearly and rotations along the shortest
+        arc. Simulator variables (`truth`) are dropped.
         """
         if abs(ratio - round(ratio)) < 1e-6 and ratio >= 1:
             every = round(ratio)
@@ -93,27 +94,27 @@ class Clip:
         after = np.minimum(before + 1, self.frames - 1)
         part = (at - before)[:, None, None]
         first, second = np.where(part < 1, self.positions[before], 0), np.where(part > 0, self.positions[after], 0)
-        positions = (1 - part) * first + part * second  # what has no share may be missing
+        positions = (1 - part) * first + part * second  # a frame of weight 0 may be missing
         turns = None if self.rotations is None else _between(self.rotations[before], self.rotations[after], part)
         return replace(self, positions=positions.astype(self.positions.dtype), rotations=turns, truth={})
 
 
 def _between(first: np.ndarray, second: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Quaternions (..., 4) on the shortest arc between others (Shoemake 1985)."""
+    """Interpolate quaternions (..., 4) along the shortest arc (Shoemake 1985)."""
     cosine = (first * second).sum(-1, keepdims=True)
     second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine).clip(max=1)
-    angle = np.maximum(np.arccos(cosine), 1e-6)  # below, sines and angles are one
+    angle = np.maximum(np.arccos(cosine), 1e-6)  # below this, sines and angles agree
     found = (np.sin((1 - part) * angle) * first + np.sin(part * angle) * second) / np.sin(angle)
     return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True), first.dtype)
 
 
 def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
-    """Why a clip cannot be used with a skeleton, in a sentence that names the clip; None when it can.
+    """Return one sentence on why the skeleton cannot use a clip, or None if it can.
 
     Args:
-        clip: the clip.
-        skeleton: that it is to have.
-        missing: joints may be NaN in some frames.
+        clip: clip.
+        skeleton: skeleton that the clip should match.
+        missing: whether joints may be NaN in some frames.
     """
     where, positions = f"clip {clip.split}/{clip.name}", clip.positions
     if positions.dtype.kind not in "fiu":
@@ -162,27 +163,30 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
 
 
 def some_frames(positions: np.ndarray) -> np.ndarray:
-    """Frames of (F, J, 3), evenly spread and at most `MOST_FRAMES`, in which joints were observed."""
+    """Return at most `MOST_FRAMES` evenly spaced frames of (F, J, 3).
+
+    Return all frames if each of the chosen frames has missing joints.
+    """
     some = positions[:: -(-len(positions) // MOST_FRAMES)]
     return positions if np.isnan(some).any(axis=2).all() else some
 
 
 def extents(positions: np.ndarray) -> np.ndarray:
-    """Of the body along each axis, (frames, 3), in those frames of (F, J, 3) that have the most joints."""
+    """Return the extents (frames, 3) of the body along each axis, for the frames of (F, J, 3) with the most joints."""
     poses = fullest(positions)
     found: np.ndarray = np.nanmax(poses, axis=1) - np.nanmin(poses, axis=1).astype(np.float64)
     return found
 
 
 def fullest(positions: np.ndarray) -> np.ndarray:
-    """Those frames of (F, J, 3) that have the most joints."""
+    """Return the frames of (F, J, 3) that have the most observed joints."""
     there = (~np.isnan(positions).any(axis=2)).sum(axis=1)
     full: np.ndarray = there == there.max()
-    return positions if full.all() else positions[full]  # a copy only where it is another
+    return positions if full.all() else positions[full]  # copy only if frames were dropped
 
 
 def _taken(values: np.ndarray, copy: bool = True) -> np.ndarray:
-    """As float32 in C order, which nobody else holds, if it is copied; or as it is mapped."""
+    """Return values as float32 in C order, copied if `copy` is set and memory is shared; mapped arrays stay mapped."""
     if is_mapped(values) and values.dtype == np.float32 and values.flags.c_contiguous:
         return values
     found = np.require(values, np.float32, ["C", "A", "W"])
@@ -193,22 +197,22 @@ def _taken(values: np.ndarray, copy: bool = True) -> np.ndarray:
 class MotionSet:
     """Clips of one skeleton.
 
-    Iterating gives the clips, `motion["train", "walking_1"]` one of them.
+    Iteration yields the clips. `motion["train", "walking_1"]` is one of them.
 
     Args:
-        clips: the clips, asked for once; copied as float32, but for arrays of that type that are mapped from a disk.
-        skeleton: the tree that all of them have.
-        name: what to call the set.
-        copy: False takes over arrays that are float32 already, which nobody else may hold.
-        skip_bad: leave out clips that cannot be used, and list them in `skipped`.
-        skipped: those that were left out before, as (split, name, reason).
-        said: how the files' units and axes were understood, for people to check.
-        missing: joints may be NaN where they were not observed, a joint as a whole: what lacks a coordinate lacks all.
-            Windows then tell by a mask what was observed.
+        clips: clips, iterated once; copied as float32, except for memory-mapped float32 arrays.
+        skeleton: skeleton of all clips.
+        name: name of the set.
+        copy: False keeps float32 arrays without copying them; the caller must not use them any more.
+        skip_bad: leave out unusable clips, and list them in `skipped`.
+        skipped: clips that were left out earlier, as (split, name, reason).
+        said: how the units and axes of the files were interpreted, for people to check.
+        missing: joints may be NaN where they were not observed; a joint with one NaN coordinate counts as missing.
+            Windows then contain a mask of observed values.
 
     Raises:
-        ValueError: a clip has NaN that is not allowed, wrong joints, a wrong shape or implausible units, two clips
-            share a key, or there is no clip.
+        ValueError: a clip has NaN although `missing` is not set, wrong joints, a wrong shape or implausible units; two
+            clips have the same key; or there are no clips.
     """
 
     clips: Sequence[Clip]
@@ -231,7 +235,7 @@ class MotionSet:
         missing: bool = False,
     ) -> None:
         single, left_out, what = [], list(skipped), name or "motion set"
-        for clip in clips:  # an iterator need not hold clips that were taken over
+        for clip in clips:  # lets an iterator free each clip after it was taken over
             if reason := defect(clip, skeleton, missing):
                 if not skip_bad:
                     raise ValueError(f"{what}: {reason}")
@@ -275,14 +279,14 @@ class MotionSet:
 
     @property
     def splits(self) -> list[str]:
-        """The splits, in order of appearance."""
+        """Names of the splits, in order of appearance."""
         return list(dict.fromkeys(clip.split for clip in self.clips))
 
     def with_rotations(self) -> MotionSet:
-        """The same motion with the turns of joints too, and the rest pose that they turn.
+        """Return the same motion with joint rotations and the rest pose that they rotate.
 
-        Those that files have are kept. Elsewhere they are found by `kinematics.inverse`, for bones that have the mean
-        lengths of all clips; positions stay as they are.
+        Rotations from files are kept. The others are estimated by `kinematics.inverse`, for bones with their mean
+        lengths over all clips; positions do not change.
         """
         if self.skeleton.rest and all(clip.rotations is not None for clip in self):
             return self
@@ -292,7 +296,7 @@ class MotionSet:
                 "or fill its gaps first (`dvae impute RUN --filled FILE`)"
             )
         found: MotionSet | None = self.__dict__.get("_turned")
-        if found is None:  # once, for all splits
+        if found is None:  # cached, because all splits use it
             skeleton = self.skeleton
             if not skeleton.rest:
                 every = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
@@ -311,15 +315,16 @@ class MotionSet:
         return found
 
     def loosened(self) -> MotionSet:
-        """The same positions with a joint more wherever bones that leave from one place move against each other.
+        """Return the same positions with extra joints where bones that share a joint move relative to each other.
 
-        A joint has one turn, and takes all that hangs from it along. Where recordings have left joints out, as a spine
-        that bends against the hips right at the pelvis, `with_rotations` can only find turns in between. Here the
-        most bones that keep their angles (distances of their ends within a millimetre, in every clip) stay with the
-        joint, and each further group of them gets one of its own in the same place, by the name of the first end.
+        A joint has one rotation, which moves all its children together. Recordings may omit joints, for example where
+        the spine bends against the hips at the pelvis. `with_rotations` can then only find a compromise. This method
+        groups the children of a joint by rigidity: the distances within a group vary by less than a millimetre in every
+        clip. The largest group stays with the joint. Each other group gets a new joint at the same place, named after
+        its first child.
 
         Raises:
-            ValueError: there are rotations already, or joints are missing.
+            ValueError: the motion already has rotations, or joints are missing.
         """
         skeleton = self.skeleton
         if skeleton.rest or self.missing:
@@ -342,7 +347,7 @@ class MotionSet:
         return MotionSet(clips, loose, self.name, copy=False, skipped=self.skipped, said=self.said)
 
     def _rigid(self, joints: Sequence[int]) -> list[list[int]]:
-        """Joints in groups whose distances stay, the largest first."""
+        """Group joints whose mutual distances are constant, the largest group first."""
         varies = np.zeros((len(joints), len(joints)))
         for clip in self:
             ends = clip.positions[:, joints].astype(np.float64)
@@ -351,10 +356,10 @@ class MotionSet:
         return sorted(([joints[place] for place in sorted(group)] for group in groups), key=len, reverse=True)
 
     def resampled(self, fps: float) -> MotionSet:
-        """The same motion at another number of frames per second; see `Clip.resampled`.
+        """Return the same motion at another frame rate, as `Clip.resampled` does.
 
         Raises:
-            ValueError: a number that is none.
+            ValueError: `fps` is not positive.
         """
         if not 0 < fps < 1e6:
             raise ValueError(f"{fps} frames per second, expected more than 0")
@@ -362,18 +367,18 @@ class MotionSet:
         return replace(self, clips=[clip.resampled(ratio) for clip in self], skeleton=skeleton)
 
     def divided(self, test: float = 0.2, shortest: int = 1) -> MotionSet:
-        """The same motion in splits "train" and "test", for recordings that nobody has divided.
+        """Return the same motion in the splits "train" and "test", for recordings without splits.
 
-        The last part of every clip is test, where it and the rest have `shortest` frames; where no clip has, whole
-        clips are, the last ones. Of one clip alone, what is before is cut once more, so that some of it can be held out
-        for validation. A clip of a split other than "all" has this before its own name.
+        The last part of every clip is for testing if both parts have at least `shortest` frames. If no clip is long
+        enough, the last clips are for testing. If there is only one clip, its training part is cut in two, so that a
+        part is available for validation. A split other than "all" becomes a prefix of the clip's name.
 
         Args:
-            test: the part, of every clip or of the clips.
-            shortest: frames that make a window.
+            test: test fraction of every clip, or of the number of clips.
+            shortest: frames in a window.
 
         Raises:
-            ValueError: no part of the whole.
+            ValueError: `test` is not between 0 and 1.
         """
         if not 0 < test < 1:
             raise ValueError(f"the part for test is {test}, expected more than 0 and less than 1")
@@ -396,7 +401,7 @@ class MotionSet:
         return replace(self, clips=found)
 
     def fingerprint(self) -> str:
-        """SHA-256 of the content: skeleton, and every clip's key, shape and bytes, in order."""
+        """Return the SHA-256 of the skeleton and of every clip's key, shape and bytes, in order."""
         digest = hashlib.sha256(repr((self.skeleton.names, self.skeleton.parents, self.skeleton.up)).encode())
         if any(clip.rotations is not None for clip in self.clips):
             digest.update(repr(self.skeleton.rest).encode())
@@ -408,7 +413,7 @@ class MotionSet:
         return digest.hexdigest()
 
     def summary(self) -> list[dict[str, str | int | float]]:
-        """One row per split: clips, frames, minutes, shortest and longest clip in frames, clips skipped."""
+        """Return one row per split: clips, frames, minutes, shortest and longest clip in frames, clips skipped."""
         skipped = Counter(split for split, _, _ in self.skipped)
         rows: list[dict[str, str | int | float]] = []
         for split in self.splits:
@@ -427,7 +432,7 @@ class MotionSet:
         return rows
 
     def info(self) -> RenderableType:
-        """What `dvae data info` prints: splits, skeleton, how rigid the bones are, and the labels."""
+        """Return the output of `dvae data info`: splits, skeleton, variation of bone lengths, and labels."""
         splits = Table(title=self.name, title_justify="left")
         rows = self.summary()
         for column in rows[0]:

@@ -1,4 +1,4 @@
-"""Motion data under a protocol, as runs keep and reopen them."""
+"""Motion data with a protocol, in a form that runs can record and reopen."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ DEFAULT_PROTOCOLS = {
     "humaneva": "humaneva",
     "walker": "simulated",
 }
-"""Protocols by the name of the skeleton, where none is named, and its clips have their splits and frame rate."""
+"""Default protocol for each skeleton name; used if the splits and the frame rate match."""
 
 
 def default_protocol(motion: MotionSet) -> Protocol:
-    """The protocol of the skeleton; or half a second observed and two predicted, of splits "train" and "test".
+    """Return the default protocol of the skeleton, or a generic one.
 
-    Windows for training start every sixth of a second, those of the test every half.
+    The generic protocol observes half a second, predicts two seconds and uses the splits "train" and "test". Training
+    windows start every sixth of a second, test windows every half second.
     """
     fps, splits = motion.skeleton.fps, set(motion.splits)
     known = PROTOCOLS.get(DEFAULT_PROTOCOLS.get(motion.skeleton.name, ""))
@@ -41,17 +42,17 @@ def default_protocol(motion: MotionSet) -> Protocol:
 
 
 def divided(motion: MotionSet, protocol: Protocol) -> MotionSet:
-    """Motion in "train" and "test", where a protocol asks for these and nobody has divided it; see `MotionSet`."""
+    """Split undivided motion into "train" and "test" if the protocol needs these splits."""
     asks = (protocol.split_by, protocol.train, protocol.test) == ("split", ("train",), ("test",))
     return motion.divided(shortest=protocol.length) if asks and not {"train", "test"} & {*motion.splits} else motion
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Where motion data were, as a run keeps it.
+    """Record of where motion data were read.
 
     Args:
-        path: the file as it was given, or "simulated".
+        path: file as it was given, or "simulated".
         fingerprint: SHA-256 of the clips.
         skip_bad: whether unusable clips were left out.
         missing: whether joints may be missing.
@@ -68,15 +69,15 @@ class Recordings:
 
 @dataclass(frozen=True)
 class MotionData:
-    """Motion data under a protocol.
+    """Motion data with a protocol.
 
     Args:
-        path: the file as it was given, or "simulated".
-        motion: its clips.
-        protocol: how windows are cut from them.
+        path: file as it was given, or "simulated".
+        motion: clips.
+        protocol: protocol that cuts the clips into windows.
         skip_bad: whether unusable clips were left out.
-        onto: whether they were put onto the skeleton of a run.
-        undivided: names of clips that are too short to be divided, so that none of their frames are for test.
+        onto: whether the clips were mapped to the skeleton of a run.
+        undivided: names of clips too short to be divided; none of their frames are in the test split.
     """
 
     kind: ClassVar[str] = "motion"
@@ -99,20 +100,19 @@ class MotionData:
         missing: bool = False,
         representation: Representation | None = None,
     ) -> Self:
-        """Reads a motion file, or simulates.
+        """Read a motion file, or simulate motion.
 
         Args:
-            path: of a file or folder that `read_motion` reads, or "simulated" for `simulate()`.
-            protocol: one of `dvae.motion.PROTOCOLS` or its name; by default the one of the skeleton, or half a second
-                observed and two predicted, see `default_protocol`. Clips that are in neither split "train" nor "test"
-                are divided, see `MotionSet.divided`.
-            skip_bad: leave out unusable clips instead of refusing the file.
-            missing: keep clips that lack joints (NaN) in some frames.
-            representation: what models see, in place of what the protocol says.
+            path: file or folder that `read_motion` reads, or "simulated" for `simulate()`.
+            protocol: one of `dvae.motion.PROTOCOLS` or its name; default: `default_protocol` of the clips.
+                `MotionSet.divided` divides clips whose split is neither "train" nor "test".
+            skip_bad: leave out unusable clips instead of raising an error.
+            missing: keep clips in which joints are missing (NaN) in some frames.
+            representation: input of the models, overrides the protocol's.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: a file that cannot be read, or an unknown protocol.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file cannot be read, or the protocol is unknown.
         """
         name = os.fspath(path)
         clips = simulate() if name == SIMULATED else read_motion(name, skip_bad=skip_bad, missing=missing)
@@ -122,16 +122,16 @@ class MotionData:
         protocol = replace(protocol, representation=representation or protocol.representation)
         split = divided(clips, protocol)
         tested = {clip.name for clip in split if clip.split == "test"}
-        partly = len(split) > len(clips) > 1  # otherwise whole clips are for test
+        partly = len(split) > len(clips) > 1  # otherwise whole clips form the test split
         whole = tuple(clip.name for clip in split if partly and clip.name not in tested)
         return cls(name, split, protocol, skip_bad, undivided=whole)
 
     def windows(self, split: str) -> Windows:
-        """The windows of "train", "validation", "test" or "train+validation"."""
+        """Return the windows of "train", "validation", "test" or "train+validation"."""
         return windows(self.motion, self.protocol, split)
 
     def parts(self) -> dict[str, str]:
-        """Return for training, validation and test a sentence: the windows, and the clips that have none."""
+        """Return one sentence for each split: its number of windows, and the clips that are too short."""
         found, protocol = {}, self.protocol
         for split in ("train", "validation", "test"):
             try:
@@ -150,7 +150,7 @@ class MotionData:
 
     @property
     def location(self) -> str:
-        """Where the clips are, as any process finds them."""
+        """Absolute path of the clips, or "simulated"."""
         return self.path if self.path == SIMULATED else os.path.abspath(self.path)
 
     @property
@@ -160,28 +160,28 @@ class MotionData:
 
     @property
     def schema(self) -> Poses:
-        """What is known of the windows without the clips."""
+        """Schema of the windows."""
         turned = self.protocol.representation != "positions"
         return Poses.under(self.protocol, (self.motion.with_rotations() if turned else self.motion).skeleton)
 
     def recorded(self) -> Recordings:
-        """Where the clips are; `reopened` reads it."""
+        """Return the record of these data that `reopened` reads."""
         return Recordings(self.path, self.fingerprint, self.skip_bad, self.motion.missing)
 
     @classmethod
     def reopened(cls, source: Recordings, schema: Poses, path: str | os.PathLike[str] | None = None) -> Self:
-        """The data that were recorded, from there or from another path, whatever they are now.
+        """Open recorded data again, from the recorded path or from another one.
 
-        Others that have another skeleton are put onto that of the schema, where its joints are among theirs by what
-        names mean; turns are then found anew.
+        The content may have changed. Data with another skeleton are mapped to the skeleton of the schema if they have
+        all its joints, which are matched by name. Their rotations are then estimated again.
 
         Args:
-            source: as `recorded` gave it.
-            schema: of the windows.
-            path: where they lie now.
+            source: result of `recorded`.
+            schema: schema of the windows.
+            path: current path, if the data have moved.
 
         Raises:
-            FileNotFoundError, ValueError: see `open`.
+            FileNotFoundError, ValueError: same as `open`.
         """
         found = cls.open(path or source.path, schema.protocol, source.skip_bad, source.missing)
         if found.schema.skeleton == schema.skeleton:
@@ -196,7 +196,7 @@ class MotionData:
             )
         try:
             put = chosen(motion, onto=known)
-        except ValueError:  # whoever compares the schemas says what differs
+        except ValueError:  # the caller compares the schemas and reports the difference
             return found
         clips = [replace(clip, rotations=None) for clip in put]
         put = MotionSet(clips, known, motion.name, skipped=motion.skipped, said=motion.said, missing=motion.missing)

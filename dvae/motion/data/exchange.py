@@ -1,9 +1,9 @@
-"""Exchange: one window's first pose with another's paths, to see whether motion follows what it is told.
+"""Exchange: combine the first pose of one window with the paths of another, to test how well motion follows paths.
 
-TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) gives a pose the trajectories of another sequence whose
-given joints start at the same place, and compares with the sequence that the trajectories come from; its public code,
-with the one that the pose comes from. Ours: one partner for each window, of another clip, and the same windows with
-their own poses, as those that have partners may be easier or harder than others.
+TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) pairs a pose with the trajectories of another sequence
+whose given joints start at the same place. It compares forecasts with the sequence of the trajectories; its public code
+compares with the sequence of the pose. Our choice: each window has one partner from another clip. The same windows with
+their own poses serve as a baseline, since windows with partners may be easier or harder than others.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from .protocols import Windows
 
 
 class Exchanged:
-    """Windows that begin with the pose of another window, as `dvae.evaluate` takes them.
+    """Windows that begin with the pose of another window, for `dvae.evaluate`.
 
-    Window n keeps its frames and paths but for the first frame, which is that of another one whose given joints are
-    there at nearly the same place relative to the pelvis. Windows that have no such partner are left out. Multimodal
-    errors there are none: the windows that begin with that pose have paths of their own.
+    Window n keeps its frames and paths, except that its first frame is the one of a partner. The given joints of a
+    partner have nearly the same positions relative to the pelvis. Windows without a partner are left out. Multimodal
+    errors are undefined, because the windows that begin with the exchanged pose have different paths.
 
     Args:
-        windows: with the same joints given everywhere, `windows.given(["LWrist"])`, and one observed frame.
-        threshold: metres, within which each given joint is in both first frames.
-        seed: of the choice among partners.
-        own: leave every window its own pose: the same windows, beside which to see what the exchange changes.
-        truth: the motion that is to be met is that of the window whose "path" it is, as TrajeVAE's text says, or of the
-            one whose "pose", as its public code has it.
+        windows: windows with one observed frame and the same given joints everywhere, e.g. `windows.given(["LWrist"])`.
+        threshold: maximum distance in metres between each given joint in the two first frames.
+        seed: seed for the choice among partners.
+        own: keep every window's own pose, as a baseline on the same windows.
+        truth: whose motion is the truth: the window of the "path", as in TrajeVAE's text, or of the "pose", as in its
+            public code.
 
     Raises:
-        ValueError: windows without given joints or with more than one observed frame, a threshold that is no distance,
-            or no window with a partner.
+        ValueError: windows have no given joints or more than one observed frame, the threshold is not positive, or no
+            window has a partner.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Exchanged:
         self._partners = self._kept if own else partners
 
     def _pairs(self) -> tuple[Tensor, Tensor]:
-        """Windows that have a partner, and theirs."""
+        """Return the indices of windows with a partner, and of their partners."""
         first = self.windows.all()["y"][:, 0].unflatten(-1, (-1, 3))
         first = first[:, [self.joints.index(name) for name in self.given_joints or ()]]
         clips = [key[:2] for key in self.windows.keys]
@@ -95,7 +95,7 @@ class Exchanged:
 
     @property
     def description(self) -> dict[str, Any]:
-        """What a record says of these windows, and how poses were exchanged."""
+        """Entries for a record: the description of the windows, and how poses were exchanged."""
         said, partners = self.windows.description, len(self._partners.unique())
         exchanged = {"threshold": self.threshold, "seed": self.seed, "partners": partners, "truth": self.truth}
         title = [*said["title"], "with own poses" if self.own else f"first poses of {partners} other windows"]
@@ -106,12 +106,12 @@ class Exchanged:
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
-        """(split, clip, first frame) of the windows that the paths come from."""
+        """(split, clip, first frame) of the windows whose paths are used."""
         keys = self.windows.keys
         return [keys[n] for n in self._kept.tolist()]
 
     def all(self) -> dict[str, Tensor]:
-        """The windows, as of `Windows.all`."""
+        """Return all windows, in the format of `Windows.all`."""
         whole = self.windows.all()
         batch = {name: values[self._kept] for name, values in whole.items()}
         poses = whole["x"][self._partners]
@@ -119,7 +119,7 @@ class Exchanged:
         return batch
 
     def labels(self, name: str) -> list[str]:
-        """The label of every window's clip."""
+        """Return the label of each window's clip."""
         labels = self.windows.labels(name)
         return [labels[n] for n in self._kept.tolist()]
 

@@ -1,4 +1,4 @@
-"""Occlusion: motion that lacks joints, as where a camera does not see them, to learn how well gaps are filled."""
+"""Occlusion: remove joints from motion, as if a camera did not see them, to measure how well models impute them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from .clips import MotionSet
 
 
 def occlude(motion: MotionSet, share: float = 0.2, length: float = 15.0, seed: int = 0) -> MotionSet:
-    """The same motion without some of its joints, in bursts.
+    """Return the same motion with some joints missing, in bursts.
 
-    Every joint of every clip but the root is missing or there by a Markov chain of its own (the law of Gilbert, 1960):
-    a burst goes on with probability 1 - 1 / length from one frame to the next, so that its length is geometric, and
-    begins so often that a joint is missing in this share of the frames, the first one included. The root is there: what
-    is relative to it would be missing with it.
+    Every joint of every clip except the root is missing or observed according to its own Markov chain (Gilbert, 1960).
+    A burst continues from one frame to the next with probability 1 - 1 / length, so its length is geometric. Bursts
+    begin with the probability that makes `share` the expected proportion of missing frames, from the first frame on.
+    The root is never missing, because positions relative to it would be missing too.
 
     Args:
-        motion: the clips.
-        share: of the frames, in which a joint is missing in expectation.
-        length: frames of a burst, in expectation.
-        seed: of the draws; a clip's are of its place in the set.
+        motion: clips.
+        share: expected proportion of frames in which a joint is missing.
+        length: expected length of a burst in frames.
+        seed: seed of the draws; each clip also uses its index in the set.
 
     Raises:
-        ValueError: a share that is not in [0, 1), or a length below 1 or so short that the bursts cannot make it up.
+        ValueError: `share` is not in [0, 1), `length` is below 1, or the bursts are too short to reach the share.
     """
     begin = share / (1 - share) / length if 0 <= share < 1 <= length else np.nan
     if not 0 <= begin <= 1:

@@ -1,18 +1,17 @@
 """Protocols: how motion is cut into windows, and which windows are for training, validation and test.
 
-Sources of the presets: DLow (Yuan and Kitani 2020) and GSPS (Mao, Liu and Salzmann 2021) for Human3.6M and
-HumanEva-I, TrajeVAE (Kania et al. 2021), and the data's own README for bandai2 and cmu8.
+Sources of the presets: DLow (Yuan and Kitani 2020) and GSPS (Mao, Liu and Salzmann 2021) for Human3.6M and HumanEva-I,
+TrajeVAE (Kania et al. 2021), and the READMEs of the data for bandai2 and cmu8.
 
-Decisions, where papers and code differ:
+Decisions where papers and code differ:
 
-* A window may start at every frame from 0 to F - T *inclusive*. The public code of DLow and GSPS draws and
-  lists starts below F - T, so it never uses a clip's last frame and drops clips of exactly T frames.
-* Validation clips are every k-th training clip in file order, chosen by clip (windows of a clip overlap) and
-  before clips that are too short are left out, so that they are the same clips for every window length. In
-  bandai2 neighbouring takes are near copies and all validation takes have seen styles: validation there is no
-  substitute for the test.
-* References that remember the training data (nearest neighbours) should remember all of it:
-  `"train+validation"`.
+* A window may start at every frame from 0 to F - T *inclusive*. The public code of DLow and GSPS draws and lists starts
+  below F - T, so it never uses a clip's last frame and drops clips of exactly T frames.
+* Validation clips are every k-th training clip in file order. Whole clips are chosen because the windows of a clip
+  overlap. They are chosen before clips that are too short are dropped, so they are the same for every window length. In
+  bandai2, neighbouring takes are near copies and all validation takes have seen styles, so validation there does not
+  replace the test.
+* References that memorise the training data (nearest neighbours) should memorise all of it: `"train+validation"`.
 """
 
 from __future__ import annotations
@@ -42,35 +41,33 @@ from ..geometry.views import TURNS, Rotations
 from .clips import Clip, MotionSet
 
 Representation = Literal["positions", "6d", "quaternion", "vector"]
-"""What models see of motion: positions of joints, or rotations in a form of `dvae.motion.geometry.rotations`."""
+"""Input of the models: positions of joints, or rotations in a form of `dvae.motion.geometry.rotations`."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How windows are cut, represented and divided.
+    """How windows are cut, represented and split.
 
     Args:
-        name: what to call it in results.
-        observed, predicted: frames before and after the present; a window is both.
-        fps: frames per second the numbers of frames refer to.
+        name: name in results.
+        observed, predicted: number of observed and of predicted frames; a window contains both.
+        fps: frames per second that the numbers of frames refer to.
         train_stride, test_stride: frames between the starts of listed training and test windows.
-        root: "drop": every frame relative to its own pelvis, which is then left out, D = 3 (J - 1).
-            "relative": relative to the pelvis of the window's first frame (that has it), D = 3 J; global motion is
-            kept.
-        multimodal_threshold: metres; test windows whose last observed poses are closer are each other's
-            futures.
-        split_by: "split", or the label, by which clips are assigned.
-        train, test: its values that mean training and test.
-        validation: the part of the training clips held out.
-        sampling: how training windows are drawn. "clip": uniform clip, uniform start. "length": every window
-            alike. "subject": uniform split of the archive (a subject, in Human3.6M), then clip, then start.
-        heading: turn every window about the up axis so that the last observed frame has heading zero.
-        rotate: turn every drawn window about the up axis by a uniform angle.
-        representation: what models see of a window: positions, or the turns of joints in one of the forms of
-            `dvae.motion.geometry.rotations`. On their other side stand positions in either case.
+        root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1). "relative":
+            relative to the pelvis in the first frame of the window that has it, D = 3 J; global motion is kept.
+        multimodal_threshold: metres; test windows whose last observed poses are closer than this share their futures.
+        split_by: "split", or the label that assigns clips to splits.
+        train, test: values of `split_by` for training and test.
+        validation: fraction of the training clips held out for validation.
+        sampling: distribution of training windows. "clip": uniform clip, uniform start. "length": uniform over all
+            windows. "subject": uniform split of the archive (a subject, in Human3.6M), then clip, then start.
+        heading: rotate every window about the up axis so that the heading of its last observed frame is zero.
+        rotate: rotate every drawn window about the up axis by a uniform random angle.
+        representation: input of the models: positions, or joint rotations in one of the forms of
+            `dvae.motion.geometry.rotations`. Windows and scores use positions in either case.
 
     Raises:
-        ValueError: a number of frames or a stride is below 1, or heading and rotate contradict each other.
+        ValueError: a number of frames or a stride is below 1, or both heading and rotate are set.
     """
 
     name: str
@@ -100,7 +97,7 @@ class Protocol:
 
     @property
     def length(self) -> int:
-        """Frames in a window, T."""
+        """Number of frames T in a window."""
         return self.observed + self.predicted
 
 
@@ -134,16 +131,18 @@ PROTOCOLS = {
         Protocol("simulated-trajectories", 1, 60, 30, train_stride=5, test_stride=15, **_TRAJECTORIES),
     )
 }
-"""The presets by name. In `bandai2-by-style` all clips of groups A and B train, all of C test, whatever the
-file's own split; this reading gives the reference figures of the data's README. Options are chosen on `bandai2-tuning`,
-of groups A and B alone, so that group C stays unseen."""
+"""The presets by name.
+
+In `bandai2-by-style`, all clips of groups A and B are for training and all clips of C for testing, whatever the
+file's own split. This split reproduces the reference values of the data's README. Options are chosen on
+`bandai2-tuning`, which uses groups A and B only, so that group C stays unseen."""
 
 
 def named_protocol(name: str) -> Protocol:
-    """A preset protocol.
+    """Return a preset protocol.
 
     Raises:
-        ValueError: an unknown name, with the nearest known one.
+        ValueError: the name is unknown; the message suggests the nearest known one.
     """
     if name not in PROTOCOLS:
         raise ValueError(f"unknown protocol {name!r}{nearest(name, PROTOCOLS)}; known: {', '.join(PROTOCOLS)}")
@@ -155,8 +154,8 @@ class Poses(Schema):
     """The schema of windows of motion, x (B, T, D) in metres.
 
     Args:
-        skeleton: of the poses.
-        protocol: under which windows are cut.
+        skeleton: skeleton of the poses.
+        protocol: protocol that cuts the windows.
     """
 
     kind: ClassVar[str] = "poses"
@@ -166,7 +165,7 @@ class Poses(Schema):
 
     @classmethod
     def under(cls, protocol: Protocol, skeleton: Skeleton, length: int | None = None) -> Self:
-        """The schema of windows that a protocol cuts, or of others of this length."""
+        """Return the schema of windows that a protocol cuts, optionally with another length."""
         view = cls._view(protocol, skeleton)
         size = view.size if isinstance(view, Rotations) else 3 * (skeleton.joints - (protocol.root == "drop"))
         return cls({"x": size}, length or protocol.length, protocol.observed, skeleton=skeleton, protocol=protocol)
@@ -174,10 +173,10 @@ class Poses(Schema):
     @classmethod
     @override
     def of(cls, data: Any, who: str = "this method", representation: str = "positions") -> Self:
-        """The schema of poses of which a model sees this representation.
+        """Return the schema of data, and check the representation that a model reads.
 
         Raises:
-            SchemaError: nothing of which that is known, or poses of another one.
+            SchemaError: the data have no schema of poses, or another representation.
         """
         found = super().of(data, who)
         if (shown := found.protocol.representation) != representation:
@@ -212,16 +211,16 @@ class Poses(Schema):
 
     @property
     def frames(self) -> int:
-        """T, of a window."""
+        """Number of frames T in a window."""
         return self.length or self.protocol.length
 
     def config(self) -> dict[str, Any]:
-        """The schema in JSON's types; `from_config` reads it."""
+        """Return the schema as JSON types; `from_config` reads it."""
         return {"skeleton": asdict(self.skeleton), "protocol": asdict(self.protocol), "length": self.length}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """The schema that `config` wrote."""
+        """Return the schema from the result of `config`."""
         return cls.under(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
 
 
@@ -230,17 +229,17 @@ def _said(representation: str) -> str:
 
 
 def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int | None = None) -> Windows:
-    """The windows of a split.
+    """Return the windows of a split.
 
     Args:
-        motion: the clips.
-        protocol: how to cut them, or the name of one of `PROTOCOLS`.
+        motion: clips.
+        protocol: protocol that cuts them, or the name of one of `PROTOCOLS`.
         split: "train", "validation", "test", or "train+validation".
-        length: frames in a window, when it should differ from the protocol's observed + predicted.
+        length: frames in a window; default: the protocol's observed + predicted.
 
     Raises:
-        ValueError: the frame rates differ, the split has no clip, no clip is long enough, or a clip lacks the
-            label by which the protocol splits.
+        ValueError: the frame rates differ, the split has no clip, no clip is long enough, or a clip has no label
+            although the protocol splits by it.
     """
     if isinstance(protocol, str):
         protocol = named_protocol(protocol)
@@ -288,7 +287,10 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
 
 
 def held_out(count: int, part: float) -> set[int]:
-    """Which of so many clips are held out for validation: of as many blocks as that part of them are, the middles."""
+    """Return the indices of the clips held out for validation.
+
+    The clips are divided into one block per clip to hold out, and the middle of each block is held out.
+    """
     blocks = round(count * part)
     if part and count > 1:
         blocks = max(blocks, 1)
@@ -298,15 +300,16 @@ def held_out(count: int, part: float) -> set[int]:
 class Windows:
     """Windows of T frames cut from clips, as tensors (…, T, D) in metres.
 
-    Made by `windows`. `sample` draws windows, `all` lists them every few frames, `batches` some at a time. Clips stay
-    as they are, perhaps mapped from a disk: windows are put to their root and turned when they are cut.
+    Created by `windows`. `sample` draws windows, `all` lists windows at a fixed stride, and `batches` yields them in
+    batches. Clips are not copied and may be memory-mapped: windows are made relative to their root, and rotated, when
+    they are cut.
 
     Attributes:
-        protocol, skeleton, split: what they were made from.
-        length: frames in a window, T.
+        protocol, skeleton, split: as given.
+        length: number of frames T in a window.
         missing: whether joints may be missing.
-        clips: the clips that are long enough.
-        skipped: (split, clip, frames) of those that are not.
+        clips: clips that are long enough.
+        skipped: (split, clip, frames) of clips that are too short.
     """
 
     def __init__(self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int) -> None:
@@ -324,7 +327,7 @@ class Windows:
                 f"the longest of {longest} frames"
             )
         if protocol.heading:
-            self.skeleton.heading(torch.zeros(self.skeleton.joints, 3))  # says now if the skeleton has no sides
+            self.skeleton.heading(torch.zeros(self.skeleton.joints, 3))  # raises early without left and right
 
         self._frames = [clip.positions for clip in self.clips]
         self._turns: list[Any] | None = None
@@ -332,14 +335,14 @@ class Windows:
             self._turns = [turned[clip.key].rotations for clip in self.clips]
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
-        self._classes: dict[str, Tensor] = {}  # by variable, the class of every clip
-        self._given: Tensor | float | None = None  # see `given`
+        self._classes: dict[str, Tensor] = {}  # variable -> class of every clip
+        self._given: Tensor | float | None = None  # set by `given`
         self._starts = frames - length + 1
         if self.missing:
             seen = (np.isfinite(block).all(-1) for frames in self._frames for block in blocks(frames))
             told = (each[:, self.skeleton.root] & (each.sum(-1) > 1) for each in seen)
             before = np.concatenate([[False], *told]).cumsum(dtype=np.int32)
-            self._told = torch.from_numpy(before)  # frames before each that tell
+            self._told = torch.from_numpy(before)  # number of usable frames before each frame
             if not len(self):
                 raise ValueError(
                     f"{split} split of {motion.name!r} has no window that has the root beside another joint in some "
@@ -357,7 +360,7 @@ class Windows:
 
     @property
     def stride(self) -> int:
-        """Frames between listed windows, the protocol's; validation windows are listed like test windows."""
+        """Frames between listed windows; validation windows use the stride of test windows."""
         return self.protocol.train_stride if self.split.startswith("train") else self.protocol.test_stride
 
     @property
@@ -366,7 +369,7 @@ class Windows:
         return self.index(self.stride)
 
     def index(self, stride: int) -> list[tuple[str, str, int]]:
-        """(split, clip, first frame) of the windows that `all(stride)` lists."""
+        """Return (split, clip, first frame) of the windows that `all(stride)` lists."""
         return list(self._keys(stride))
 
     def __len__(self) -> int:
@@ -380,18 +383,19 @@ class Windows:
 
     @property
     def schema(self) -> Poses:
-        """What is known of these windows without their data."""
+        """Schema of these windows."""
         return Poses.under(self.protocol, self.skeleton, self.length)
 
     @property
     def size(self) -> int:
-        """Numbers per frame, D = 3 J, or 3 (J - 1) without the root."""
+        """Number of values per frame, D = 3 J, or 3 (J - 1) without the root."""
         return 3 * len(self.joints)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Draw windows with replacement, as the protocol's `sampling` says: {"x": (B, T, D)} float32.
+        """Draw windows with replacement, as the protocol's `sampling` defines: {"x": (B, T, D)} float32.
 
-        Of a set that may lack joints there is a "mask" too, see `all`. The same generator state gives the same windows.
+        If joints may be missing, the batch also contains "mask", as in `all`. The same generator state gives the same
+        windows.
         """
         which, where, turn = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
         clips = torch.searchsorted(self._weights, which * self._weights[-1], right=True)
@@ -407,16 +411,17 @@ class Windows:
         return batch
 
     def all(self, stride: int | None = None) -> Batch:
-        """The windows that start at multiples of `stride`, ordered like `keys`: {"x": (N, T, D)} float32.
+        """Return the windows that start at multiples of `stride`, in the order of `keys`: {"x": (N, T, D)} float32.
 
-        Of a set that may lack joints there is a "mask" too, (N, T, D), False where nothing was observed; x is 0 there.
-        Poses are relative to a root, so that where this is missing they are (with root="relative", where it is missing
-        throughout). Listed are windows of which something was observed, both before the present and after.
+        If joints may be missing, the batch also contains "mask" (N, T, D), which is False where a value is missing; x
+        is 0 there. Poses are relative to the root, so a whole frame is missing if its root is. With root="relative",
+        values are missing only if the root is missing throughout the window. Listed are windows with observed values
+        both in the observed and in the predicted frames.
         """
         return self._listed(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
 
     def batches(self, batch_size: int) -> Iterator[Batch]:
-        """The windows that `all()` lists, so many at a time."""
+        """Yield the windows that `all()` lists, in batches of `batch_size`."""
         clips, starts = self._list(self.stride)
         generator = torch.Generator().manual_seed(0)
         for some in torch.arange(len(clips)).split(batch_size):
@@ -424,7 +429,7 @@ class Windows:
 
     def _listed(self, clips: Tensor, starts: Tensor, generator: torch.Generator) -> Batch:
         x = torch.empty(len(clips), self.length, self.size)
-        for block in torch.arange(len(clips)).split(512):  # so that memory holds the windows little more than once
+        for block in torch.arange(len(clips)).split(512):  # in blocks: limits peak memory to little more than one copy
             x[block] = self._cut(clips[block], starts[block])
         batch = self._batch(x, clips, generator)
         if self._turns is not None:
@@ -432,13 +437,16 @@ class Windows:
         return batch
 
     def poses(self) -> Tensor:
-        """Every frame of the clips, once, as a window that starts there has it: (N, D) float32; whole poses alone."""
+        """Return every frame of the clips once, as the first frame of a window has it: (N, D) float32.
+
+        Frames with missing joints are left out.
+        """
         parts = (tensor_of(block) for frames in self._frames for block in blocks(frames))
         poses = torch.cat([self._represented(part[:, None], 0)[:, 0] for part in parts])
         return poses[poses.isfinite().all(-1)] if self.missing else poses
 
     def labels(self, name: str) -> list[str]:
-        """The label of every listed window's clip; empty text where a clip lacks it.
+        """Return the label of every listed window's clip; an empty string if the clip has none.
 
         Raises:
             KeyError: no clip has such a label.
@@ -449,15 +457,15 @@ class Windows:
         return [self.clips[c].labels.get(name, "") for c in self._list(self.stride)[0].tolist()]
 
     def classified(self, variable: str, label: str, classes: Sequence[str]) -> Windows:
-        """These windows, whose batches hold the class of each one too: {variable: (B,)} int64, indices of `classes`.
+        """Return these windows with classes in their batches: {variable: (B,)} int64, indices of `classes`.
 
         Args:
-            variable: its name in batches.
-            label: the label of the clips that is the class.
-            classes: what the label may be.
+            variable: name in batches.
+            label: label of the clips that is the class.
+            classes: possible values of the label.
 
         Raises:
-            ValueError: a clip lacks the label, or has one that is none of the classes.
+            ValueError: a clip does not have the label, or its value is not one of the classes.
         """
         for clip in self.clips:
             if (found := clip.labels.get(label)) not in classes:
@@ -472,9 +480,9 @@ class Windows:
         return windows
 
     def positions(self, x: Tensor) -> Tensor:
-        """Joint positions (..., T, J, 3) of frames (..., T, D), for drawing and bone lengths.
+        """Return joint positions (..., T, J, 3) of frames (..., T, D), for drawings and bone lengths.
 
-        A root that was dropped is put back at the origin.
+        A dropped root is added at the origin.
         """
         if x.shape[-1] != self.size:
             raise ValueError(
@@ -484,13 +492,13 @@ class Windows:
         return self.skeleton.with_root(x.unflatten(-1, (-1, 3)))
 
     def filled(self, positions: Tensor) -> MotionSet:
-        """The clips as they were read, and where they lack joints, with those of the listed windows.
+        """Return the original clips, with missing joints filled from the listed windows.
 
-        Windows are put back where they were cut, turned and moved as the clip is: the root where it was, or on the
-        straight line across its own gap. What several windows fill is the first one's; gaps that none covers stay.
+        Windows are moved and rotated back to the place where they were cut. A missing root is interpolated linearly. If
+        several windows cover a missing joint, the first one fills it; joints that no window covers stay missing.
 
         Args:
-            positions: (N, T, J, 3) of the windows, whole ones, see `positions`.
+            positions: (N, T, J, 3) of complete windows, in the format of `positions`.
         """
         clips, starts = self._list(self.stride)
         frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
@@ -502,12 +510,12 @@ class Windows:
         return MotionSet(made_whole, self.skeleton, missing=bool(found.isnan().any()))
 
     def to_world(self, positions: Tensor, chosen: Sequence[int] | slice = slice(None)) -> Tensor:
-        """Return positions (..., N, T, J, 3) of listed windows where and as their clips have them.
+        """Return positions (..., N, T, J, 3) of listed windows in the coordinates of their clips.
 
         Args:
-            positions: as `positions` returns them. Where the protocol drops the root, T frames of whole windows;
-                otherwise of any number.
-            chosen: places of the N windows in `keys`; by default all.
+            positions: result of `positions`. If the protocol drops the root, all T frames of each window; otherwise any
+                number of frames.
+            chosen: indices of the N windows in `keys`; default: all.
         """
         clips, starts = (each[chosen] for each in self._list(self.stride))
         joints, root = cut(self._frames, clips, starts, self.length), self.skeleton.root
@@ -521,14 +529,14 @@ class Windows:
         return positions + places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
 
     def given(self, joints: Sequence[str] | float) -> Windows:
-        """These windows, whose batches hold trajectories too: {"y": (B, T, D)}, x at given joints and 0 at others.
+        """Return these windows with trajectories in their batches: {"y": (B, T, D)}, x at given joints and 0 at others.
 
         Args:
-            joints: names of the given ones, see `Skeleton.find`; or the probability with which each one is given over
-                a whole window, one draw for a window and joint. `all` draws the same ones every time.
+            joints: names of the given joints, as in `Skeleton.find`; or the probability that a joint is given in a
+                whole window, drawn independently for each window and joint. `all` uses the same draws every time.
 
         Raises:
-            ValueError: an unknown joint, one that the protocol has dropped, or no probability.
+            ValueError: a joint is unknown, the protocol drops it, or the probability is not in [0, 1].
         """
         windows = copy(self)
         if isinstance(joints, float | int):
@@ -546,36 +554,36 @@ class Windows:
 
     @property
     def joints(self) -> list[str]:
-        """Names of the joints of a frame; all but the root, if the protocol drops that."""
+        """Names of the joints in a frame: all joints, without the root if the protocol drops it."""
         names, root = self.skeleton.names, self.skeleton.root
         return [name for j, name in enumerate(names) if self.protocol.root != "drop" or j != root]
 
     @property
     def given_joints(self) -> tuple[str, ...] | None:
-        """Names of the joints whose trajectories batches hold, if these are the same ones in every window."""
+        """Names of the joints whose trajectories are in the batches; None if they differ between windows."""
         if not isinstance(self._given, Tensor):
             return None
         return tuple(name for name, given in zip(self.joints, self._given.tolist(), strict=True) if given)
 
     references: ClassVar = {"zero velocity": "last value", "nearest neighbours": "nearest neighbours"}
-    """Reference forecasts, by the names that motion papers give them (`inference.evaluation.references`)."""
+    """Reference forecasts, by their names in motion papers (`inference.evaluation.references`)."""
 
     @property
     def description(self) -> dict[str, Any]:
-        """What a record says of these windows: joints, and those whose paths are given."""
+        """Entries for a record: the joints, and those whose paths are given."""
         said = {"joints": list(self.skeleton.names), "title": []}
         if (given := self.given_joints) is not None:
             said |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
         return said
 
     def with_protocol(self, protocol: Protocol) -> Windows:
-        """These windows, drawn and cut as another protocol says, which divides clips and frames alike."""
+        """Return these windows, cut by another protocol that splits clips and counts frames in the same way."""
         windows = copy(self)
         windows.protocol = protocol
         return windows
 
     def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> Batch:
-        """Windows with what is to go with them."""
+        """Return the batch of windows, with classes, mask and trajectories."""
         seen, x = x.isfinite(), x.nan_to_num(0.0)
         batch = Batch({"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}})
         if self.missing:
@@ -590,8 +598,8 @@ class Windows:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the protocol, the skeleton, the listed windows and what is read of the data they are cut from."""
-        protocol = astuple(self.protocol)  # with its last field where that is not what it always was
+        """SHA-256 of the protocol, the skeleton, the keys of the listed windows and the data that are read."""
+        protocol = astuple(self.protocol)  # omits `representation` for positions: keeps older fingerprints valid
         protocol = protocol if self._turns is not None else protocol[:-1]
         digest = hashlib.sha256(repr((protocol, self.split, self.length)).encode())
         names, parents, up = self.skeleton.names, self.skeleton.parents, self.skeleton.up
@@ -600,9 +608,7 @@ class Windows:
         digest.update(b")")
         for frames in self._frames:
             hash_values(digest, frames, "<f4")
-        if (
-            self._turns is not None and self._rest
-        ):  # turns of files: those that are found each machine rounds in its way
+        if self._turns is not None and self._rest:  # only rotations from files: estimates differ between machines
             digest.update(repr(self._rest).encode())
             for clip in self.clips:
                 if clip.rotations is not None:
@@ -615,14 +621,14 @@ class Windows:
         return digest.hexdigest()
 
     def _keys(self, stride: int) -> Iterator[tuple[str, str, int]]:
-        """Keys of the listed windows, one at a time: those for training may be as many as frames."""
+        """Yield the keys of the listed windows one at a time, because there may be as many as frames."""
         for clip, first, count in zip(self.clips, self._first.tolist(), self._starts.tolist(), strict=True):
             for some in torch.arange(0, count, _at_least_one(stride)).split(4096):
                 kept = some[self._tells(first + some)] if self.missing else some
                 yield from ((*clip.key, start) for start in kept.tolist())
 
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:
-        """Clip index and first frame of every listed window."""
+        """Return the clip index and first frame of every listed window."""
         stride = _at_least_one(stride)
         counts = (self._starts + stride - 1) // stride
         clips = torch.repeat_interleave(counts)
@@ -633,30 +639,30 @@ class Windows:
         return clips[kept], starts[kept]
 
     def _tells(self, first: Tensor) -> Tensor:
-        """Whether windows that start at these frames, counted over all clips, have something observed in both parts."""
+        """Return whether windows have usable frames in both parts; `first` counts frames over all clips."""
         before, now, after = (self._told[first + n] for n in (0, min(self.protocol.observed, self.length), self.length))
         return (before < now) & ((now < after) | (self.length <= self.protocol.observed))
 
     def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
-        """(B,), (B,) -> (B, T, D): copied, and then as the protocol represents them."""
+        """Return copied windows (B, T, D) in the protocol's representation, for clips (B,) and first frames (B,)."""
         return self._represented(cut(self._frames, clips, starts, self.length), self.protocol.observed - 1)
 
     def _represented(self, joints: Tensor, now: int) -> Tensor:
-        """Frames (B, T, D) of joints (B, T, J, 3), of whose frame `now` the heading is zero, if it is fixed."""
+        """Return frames (B, T, D) of joints (B, T, J, 3); a fixed heading is zero in frame `now`."""
         root = self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, now)[:, None, None]
         if self.protocol.root == "drop":
             joints = self.skeleton.without_root(joints - joints[:, :, root : root + 1])
         else:
-            origin = joints[:, :, root].isfinite().all(-1).byte().argmax(1)  # the first frame, unless it lacks it
+            origin = joints[:, :, root].isfinite().all(-1).byte().argmax(1)  # the first frame with an observed root
             joints = joints - joints[:, :, root : root + 1].take_along_dim(origin[:, None, None, None], 1)
         if self.protocol.heading:
             joints = rotate_about_up(joints, -heading, self.skeleton.up)
         return joints.flatten(-2)
 
     def _turned(self, clips: Tensor, starts: Tensor, angle: Tensor | None = None) -> Tensor:
-        """Turns (B, T, 4 J) of the joints in windows, whose root turns as the windows do."""
+        """Return rotations (B, T, 4 J) of the joints in windows; the root is rotated together with its window."""
         assert self._turns is not None
         turns, root = cut(self._turns, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:

@@ -1,13 +1,11 @@
-"""A simulator of human motion: people who walk, wave and turn, with everything known about them.
+"""A simulator of human motion: people who walk, wave and turn, with all underlying variables known.
 
-A person has a static part, drawn once a clip (morphology: the lengths of their bones; style: cadence,
-amplitudes, posture, carriage of the arms), and a dynamic part (a semi-Markov chain of activities and the
-phase of their gait). When the next activity starts, and which it is, cannot be known from the past, so
-futures are multimodal.
+A person has a static part, drawn once per clip: morphology (bone lengths) and style (cadence, amplitudes, posture, arm
+carriage). The dynamic part is a semi-Markov chain of activities and the phase of the gait. The time and type of the
+next activity cannot be predicted from the past, so futures are multimodal.
 
-Joint angles are smooth functions of phase and activity; positions follow by forward kinematics, so bones are
-rigid. The pelvis then moves as the feet demand: it is as high as the lower foot allows and travels so that
-the foot that carries the body stands still.
+Joint angles are smooth functions of phase and activity. Positions follow by forward kinematics, so bones are rigid. The
+pelvis then follows the feet: the lower foot determines its height, and the foot that carries the body stays in place.
 """
 
 from __future__ import annotations
@@ -21,17 +19,17 @@ ACTIVITIES = ("stand", "walk", "wave-left", "wave-right", "wave-both", "turn-lef
 """The activities in the order of the codes in a clip's truth."""
 
 SHORTEST, MEAN_EXTRA = 0.7, 1.0
-"""Seconds: an activity lasts the first plus an exponential time with the second as its mean."""
+"""Seconds: the duration of an activity is the first plus an exponential time whose mean is the second."""
 
 BLEND = 0.45
-"""Seconds that passing from one activity into the next takes."""
+"""Duration in seconds of the transition between activities."""
 
 SETTLE = 0.4
-"""Seconds over which the pelvis follows the feet: less shakes the body at each step, more lets feet slide."""
+"""Seconds of smoothing between feet and pelvis: shorter shakes the body at each step, longer lets the feet slide."""
 
 _J = {name: joint for joint, name in enumerate(WALKER.names)}
 
-# A body of average size at rest, metres: each joint's offset from its parent, left towards +x, facing +z.
+# Average body at rest: offset of each joint from its parent in metres. Left is +x, and the body faces +z.
 _REST = {
     "RHip": (-0.11, -0.03, 0.0),
     "RKnee": (0.0, -0.43, 0.0),
@@ -57,10 +55,10 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
     """Simulate clips of walking, waving and turning people on `WALKER`, 30 frames a second.
 
     Args:
-        clips: how many people, one clip each.
+        clips: number of people, one clip each.
         frames: length of a clip.
-        seed: the same seed gives the same clips.
-        test: the part of the clips, the last ones, that is filed under "test"; the rest is "train".
+        seed: random seed.
+        test: fraction of the clips, the last ones, in split "test"; the others are in "train".
 
     Returns:
         A `MotionSet`. Labels of a clip: `activity` (its first), `switches` ("walk@0 wave-left@41": activity
@@ -69,7 +67,7 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
         `heading` (F,) in radians, `bone_lengths` (16,) in metres, `style` (7,).
 
     Raises:
-        ValueError: fewer than 1 clip or 2 frames, or a part outside 0 to 1.
+        ValueError: fewer than 1 clip or 2 frames, or a test fraction outside 0 to 1.
     """
     if clips < 1 or frames < 2 or not 0 <= test <= 1:
         raise ValueError(f"cannot simulate {clips} clips of {frames} frames with a part of {test} for test")
@@ -104,7 +102,7 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
 
 
 def _morphology(random: np.random.Generator, clips: int) -> np.ndarray:
-    """Offsets of joints from their parents (N, J, 3): size, proportions of trunk, legs, arms and widths."""
+    """Draw offsets of joints from their parents (N, J, 3): size, and proportions of trunk, legs, arms and widths."""
     rest = np.zeros((WALKER.joints, 3))
     for name, offset in _REST.items():
         rest[_J[name]] = offset
@@ -117,17 +115,17 @@ def _morphology(random: np.random.Generator, clips: int) -> np.ndarray:
 
 
 def _style(random: np.random.Generator, clips: int) -> np.ndarray:
-    """(N, 7): cadence (Hz); stride, knee lift, arm swing, elbow bend, lean (radians); pace of waving (Hz)."""
+    """Draw styles (N, 7): cadence (Hz), stride, knee lift, arm swing, elbow bend, lean (radians), wave rate (Hz)."""
     middle = np.array([0.95, 0.42, 0.95, 0.45, 0.45, 0.06, 1.4])
     spread = np.array([0.14, 0.07, 0.12, 0.16, 0.22, 0.06, 0.3])
     return middle + spread * np.clip(random.standard_normal((clips, 7)), -2, 2)
 
 
 def _activities(random: np.random.Generator, clips: int, frames: int) -> np.ndarray:
-    """(N, F) codes: a semi-Markov chain that never repeats an activity and often walks."""
+    """Draw activity codes (N, F): a semi-Markov chain that never repeats an activity and prefers walking."""
     segments = 2 + int(frames / WALKER.fps / SHORTEST)
     seconds = SHORTEST + random.exponential(MEAN_EXTRA, (clips, segments))
-    seconds[:, 0] *= random.random(clips)  # the clip starts somewhere within its first activity
+    seconds[:, 0] *= random.random(clips)  # the clip starts at a random time within its first activity
     starts = np.cumsum(seconds, axis=1) - seconds
     odds = np.array([1.0, 3.0, 1.0, 1.0, 1.0, 1.5, 1.5])
     codes = np.empty((clips, segments), int)
@@ -153,7 +151,7 @@ def _smooth(signals: np.ndarray, seconds: float) -> np.ndarray:
 
 
 def _drift(random: np.random.Generator, clips: int, frames: int) -> np.ndarray:
-    """A slow random signal (N, F) of unit variance: four sinusoids below 0.4 Hz."""
+    """Draw a slow random signal (N, F) of unit variance: four sinusoids below 0.4 Hz."""
     time = np.arange(frames) / WALKER.fps
     hertz, phase = random.uniform(0.05, 0.4, (clips, 4, 1)), random.uniform(0, 2 * np.pi, (clips, 4, 1))
     return np.sin(2 * np.pi * hertz * time + phase).sum(axis=1) / np.sqrt(2)
@@ -164,7 +162,7 @@ def _of(weights: np.ndarray, prefix: str) -> np.ndarray:
 
 
 def _phase(random: np.random.Generator, weights: np.ndarray, style: np.ndarray) -> np.ndarray:
-    """Phase of the gait (N, F): it runs while walking or turning, and rests otherwise."""
+    """Return the phase of the gait (N, F): it advances while walking or turning, and rests otherwise."""
     clips, frames = weights.shape[:2]
     running = _of(weights, "walk") + 0.85 * _of(weights, "turn")
     hertz = style[:, :1] * (1 + 0.06 * _drift(random, clips, frames)) * running
@@ -172,7 +170,7 @@ def _phase(random: np.random.Generator, weights: np.ndarray, style: np.ndarray) 
 
 
 def _heading(random: np.random.Generator, weights: np.ndarray) -> np.ndarray:
-    """Heading (N, F) in radians: turns at the person's own rate, and a path that is never quite straight."""
+    """Return the heading (N, F) in radians: turns at a personal rate, and slow drift while walking."""
     clips, frames = weights.shape[:2]
     rate = random.uniform(1.0, 2.2, (clips, 1)) * (_of(weights, "turn-left") - _of(weights, "turn-right"))
     rate = rate + 0.15 * _drift(random, clips, frames) * _of(weights, "walk")
@@ -182,9 +180,9 @@ def _heading(random: np.random.Generator, weights: np.ndarray) -> np.ndarray:
 def _angles(
     random: np.random.Generator, weights: np.ndarray, style: np.ndarray, phase: np.ndarray, heading: np.ndarray
 ) -> dict[str, list[tuple[str, np.ndarray]]]:
-    """Rotations of the bones that start at each joint: (axis, angle (N, F)), the outermost first.
+    """Return the rotations of the bones that start at each joint: (axis, angle (N, F)), the outermost first.
 
-    About x a positive angle takes a hanging limb backwards; about z it takes it towards the left.
+    A positive angle about x moves a hanging limb backwards; a positive angle about z moves it to the left.
     """
     clips, frames = phase.shape
     _, stride, lift, swing, bend, lean, wave_hertz = (style[:, k : k + 1] for k in range(style.shape[1]))
@@ -203,7 +201,7 @@ def _angles(
     for side, sign in (("L", 1.0), ("R", -1.0)):
         own = phase if side == "L" else phase + np.pi
         step = np.clip(np.sin(own), 0, None) ** 2  # marching on the spot while turning
-        gait = np.cos(own) + 0.09 * np.cos(3 * own)  # nearly a triangle: the body's speed is nearly constant
+        gait = np.cos(own) + 0.09 * np.cos(3 * own)  # nearly a triangle wave: nearly constant speed
         flex = stride * walk * (gait + 0.1) + 0.45 * turn * step + 0.03
         knee = 0.06 + walk * (0.08 + lift * ((1 + np.cos(own - 1.45 * np.pi)) / 2) ** 2) + 0.9 * turn * step
         rotations[f"{side}Hip"] = [("x", -flex), ("z", sign * 0.03 - sway)]
@@ -223,7 +221,7 @@ def _angles(
 
 
 def _kinematics(offsets: np.ndarray, rotations: dict[str, list[tuple[str, np.ndarray]]]) -> np.ndarray:
-    """Forward kinematics: positions (N, F, J, 3) relative to the pelvis."""
+    """Return positions (N, F, J, 3) relative to the pelvis, by forward kinematics."""
     clips, frames = next(iter(rotations.values()))[0][1].shape
     positions = np.zeros((clips, frames, WALKER.joints, 3))
     globally: dict[int, np.ndarray] = {}
@@ -253,12 +251,12 @@ def _rotation(axis: str, angle: np.ndarray) -> np.ndarray:
 def _stand_on_feet(
     random: np.random.Generator, positions: np.ndarray, weights: np.ndarray, phase: np.ndarray
 ) -> np.ndarray:
-    """Global positions: the lower foot is on the floor, the foot that carries the body stays in its place."""
+    """Return global positions: the lower foot is on the floor, and the foot that carries the body stays in place."""
     feet = positions[:, :, [_J["LFoot"], _J["RFoot"]]]
     depth = np.exp(-(feet[..., 1] - feet[..., 1].min(axis=2, keepdims=True)) / 0.02)
     height = _ANKLE_HEIGHT - (depth * feet[..., 1]).sum(axis=2) / depth.sum(axis=2)
 
-    # Walking, a leg carries while it moves backwards; turning on the spot, while it is not lifted.
+    # In walking, a leg carries the body while it moves backwards; in turning on the spot, while it is not lifted.
     left = 0.5 + 0.5 * (_of(weights, "walk") - _of(weights, "turn")) * np.tanh(3 * np.sin(phase))
     carrying = np.stack([left, 1 - left], axis=2)
     steps = np.diff(feet[..., [0, 2]], axis=1, prepend=feet[:, :1, :, [0, 2]])

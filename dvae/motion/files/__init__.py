@@ -1,4 +1,4 @@
-"""Motion files: a reader for each format, all to one `Recording`, and writers of those that other programs open."""
+"""Motion files: one reader per format that returns a `Recording`, and writers for formats of other programs."""
 
 from .plain import read_paths, save
 from .reading import read_motion

@@ -1,10 +1,11 @@
-"""ASF/AMC, Acclaim's skeletons and motions, and the exponential-map text that the CMU benchmark made of them.
+"""ASF/AMC, Acclaim's skeletons and motions, and the CMU benchmark's text files of exponential maps.
 
-A bone of an ASF file has a direction, a length and axes of its own, about which its AMC rows turn it: by C M C^-1
-against its parent, where C are its axes and M the turn that a row has, the first angle first. Here a joint stands where
-its bone begins and has the bone's name; where a last bone ends stands one more.
+A bone of an ASF file has a direction, a length and its own axes. The rows of an AMC file rotate it about these axes, by
+C M C^-1 relative to its parent. C is the matrix of its axes, and M the rotation in the row, with the first angle
+applied first. Here a joint is at the start of its bone and has the name of the bone. An additional joint is at the end
+of each last bone.
 
-A unit is 1 / (45/100) inch where the file says `length 0.45` (the frequently asked questions of mocap.cs.cmu.edu).
+If the file contains `length 0.45`, a unit is 1 / (45/100) inch (frequently asked questions of mocap.cs.cmu.edu).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from .recording import END, Recording, check_joints, check_size, numbers, read_l
 
 INCH = 0.0254
 FPS = 120.0
-"""Of CMU's recordings, whose files do not say."""
+"""Frames per second of CMU's recordings, which the files do not contain."""
 
 
 Vector = tuple[float, float, float]
@@ -31,7 +32,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Bone:
-    """One bone: its parent's name, its vector in the file's unit, its axes (3, 3), and those of its turns."""
+    """One bone: name of its parent, vector in the unit of the file, axes (3, 3), and axes of its rotations."""
 
     parent: str
     vector: Vector
@@ -40,7 +41,7 @@ class Bone:
 
 
 def joints_of(bones: Mapping[str, Bone]) -> tuple[list[str], list[int], np.ndarray]:
-    """Names, parents and offsets (J, 3) of the joints at which bones begin and the last ones end, depth first."""
+    """Return names, parents and offsets (J, 3) of the joints at bone starts and at the last ends, depth first."""
     below: dict[str, list[str]] = {"root": []}
     for name, bone in bones.items():
         below[name] = []
@@ -61,11 +62,11 @@ def joints_of(bones: Mapping[str, Bone]) -> tuple[list[str], list[int], np.ndarr
 
 
 def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
-    """Bones, metres of a unit, whether angles are in degrees, and the channels of the root.
+    """Return the bones, the unit in metres, whether angles are in degrees, and the channels of the root.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is none, or damaged.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not ASF, or damaged.
     """
     path = Path(path)
     found: dict[str, dict[str, list[str]]] = {}
@@ -133,8 +134,8 @@ def read_amc(path: str | Path) -> Recording:
     only ASF file there.
 
     Raises:
-        FileNotFoundError: there is no such file, or no ASF file beside it.
-        ValueError: the file is none, or damaged, or of another skeleton; the message has the frame.
+        FileNotFoundError: the file does not exist, or its folder has no matching ASF file.
+        ValueError: the file is not AMC, is damaged, or has another skeleton; the message contains the frame.
     """
     path = Path(path)
     skeleton = _skeleton_of(path)
@@ -217,19 +218,19 @@ SUBJECT_02 = {
     "rthumb": ("rwrist", -0.59786, 0, 0.59786),
     "rfingers": ("rhand", -0.58887, 0, 0),
 }
-"""Parent and vector of the bones of CMU's subject 02, on whom the benchmark puts everybody, in 1 / .45 inch."""
+"""Parents and vectors of the bones of CMU's subject 02 in 1 / .45 inch; the benchmark gives this body to everybody."""
 
 
 def read_expmap(path: str | Path) -> Recording:
-    """Read exponential maps as in the CMU benchmark: a row of 117 numbers for each frame, place and rotation vectors.
+    """Read exponential maps as in the CMU benchmark: rows of 117 numbers per frame, positions and rotation vectors.
 
-    The file's vectors act on rows, and are negated here. Its first row is no frame but a pose at rest, and is left out.
-    Its rotation of the root composes the angles of the AMC file in the wrong order (z x y, not z y x), which tilts who
-    faces away from +z; the angles are taken out and composed again.
+    The vectors in the file act on rows; they are negated here. The first row is a rest pose, not a frame, and is left
+    out. The root rotation in the file composes the angles of the AMC file in the wrong order (z x y instead of z y x),
+    which tilts people who face away from +z. The angles are extracted and composed again in the right order.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is none, or damaged.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file has another format, or is damaged.
     """
     path = Path(path)
     text = " ".join(read_lines(path)).replace(",", " ")
@@ -243,7 +244,8 @@ def read_expmap(path: str | Path) -> Recording:
     read = torch.from_numpy(values).reshape(rows, -1, 3)[1:]
     turns = to_matrix(-read[:, 1:], "vector")
     z, x, y = from_matrix(turns[:, 0], "euler-zxy").unbind(-1)
-    other = y.abs() > pi / 2  # of the two triples for a rotation, AMC files have that whose y, in the middle, is small
+    # of the two equivalent triples of angles, AMC files use the one with a small middle angle y
+    other = y.abs() > pi / 2
     z, x, y = torch.where(other, pi + z, z), torch.where(other, pi - x, x), torch.where(other, pi + y, y)
     turns[:, 0] = to_matrix(torch.stack([z, y, x], -1), "euler-zyx")
     places = torch.from_numpy(offsets).repeat(rows - 1, 1, 1)
@@ -252,15 +254,15 @@ def read_expmap(path: str | Path) -> Recording:
 
 
 def _turned(angles: Tensor, axes: str) -> Tensor:
-    """Turns (..., 3, 3) about fixed axes in this order, by angles (..., n) in radians."""
+    """Return rotations (..., 3, 3) about fixed axes in this order, by angles (..., n) in radians."""
     return to_matrix(angles.flip(-1), f"euler-{axes[::-1]}")
 
 
 def _ordered(path: Path, parent_of: Mapping[str, str]) -> Iterator[str]:
-    """The bones in the order of the file.
+    """Yield the bones in the order of the file.
 
     Raises:
-        ValueError: they do not all hang from the root.
+        ValueError: a bone does not descend from the root.
     """
     reached = {"root"}
     for name, parent in parent_of.items():

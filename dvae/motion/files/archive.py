@@ -1,9 +1,9 @@
-"""Reading npz archives that anybody may have made.
+"""Safe reading of untrusted npz archives.
 
-Nothing in one is believed before it is checked, and no native object is built from what it says. Headers
-(`dvae.data.npy`) and the pickle of an archive are read by few rules, into names, shapes and bytes; when these fit each
-other, arrays are made of the bytes. numpy's own readers evaluate headers, and fill arrays and dtypes with whatever a
-pickle holds.
+Everything in an archive is checked before it is used, and no native object is created from it directly. Headers
+(`dvae.data.npy`) and pickles are parsed by few rules into names, shapes and bytes. If these are consistent, arrays are
+created from the bytes. numpy's own readers evaluate headers, and fill arrays and dtypes with whatever a pickle
+contains.
 """
 
 from __future__ import annotations
@@ -26,36 +26,36 @@ from ...data.npy import LONGEST, Refused, check_bytes, dtype_of, header
 from ..geometry.skeleton import is_name
 
 LARGEST = 4 * 2**30
-"""Bytes that a file may unpack to."""
+"""Maximum size in bytes of an unpacked file."""
 
 DENSEST, SMALL = 100, 2**26
-"""How many times its own size a file may unpack to, where that is more than so many bytes. Motion packs to a half."""
+"""Maximum compression ratio of a file that unpacks to more than `SMALL` bytes. Motion compresses to about a half."""
 
 MAPPED = 2**28
-"""Bytes of an archive from which it is written as it is, and what it holds can be mapped."""
+"""Size in bytes above which an archive is written uncompressed, so that its arrays can be memory-mapped."""
 
 INSTRUCTIONS = 2**20
-"""Of a pickle; that of an archive has about twenty for each clip."""
+"""Maximum number of instructions in a pickle; an archive has about twenty for each clip."""
 
 _CHUNK = 2**20
 
 
 @contextmanager
 def archive(path: str | Path, mapping: bool = False) -> Iterator[dict[str, Member]]:
-    """The members of an npz file by name, to be read within the context.
+    """Open an npz file, and yield its members by name, to be read within the context.
 
     Args:
-        path: the file.
-        mapping: of a large file, map those arrays of float32 that are in it as they are: they are not in memory, last
-            when the context has ended, and nobody can write to them.
+        path: file.
+        mapping: memory-map the uncompressed float32 arrays of a large file. They use no memory, stay valid after the
+            context, and are read-only.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or no npz, or would unpack to more than is read; what is refused within the
-            context names the file too.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged, is not an npz, or would unpack to too many bytes. Errors raised within the
+            context also name the file.
     """
     path = Path(path)
-    if not path.is_file():  # nor a pipe, which would never end
+    if not path.is_file():  # excludes pipes, which might never end
         raise FileNotFoundError(f"{path}: no such file")
     try:
         with _damage(), zipfile.ZipFile(path) as file:
@@ -63,23 +63,23 @@ def archive(path: str | Path, mapping: bool = False) -> Iterator[dict[str, Membe
     except MemoryError:
         raise ValueError(f"{path}: there is not enough memory to read it") from None
     except Refused as error:
-        # no terminal's commands
+        # removes terminal control characters
         text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(error))
         raise ValueError(f"{path}: {text}") from error
 
 
 def holds(path: str | Path, *names: str) -> bool:
-    """Whether a file is an npz with members of these names."""
+    """Return whether a file is an npz with members of these names."""
     try:
         with archive(path) as members:
             return members.keys() >= {*names}
-    except (OSError, ValueError):  # the reader reports what is wrong with it
+    except (OSError, ValueError):  # the reader will report the error
         return False
 
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """What the zip library raises over damaged bytes, which is almost anything, as a sentence."""
+    """Convert the errors that the zip library raises on damaged bytes, which can be almost any, to `Refused`."""
     try:
         yield
     except (Refused, MemoryError, FileNotFoundError, PermissionError):
@@ -90,16 +90,19 @@ def _damage() -> Iterator[None]:
 
 
 def _limit(size: int) -> int:
-    """Bytes that a file of this size may unpack to."""
+    """Return the maximum unpacked size in bytes of a file of this size."""
     return min(LARGEST, max(SMALL, DENSEST * size))
 
 
 def write_arrays(file: BinaryIO, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Write an npz that `archive` reads: compressed, unless it can be mapped or packs too well, as what hardly moves.
+    """Write an npz that `archive` reads.
+
+    It is compressed unless it is large enough to be mapped, or its compression ratio is above the limit for reading, as
+    for motion that hardly moves.
 
     Args:
-        file: a new one, open for writing and reading.
-        arrays: the members by name, one at a time.
+        file: new file, open for writing and reading.
+        arrays: members by name, one at a time.
     """
     with zipfile.ZipFile(file, "w") as stored:
         for name, array in arrays:
@@ -152,7 +155,7 @@ def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Membe
 
 
 def _placed(content: np.ndarray, info: zipfile.ZipInfo) -> np.ndarray | None:
-    """The array of a member where it lies in the bytes of its archive; None of one that has to be read."""
+    """Return the array of a member as a view of the archive's bytes, or None if it has to be read."""
     if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1 or info.header_offset < 0:
         return None
     local = content[info.header_offset :][:30].tobytes()
@@ -171,7 +174,7 @@ def _placed(content: np.ndarray, info: zipfile.ZipInfo) -> np.ndarray | None:
 
 
 class _Stream:
-    """The unpacked bytes of a member, of which no more is asked for than there are."""
+    """The unpacked bytes of a member; reads beyond its end raise an error."""
 
     class _Raw(io.RawIOBase):
         def __init__(self, file: Any):
@@ -181,7 +184,7 @@ class _Stream:
             return True
 
         def readinto(self, buffer: Any) -> int:
-            data = self._file.read(min(len(buffer), _CHUNK))  # more at once would be unpacked before it is cut
+            data = self._file.read(min(len(buffer), _CHUNK))  # a larger request would be unpacked before it is cut
             buffer[: len(data)] = data
             return len(data)
 
@@ -194,7 +197,7 @@ class _Stream:
         return self._taken(self._buffered.read(size))
 
     def some(self, size: int) -> bytes:
-        """So many bytes, or those that are left."""
+        """Return `size` bytes, or all remaining ones."""
         return self.read(min(size, self.left))
 
     def readline(self) -> bytes:
@@ -218,7 +221,7 @@ class Member:
     """One npy file inside an npz.
 
     Args:
-        name: without the ending.
+        name: name without the ending.
     """
 
     name: str
@@ -228,14 +231,14 @@ class Member:
 
     @property
     def size(self) -> int:
-        """Bytes that it unpacks to."""
+        """Unpacked size in bytes."""
         return self._info.file_size
 
     def array(self) -> np.ndarray:
-        """The array, of numbers or text.
+        """Return the array of numbers or text.
 
         Raises:
-            ValueError: it is damaged, or holds pickled objects.
+            ValueError: it is damaged, or contains pickled objects.
         """
         if self._mapped is not None:
             return self._mapped
@@ -253,10 +256,10 @@ class Member:
         return array
 
     def clips(self) -> list[tuple[str, str, np.ndarray]]:
-        """(split, clip, array) of a pickled dictionary of dictionaries of arrays.
+        """Return (split, clip, array) of a pickled dictionary of dictionaries of arrays.
 
         Raises:
-            ValueError: it is damaged, or anything else; or its pickle asks for something that is not data.
+            ValueError: it is damaged, it has other content, or its pickle contains anything but data.
         """
         with self._open() as stream:
             dtype, shape, _ = header(stream.some)
@@ -292,14 +295,14 @@ class Member:
 
 
 class _Global:
-    """A name that a pickle may say, and what calling it with arguments means here."""
+    """A global name in a pickle, and a safe replacement for its call."""
 
     def __init__(self, name: str, call: Callable[..., Any] | None = None):
         self.name, self.call = name, call
 
 
 class _Type:
-    """A dtype in the making: a code, then the order of its bytes."""
+    """A dtype under construction: a code, then its byte order."""
 
     def __init__(self, dtype: np.dtype):
         self.dtype = dtype
@@ -314,7 +317,7 @@ class _Type:
 
 
 class _Array:
-    """An array in the making: nothing, then an array of numbers or text, or a shape and a list of objects."""
+    """An array under construction: empty, then an array of numbers or text, or a shape and a list of objects."""
 
     def __init__(self, array: np.ndarray | None = None):
         self._array = array
@@ -334,11 +337,11 @@ class _Array:
         self._array, self._objects = np.empty((), object), content
 
     def item(self) -> Any:
-        """What an array of one object holds."""
+        """Return the content of an array of one object."""
         return self._objects[0] if self._objects and len(self._objects) == 1 else self
 
     def numbers(self) -> np.ndarray:
-        """The array, or an empty one of objects: these are not used."""
+        """Return the array, or an empty one for objects, which are not used."""
         if self._array is None:
             raise Refused("damaged pickle: an array has no content")
         return self._array
@@ -360,7 +363,7 @@ def _shape(shape: Any) -> tuple[int, ...]:
 
 
 def _bytes(content: Any) -> bytes | bytearray:
-    if isinstance(content, str):  # Python 2's bytes
+    if isinstance(content, str):  # bytes of Python 2
         return content.encode("latin1")
     if not isinstance(content, bytes | bytearray):
         raise Refused(f"refused an array of a {_said(content)}: expected bytes")
@@ -376,23 +379,23 @@ def _of_bytes(content: Any, dtype: np.dtype, shape: Any, order: Any) -> np.ndarr
 
 
 class _Interpreter:
-    """Follows a pickle, and builds dict, list, tuple, str, numbers and arrays; refuses every other global by name.
+    """Interpret a pickle, and build dict, list, tuple, str, numbers and arrays; refuse every other global by name.
 
-    Whatever a pickle can name again at the price of two bytes is neither copied, nor compared, nor gone through without
+    A pickle can refer to a value again for two bytes. Such values are never copied, compared or traversed without
     limit.
 
     Args:
-        room: bytes of text and content that calls may take, each as often as it is given to one.
+        room: maximum number of bytes of text and content passed to calls; repeated values count each time.
     """
 
     def __init__(self, room: int) -> None:
         self.room = room
         self.stack: list[Any] = []
-        self.below: list[list[Any]] = []  # the stacks under the marks
+        self.below: list[list[Any]] = []  # the stacks below the marks
         self.memo: dict[int, Any] = {}
 
     def run(self, stream: _Stream) -> Any:
-        """What a pickle makes."""
+        """Return the value of a pickle."""
         try:
             for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):  # type: ignore[arg-type]
                 if count == INSTRUCTIONS:
@@ -419,7 +422,7 @@ class _Interpreter:
         self.stack = []
 
     def items(self) -> list[Any]:
-        """What lies above the last mark, which is taken away."""
+        """Remove and return the values above the last mark."""
         found, self.stack = self.stack, self.below.pop()
         return found
 
@@ -446,7 +449,7 @@ class _Interpreter:
         if not isinstance(target, dict):
             raise Refused(f"refused to set items of a {_said(target)}")
         for key, value in zip(items[::2], items[1::2], strict=True):
-            if not isinstance(key, str):  # nothing else is hashed or compared, which can take forever
+            if not isinstance(key, str):  # only text is hashed or compared; other values could take forever
                 raise Refused(f"refused a {_said(key)} as a key: splits and clips have names")
             if not is_name(key):
                 raise Refused(f"refused the key {key[:40]!r}: splits and clips have names")
@@ -458,7 +461,7 @@ class _Interpreter:
         self.fill(items)
 
     def find(self, name: str) -> None:
-        home = name.replace("numpy._core.", "numpy.core.")  # numpy 2 moved its core
+        home = name.replace("numpy._core.", "numpy.core.")  # numpy 2 renamed its core
         if home not in _GLOBALS:
             raise Refused(f"refused {name[:200]}: {_ALLOWED}")
         self.push(_Global(home, _GLOBALS[home]))
@@ -493,7 +496,7 @@ class _Interpreter:
 def _reconstruct(subtype: Any, shape: Any, _code: Any) -> _Array:
     if not isinstance(subtype, _Global) or subtype.name != "numpy.ndarray":
         raise Refused(f"refused an array of the class {_said(subtype)}")
-    if _shape(shape) != (0,):  # numpy starts every array empty and fills it afterwards
+    if _shape(shape) != (0,):  # numpy creates every array empty and fills it afterwards
         raise Refused(f"refused an array declared with shape {shape} before its content")
     return _Array()
 
@@ -513,7 +516,7 @@ def _from_buffer(content: Any, kind: Any, shape: Any, order: Any, axes: Any = No
     return _Array(array)
 
 
-def _encode(text: Any, encoding: Any) -> bytes:  # how protocols 0 to 2 spell bytes
+def _encode(text: Any, encoding: Any) -> bytes:  # protocols 0 to 2 encode bytes in this way
     if encoding != "latin1":
         raise Refused(f"refused the codec {str(encoding)[:40] if isinstance(encoding, str) else ''}: expected latin1")
     return bytes(_bytes(text if isinstance(text, str) else None))

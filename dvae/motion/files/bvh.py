@@ -1,9 +1,9 @@
-"""BVH, Biovision's hierarchy: a tree of joints with offsets and channels, then a row of numbers for each frame.
+"""BVH (Biovision hierarchy): a tree of joints with offsets and channels, then one row of numbers per frame.
 
-Read as animation programs do: a joint's turns are about its own axes in the order of its channels, and a joint with
-channels of position, which any may have, is placed by these in place of its offset. Ends are joints of their own,
-named after what ends, but for those without a length, which say nothing. Known readers refuse files in circulation,
-such as those with one row more than they announce.
+Files are read in the same way as animation programs read them. Rotations are about the joint's own axes, in the order
+of its channels. Position channels, which any joint may have, replace the joint's offset. End sites become joints, named
+after their parents; end sites without length are dropped. Many existing files have errors, such as one row more than
+announced; these files are accepted.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class _Joint:
     name: str
     parent: int
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    channels: list[int] = field(default_factory=list)  # places in _AXES
+    channels: list[int] = field(default_factory=list)  # indices into _AXES
     ends: bool = False
 
 
@@ -38,8 +38,8 @@ def read_bvh(path: str | Path) -> Recording:
     """Read a BVH file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is none, or damaged; the message has the line.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not BVH, or damaged; the message contains the line.
     """
     path = Path(path)
     lines = read_lines(path)
@@ -88,20 +88,21 @@ def write_bvh(
     fps: float,
     order: str = "zyx",
 ) -> None:
-    """Write a BVH file in centimetres, as animation programs expect them; it replaces an older one once it is whole.
+    """Write a BVH file in centimetres, the usual unit of animation programs.
 
-    At a joint from which nothing hangs stands an end without a length, which importers ask for.
+    An existing file is replaced only after a complete write. A joint without children gets an end site of length zero,
+    because importers require one.
 
     Args:
-        names, parents: of the joints, the root first.
-        offsets: (J, 3) of the rest pose in metres.
+        names, parents: joint names and indices of their parents, the root first.
+        offsets: (J, 3), rest pose in metres.
         rotations: (F, J, 4), local quaternions w x y z.
-        root: (F, 3), place of the root in metres.
+        root: (F, 3), position of the root in metres.
         fps: frames per second.
-        order: of the turns.
+        order: order of the rotation axes.
 
     Raises:
-        ValueError: a name has white space or a brace, or names repeat.
+        ValueError: a name contains white space or a brace, or names repeat.
     """
     for name in names:
         if not name or any(letter.isspace() or letter in "{}" for letter in name):
@@ -138,13 +139,14 @@ def write_bvh(
 
 
 def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
-    """The joints, parents first, and the line of MOTION, which loses this word.
+    """Return the joints, parents first, and the line of MOTION, where this word is removed.
 
-    Words may be anywhere on lines, but the name of a joint, which may have several, is on one.
+    Words may be split over lines arbitrarily, except that the name of a joint, which may have several words, is on one
+    line.
     """
     joints: list[_Joint] = []
-    open_: list[int] = []  # joints whose braces are open, the last one inmost
-    named = False  # a joint was named, and its brace is to come
+    open_: list[int] = []  # joints with open braces, the innermost last
+    named = False  # a joint was named, and its opening brace must follow
     words = ((word, number) for number, line in enumerate(lines, 1) for word in _WORD.findall(line))
     ahead = next(words, None)
 
@@ -152,7 +154,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
         return ValueError(f"{path}: line {number} is {lines[number - 1].strip()[:60]!r}, expected {expected}")
 
     def following(belongs: Callable[[str, int], bool]) -> list[str]:
-        """The next words, as long as they belong to the one before."""
+        """Return the next words that belong to the current keyword."""
         nonlocal ahead
         found = []
         while ahead is not None and belongs(*ahead):
@@ -173,7 +175,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
         if kind in ("ROOT", "JOINT", "END"):
             if named or (kind == "ROOT") == bool(joints) or (kind != "ROOT" and not open_):
                 raise wrong(number, "one ROOT, and JOINT or End Site within its braces")
-            line = number if ahead is None else ahead[1]  # of the name, which may have several words
+            line = number if ahead is None else ahead[1]  # line of the name
             rest = " ".join(following(lambda word, at: at == line and word != "{"))  # noqa: B023
             parent = open_[-1] if open_ else -1
             name = rest if kind != "END" else joints[parent].name + END
@@ -195,7 +197,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
                 raise wrong(number, "a brace that was opened")
             closed = joints[open_.pop()]
             if closed.ends and closed is joints[-1] and not (closed.offset.any() or closed.channels):
-                joints.pop()  # at its parent, which has a name
+                joints.pop()  # the end coincides with its parent
         elif kind == "OFFSET" and open_ and not named:
             found = numbers(" ".join(following(_is_value)), f"{path}: line {number}")
             if len(found) != 3:
@@ -217,7 +219,7 @@ def _is_value(word: str, _: int) -> bool:
 
 
 def _header(path: Path, lines: list[str], line: int) -> tuple[int, float, int]:
-    """Number of frames, seconds from one to the next, and the line at which they begin."""
+    """Return the number of frames, the frame time in seconds, and the line where the frames begin."""
     found: list[float] = []
     for expected in ("frames:", "frame time:"):
         text = ""

@@ -1,4 +1,4 @@
-"""Recordings that their owners let everybody download, checked by their SHA-256.
+"""Download freely available recordings, verified by their SHA-256.
 
 CMU Graphics Lab Motion Capture Database, mocap.cs.cmu.edu: free for all uses; the data may not be resold. "The data
 used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."
@@ -21,23 +21,23 @@ COLLECTIONS: dict[str, tuple[str, dict[str, str]]] = {
         },
     ),
 }
-"""Name to the address of its folder, and its files with their SHA-256."""
+"""Name -> URL of the folder, and its files with their SHA-256."""
 
 
 def get(name: str, out: str | Path, url: str | None = None) -> list[Path]:
-    """Download a collection's files that are not there yet; none that is not what it should be is kept.
+    """Download the missing files of a collection; files with a wrong checksum are not kept.
 
     Args:
-        name: of the collection, one of `COLLECTIONS`.
-        out: the folder; subfolders are as at the address.
-        url: of another copy.
+        name: name of the collection, one of `COLLECTIONS`.
+        out: output folder; subfolders are the same as at the URL.
+        url: URL of a mirror.
 
     Returns:
         The files.
 
     Raises:
-        ValueError: an unknown name; or a file is not the one that is known.
-        OSError: a file cannot be had or written.
+        ValueError: the name is unknown, or the checksum of a file is wrong.
+        OSError: a file cannot be downloaded or written.
     """
     if name not in COLLECTIONS:
         raise ValueError(f"no collection {name!r}; known: {', '.join(COLLECTIONS)}")

@@ -1,6 +1,6 @@
-"""C3D, the markers of optical motion capture (The C3D File Format, Motion Lab Systems 2021), of which places are read.
+"""C3D, the markers of optical motion capture (The C3D File Format, Motion Lab Systems 2021); only positions are read.
 
-Known readers, in C and C++, end the whole process over a damaged file; what is read here is checked against them.
+Existing readers in C and C++ crash the whole process on a damaged file. This reader was verified against them.
 """
 
 from __future__ import annotations
@@ -17,29 +17,30 @@ from ... import files
 from .recording import MOST_TEXT, Recording, check_joints, check_size
 
 MOST_DISTANCES = 2**23
-"""From which a tree is found: of a hundred markers, in 800 frames."""
+"""Maximum number of distances used to find a tree: a hundred markers in 800 frames."""
 
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
-_BLOCK, _MOST_BLOCKS = 512, 255  # bytes of a block, and how many hold the parameters, said in one byte
+_BLOCK, _MOST_BLOCKS = 512, 255  # bytes of a block, and maximum number of parameter blocks, which is stored in one byte
 _OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "REACTIONS", "SCALARS")
-"""Parameters of the group POINT that list points which are no places but what a model of the body computed."""
-_ORDERS = {84: "<", 86: ">"}  # Intel's and MIPS' bytes; DEC's numbers (85) are of the eighties
+"""Parameters of the group POINT that list points computed by a body model; these points are not positions."""
+_ORDERS = {84: "<", 86: ">"}  # byte orders of Intel and MIPS; the DEC format (85) dates from the 1980s
 
 
 def read_c3d(path: str | Path) -> Recording:
-    """Read the labelled markers of a C3D file, and the tree that holds them best together.
+    """Read the labelled markers of a C3D file, and connect them by a tree.
 
-    Markers have no skeleton. Here one hangs from another where their distance hardly changes: the minimum spanning tree
-    over the spread of all distances, from the marker in the middle. A marker that is not seen is NaN: its residual is
-    negative, or its place and its residual are exactly zero. Points without a name are left out, and so are those that
-    the file lists as angles, forces, moments, powers, reactions or scalars. The notes of the recording name them.
+    Markers have no skeleton. The tree is the minimum spanning tree over the variation of all pairwise distances, rooted
+    at the central marker, so that neighbours are at nearly constant distance. A marker that was not observed is NaN:
+    its residual is negative, or its position and residual are exactly zero. Points without a name are left out. So are
+    points that the file lists as angles, forces, moments, powers, reactions or scalars. The notes of the recording name
+    all of these points.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is none, or damaged; or has no markers.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not C3D, is damaged, or has no markers.
     """
     path = Path(path)
-    if not path.is_file():  # nor a pipe, which would never end
+    if not path.is_file():  # excludes pipes, which might never end
         raise FileNotFoundError(f"{path}: no such file")
     content = files.read(path, MOST_TEXT, links=True)
     if len(content) < _BLOCK or not content[0] or content[1] != 0x50:
@@ -55,7 +56,7 @@ def read_c3d(path: str | Path) -> Recording:
     kind = np.dtype(f"{order}f4" if scale < 0 else f"{order}i2")
     row = 4 * markers + analog
     there = max(len(content) - _BLOCK * (start - 1), 0) // (kind.itemsize * row) if row and start else 0
-    frames = there if last == 0xFFFF else last - first + 1  # more than fit into two bytes
+    frames = there if last == 0xFFFF else last - first + 1  # the number of frames exceeds two bytes
     if not 0 < frames <= there or not markers:
         raise ValueError(f"{path}: it announces {markers} markers in {frames} frames and has room for {there}")
     check_size(path, frames, markers)
@@ -105,7 +106,7 @@ def _some(names: list[str]) -> str:
 
 
 def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
-    """Texts of the group POINT by name, and the order of bytes."""
+    """Return the texts of the group POINT by name, and the byte order."""
     start = _BLOCK * (content[0] - 1)
     content = content[start : start + _BLOCK * _MOST_BLOCKS]
     content = content[: _BLOCK * content[2] or None]  # some programs write 0
@@ -118,7 +119,7 @@ def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
         further = struct.unpack_from(f"{order}H", content, here)[0]
         if group < 0:
             point = -group if name == "POINT" else point
-        elif struct.unpack_from("b", content, here + 2)[0] == -1:  # text
+        elif struct.unpack_from("b", content, here + 2)[0] == -1:  # a text parameter
             sizes = list(content[here + 4 : here + 4 + content[here + 3]])
             width = sizes[0] if sizes else 1
             begin = here + 4 + len(sizes)
@@ -132,10 +133,10 @@ def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
 
 
 def tree(places: np.ndarray) -> tuple[list[int], list[int]]:
-    """Markers, each after the one that it hangs from, and the places of these in that order; -1 for the first.
+    """Return the markers in breadth-first order, and the index of each parent in that order, -1 for the first.
 
     Args:
-        places: (F, M, 3), NaN where one is not seen.
+        places: (F, M, 3), NaN where a marker was not observed.
     """
     some = places[:: -(-len(places) * places.shape[1] ** 2 // MOST_DISTANCES)]
     pairs = np.stack([np.linalg.norm(some - some[:, marker, None], axis=-1) for marker in range(some.shape[1])], 1)
@@ -145,7 +146,7 @@ def tree(places: np.ndarray) -> tuple[list[int], list[int]]:
     spread = np.sqrt(np.square(np.where(known, pairs - mean, 0)).sum(0) / count)
     never = known.sum(0) < 2
     mean, spread = np.where(never, mean.max() + 1, mean), np.where(never, spread.max() + 1, spread)
-    weights = spread + 1e-3 * mean + 1e-12  # of markers on one bone the nearest; none is 0, which would be no edge
+    weights = spread + 1e-3 * mean + 1e-12  # prefers near markers on the same bone; csgraph ignores edges of weight 0
     np.fill_diagonal(weights, 0)
     middle = int(mean.sum(1).argmin())
     graphs = scipy.sparse.csgraph

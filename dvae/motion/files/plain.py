@@ -1,8 +1,8 @@
-"""Archives of positions, read and written: `positions_3d`, plain npz, tables.
+"""Read and write archives of positions: `positions_3d`, plain npz, and tables.
 
-The `positions_3d` archive is VideoPose3D's (Pavllo et al. 2019; `data_3d_h36m.npz`): an npz whose one member
-is a pickled dictionary split -> clip -> (F, J, 3). A pickle is a program, and numpy's `allow_pickle=True`
-runs it. Here it is read as data (`archive`).
+The `positions_3d` archive is VideoPose3D's (Pavllo et al. 2019; `data_3d_h36m.npz`): an npz whose only member is a
+pickled dictionary split -> clip -> (F, J, 3). A pickle is a program, and numpy's `allow_pickle=True` runs it. Here it
+is parsed as data only (`archive`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .recording import MOST_PLACES, MOST_TEXT, Recording, check_joints
 from .settled import doubt
 
 TURNS = ".rotations"
-"""At the end of a member's name: the rotations of the clip."""
+"""Ending of the names of members that contain the rotations of a clip."""
 
 SKELETON, LABELS = "skeleton.json", "labels.csv"
 
@@ -37,13 +37,13 @@ WHICH = (
 )
 
 MOST_NUMBERS = 2**23
-"""In a csv file of paths, blank rows included: a hundred thousand frames of twenty joints."""
+"""Maximum number of values in a csv file of paths, with blank rows: a hundred thousand frames of twenty joints."""
 
 _ARCHIVES = (
     ({f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)}, 32, HUMAN36M, HUMAN36M_KEPT),
     ({f"{part}/S{i}" for part in ("Train", "Validate") for i in (1, 2, 3)}, 15, HUMANEVA, None),
 )
-"""VideoPose3D's archives: subjects, joints, skeleton, and which of the joints make it up."""
+"""VideoPose3D's archives: subjects, number of joints, skeleton, and indices of its joints."""
 
 
 def read_archive(
@@ -57,10 +57,10 @@ def read_archive(
     fps: float | None = None,
     missing: bool = False,
 ) -> MotionSet:
-    """Read an npz of positions; see `read_motion`.
+    """Read an npz of positions; the other arguments are the same as in `read_motion`.
 
     Args:
-        joints: which of the file's joints make up the skeleton, when it has more, such as `HUMAN36M_KEPT`.
+        joints: indices of the skeleton's joints in a file with more joints, such as `HUMAN36M_KEPT`.
     """
     found = _read_clips(path)
     if skeleton is None:
@@ -75,14 +75,14 @@ def read_archive(
 
     def clips() -> Iterator[Clip]:
         size = 0
-        while found:  # what was read is let go as soon as it is taken over
+        while found:  # frees each array as soon as its clip is taken over
             split, name, positions, turns = found.pop()
             if joints is not None and positions.ndim == 3 and positions.shape[1] > max(joints):
                 positions, turns = positions[:, list(joints)], None
             if metres is not None and positions.dtype.kind in "fiu":
                 positions = metres * positions
             size += 0 if is_mapped(positions) else positions.nbytes
-            if size > LARGEST:  # of a larger file that is mapped, some are to be copied
+            if size > LARGEST:  # in a large mapped file, some arrays may have to be copied
                 raise ValueError(f"it has more than {LARGEST:,} bytes of motion that is not mapped as float32")
             labelled = known.get((split, name), known.get((None, name), {}))
             yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
@@ -101,24 +101,24 @@ def save(path: str | Path, motion: MotionSet) -> None:
     """Write a plain npz with its skeleton and labels, for `read_motion`.
 
     The skeleton of people.npz is in people.npz.skeleton.json, and its labels, if any, are in people.npz.labels.csv, so
-    that several archives fit into one folder. Each takes the place of an older file, or of a link, once it is whole.
-    Rotations are members of their own, "split/clip.rotations".
+    several archives fit into one folder. Each file replaces an older file or link only after a complete write.
+    Rotations are separate members, "split/clip.rotations".
 
     Raises:
-        OSError: one cannot be written; the error names it.
-        ValueError: a clip's name has a slash, which would be read as part of the split, or is one that `read_motion`
-            refuses.
+        OSError: a file cannot be written; the message names it.
+        ValueError: the name of a clip contains a slash, which would be read as part of the split, or `read_motion`
+            would refuse it.
     """
     save_clips(path, iter(motion), lambda: motion.skeleton)
 
 
 def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], Skeleton]) -> None:
-    """What `save` does, of clips that are held one at a time.
+    """Do the same as `save`, with only one clip in memory at a time.
 
     Args:
-        path: the npz file.
-        clips: each asked for once.
-        skeleton: asked for after the last of them.
+        path: npz file.
+        clips: clips, iterated once.
+        skeleton: function that returns the skeleton; called after the last clip.
     """
     path = Path(path)
     labelled = []
@@ -140,7 +140,8 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
         write_arrays(file, members())
     skeleton().to_json(own_companion(path, SKELETON))
     own = own_companion(path, LABELS)
-    if not write_labels(own, labelled, always=path.with_name(LABELS).is_file()):  # the folder's are not of these clips
+    # labels.csv of the folder belongs to other clips
+    if not write_labels(own, labelled, always=path.with_name(LABELS).is_file()):
         own.unlink(missing_ok=True)
 
 
@@ -156,10 +157,10 @@ def companion(path: Path, name: str) -> Path:
 
 
 def write_labels(path: Path, clips: Iterable[Clip], older: Path | None = None, always: bool = False) -> bool:
-    """Write the labels of clips as `read_labels` reads them, and return whether there was anything to write.
+    """Write the labels of clips in the format of `read_labels`, and return whether there was anything to write.
 
     Args:
-        path: the file.
+        path: file.
         clips: clips with their labels.
         older: an earlier file, whose rows of other clips are kept.
         always: write the names of clips without labels too.
@@ -187,7 +188,7 @@ def write_labels(path: Path, clips: Iterable[Clip], older: Path | None = None, a
 
 
 def check_key(key: tuple[str, str], path: Path | None = None) -> None:
-    """Refuses a split and a name of a clip, or of the file at this path, that cannot be shown."""
+    """Raise an error if a split or a clip name is not printable."""
     if not all(map(is_name, key)):
         raise ValueError(
             f"{brief(str(path or '/'.join(key)))} is no name for a split and a clip: expected text that can be printed"
@@ -197,10 +198,10 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
 def _skeleton_of(
     path: Path, clips: Sequence[_Read], chosen: Sequence[int] | None
 ) -> tuple[Skeleton, tuple[int, ...] | None]:
-    """Return the skeleton of a file, read or known by its subjects, and the places of its joints in the file.
+    """Return the skeleton of a file, read or known by its subjects, and the indices of its joints in the file.
 
     Raises:
-        ValueError: the skeleton has another number of joints than the file, or there is none.
+        ValueError: the numbers of joints in skeleton and file differ, or no skeleton is known.
     """
     counts = {positions.shape[1] for _, _, positions, _ in clips if positions.ndim == 3}
     file = companion(path, SKELETON)
@@ -220,7 +221,7 @@ def _skeleton_of(
 
 
 def read_labels(beside: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
-    """Rows by (split, clip), of a file that is given or stands beside; by (None, clip) where it has no split column."""
+    """Return rows by (split, clip), or by (None, clip) without a split column; `beside` is the default file."""
     file = Path(labels) if labels else beside
     if not file.is_file():
         if labels:
@@ -241,10 +242,10 @@ def read_labels(beside: Path, labels: str | Path | None) -> dict[tuple[str | Non
 
 @contextmanager
 def _table(path: Path, *most: int) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str]]]]]:
-    """The header of a csv file, and its rows with their numbers: each as long as the header, or empty.
+    """Open a csv file, and yield its header and its numbered rows, each as long as the header or empty.
 
     Raises:
-        ValueError: the file is no text or too large, or a row has another length; or is so at a later row.
+        ValueError: the file is not text or too large, or a row has another length (raised when that row is read).
     """
 
     def numbered() -> Iterator[tuple[int, list[str]]]:
@@ -265,25 +266,25 @@ def _table(path: Path, *most: int) -> Iterator[tuple[list[str], Iterator[tuple[i
 
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file by name, none of them pickled.
+    """Return the arrays of an npz file by name, without unpickling.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or no npz, or holds pickled objects.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged, is not an npz, or contains pickled objects.
     """
     with archive(path) as members:
         return {name: member.array() for name, member in members.items()}
 
 
 def read_paths(path: str | Path) -> dict[str, np.ndarray]:
-    """Paths of joints, each (frames, 3), NaN where it is not known.
+    """Read paths of joints, each (frames, 3), NaN where unknown.
 
     Args:
-        path: an npz file of one array for each joint; or a csv file whose header names three columns for each joint,
-            as in `LWrist_x,LWrist_y,LWrist_z`, with one row for each frame and an empty cell where nothing is known.
+        path: an npz file with one array per joint; or a csv file whose header names three columns per joint, as in
+            `LWrist_x,LWrist_y,LWrist_z`, with one row per frame and empty cells for unknown values.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         ValueError: the file is damaged, or is not as described.
     """
     path = Path(path)
@@ -297,7 +298,7 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
             raise ValueError(
                 f"{path}: the path of {joint} is {values.dtype} {values.shape}, expected numbers (frames, 3)"
             )
-        far = np.abs(values) > np.finfo(np.float32).max  # what models compute with; NaN is not known and not far
+        far = np.abs(values) > np.finfo(np.float32).max  # the limit of float32, which models use; NaN passes
         if far.any():
             raise ValueError(
                 f"{path}: the path of {joint} has {values[far][0]} in frame {np.argwhere(far)[0][0]}; expected metres, "
@@ -307,7 +308,7 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[str, np.ndarray]:
-    """Three columns of a csv file for each joint: of so many numbers, and bytes."""
+    """Read three columns per joint from a csv file with at most `numbers` values, and optionally a limit in bytes."""
     with _table(path, *most) as (header, rows):
         columns: dict[str, list[int]] = {}
         for place, name in enumerate(header):
@@ -326,7 +327,7 @@ def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[s
         for number, cells in rows:
             if len(header) * (len(values) + blank) > numbers:
                 raise ValueError(f"{path}: it has more than {numbers:,} numbers")
-            if not cells:  # frames of which nothing is known, if others follow
+            if not cells:  # a frame without known values; counts only if others follow
                 blank += 1
                 continue
             values += [np.full(len(header), np.nan)] * blank
@@ -345,11 +346,11 @@ def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[s
 
 
 def read_table(path: Path) -> Recording:
-    """Read a clip from a csv file of columns as in `read_paths`, with its skeleton.
+    """Read a clip and its skeleton from a csv file with columns as in `read_paths`.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, or has other joints than the skeleton.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged, or its joints differ from those in the skeleton.
     """
     columns = _read_columns(path, 3 * MOST_PLACES, MOST_TEXT)
     check_joints(path, len(columns))
@@ -366,7 +367,7 @@ def read_table(path: Path) -> Recording:
 
 
 def write_table(path: str | Path, names: Sequence[str], positions: np.ndarray) -> None:
-    """Write a clip (F, J, 3) as a csv file of columns such as LWrist_x, in metres, which `read_table` reads."""
+    """Write a clip (F, J, 3) in metres as a csv file with columns such as LWrist_x, which `read_table` reads."""
     table = io.StringIO(newline="")
     writer = csv.writer(table)
     writer.writerow(f"{name}_{axis}" for name in names for axis in "xyz")
@@ -376,7 +377,7 @@ def write_table(path: str | Path, names: Sequence[str], positions: np.ndarray) -
 
 
 _Read = tuple[str, str, np.ndarray, np.ndarray | None]
-"""Split, clip, positions, and rotations where there are."""
+"""Split, clip, positions, and optional rotations."""
 
 
 def _read_clips(path: Path) -> list[_Read]:

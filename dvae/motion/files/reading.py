@@ -1,4 +1,4 @@
-"""Motion files of any kind, and folders of them, to one set of clips in metres."""
+"""Read motion files of any supported format, or folders of them, as one set of clips in metres."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ READERS: dict[str, Callable[[Path], Recording]] = {
     ".csv": read_table,
     ".txt": read_expmap,
 }
-"""By the end of a file's name, in the order in which a folder's files are taken for motion."""
+"""Readers by file name ending, in the order of preference within a folder."""
 
 MOST_FILES = 100_000
 SAMPLE = 9
-"""Files of a folder from which its unit and axes are found."""
+"""Number of files of a folder that determine its unit and axes."""
 
 SAME = 1e-3
-"""Metres within which two files have one rest pose."""
+"""Tolerance in metres within which two files have the same rest pose."""
 
 BENDS = "rotations are left out, as a joint moves against the one that it hangs from"
 
 LIKE = 1.6
-"""Factor within which bodies of one folder are; inches are 2.54 centimetres."""
+"""Maximum ratio of body sizes in one folder; smaller than 2.54, so that it detects inches among centimetres."""
 
 
 @dataclass(frozen=True)
 class File:
-    """A file of one recording, what its clip is called, and what is known of it."""
+    """A file with one recording, and the split, name and labels of its clip."""
 
     split: str
     name: str
@@ -57,7 +57,7 @@ class File:
     labels: Mapping[str, str] = field(default_factory=dict)
 
     def read(self) -> Recording:
-        """What it holds; the message of what is refused has the path."""
+        """Return the content; error messages contain the path."""
         return READERS[self.path.suffix.lower()](self.path)
 
 
@@ -73,12 +73,12 @@ def read_motion(
     fps: float | None = None,
     missing: bool = False,
 ) -> MotionSet:
-    """Read a motion file, or a folder of files of one kind and one skeleton.
+    """Read a motion file, or a folder of files with one format and one skeleton.
 
     | file | |
     |---|---|
     | `.bvh` | |
-    | `.amc` | with its `.asf` beside it |
+    | `.amc` | with its `.asf` in the same folder |
     | `.txt` | exponential maps as in the CMU benchmark |
     | `.c3d` | markers |
     | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; with a skeleton |
@@ -86,39 +86,38 @@ def read_motion(
     | `.npz` | VideoPose3D's archive: the member `positions_3d` |
     | `.npz` | any other: an array (F, J, 3) in metres for each clip under "split/clip"; with a skeleton |
 
-    A folder is read to its last subfolder, without following links: a clip's name is its file's, its split the
-    subfolder, or "all". A key of an npz without a slash belongs to the split "all", too.
+    Folders are read recursively, without following links. The name of a clip is the name of its file; its split is the
+    subfolder, or "all". A key of an npz without a slash also belongs to the split "all".
 
     The skeleton of people.npz is read from people.npz.skeleton.json, or else from skeleton.json in the same folder.
     Labels are read from people.npz.labels.csv, or else from labels.csv, which has one row per clip with the columns
-    split, clip and whatever is known. VideoPose3D's archives of Human3.6M and HumanEva-I need no skeleton file; they
-    are known by their subjects and joints.
+    split, clip and any labels. VideoPose3D's archives of Human3.6M and HumanEva-I need no skeleton file; they are
+    recognised by their subjects and joints.
 
-    Units and axes are as the file says, or found: a person has a person's size, and their head is above their feet.
-    `MotionSet.said` has what was found.
+    Units and axes are read from the file, or else inferred: a person has a plausible size, and the head is above the
+    feet. `MotionSet.said` describes the result.
 
     Args:
-        path: the file or folder.
-        skeleton: overrides that of the file or next to it.
-        labels: a csv file, instead of the one next to the file.
-        skip_bad: leave out clips with NaN, wrong joints or units instead of raising; they are listed in
-            `skipped`.
-        joints: those to keep, by place or name; or by name with a new one. Each hangs from its nearest ancestor that is
-            kept. Rotations are kept where no bone between kept joints bends.
-        onto: a known skeleton, such as `WALKER`, whose joints are found by what names mean; `joints` may say which is
-            which, {"name there": "name here"}.
-        metres: of the file's unit, instead of what is found.
-        up: the file's axis that is up, "y" or "z", instead of what is found.
-        fps: frames per second, instead of those that the file states; to change them, see `MotionSet.resampled`.
-        missing: keep clips that lack joints, which are NaN in frames where they were not observed.
+        path: file or folder.
+        skeleton: overrides the skeleton of the file.
+        labels: a csv file, instead of the default one.
+        skip_bad: leave out clips with NaN, wrong joints or units instead of raising; they are listed in `skipped`.
+        joints: joints to keep, by index or name; or a mapping from names to new names. The parent of each joint is its
+            nearest kept ancestor. Rotations are kept if all bones between kept joints are rigid.
+        onto: a known skeleton, such as `WALKER`, whose joints are matched by name; `joints` may override the matching,
+            {"name in the file": "name in the skeleton"}.
+        metres: length of the file's unit in metres, instead of the inferred one.
+        up: up axis of the file, "y" or "z", instead of the inferred one.
+        fps: true frames per second, if the file is wrong; `MotionSet.resampled` changes the frame rate.
+        missing: keep clips in which joints are missing (NaN) in some frames.
 
     Returns:
         The clips in file order, in metres.
 
     Raises:
-        FileNotFoundError: there is no such file, or none in the folder.
-        ValueError: the file is damaged, its pickle asks for anything but data, a clip is unusable, files of a folder
-            differ in joints or frames per second, or no skeleton is known; the message says which.
+        FileNotFoundError: the file does not exist, or the folder has no motion files.
+        ValueError: the file is damaged, its pickle contains anything but data, a clip is unusable, the files of a
+            folder differ in joints or frames per second, or the skeleton is unknown. The message contains the reason.
     """
     path = Path(path)
     files = find_files(path, labels)
@@ -156,12 +155,12 @@ def read_motion(
 
 
 def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
-    """Files of one recording each: the path itself, or those of a folder; none if it is an archive of many clips.
+    """Return files with one recording each: the path itself, or the files of a folder; empty for an archive of clips.
 
     Raises:
-        FileNotFoundError: there is nothing.
-        ValueError: the file has no known format, a folder has files of several kinds, or their names are none for
-            clips.
+        FileNotFoundError: the file does not exist, or the folder has no motion files.
+        ValueError: the format is unknown, a folder has files of several formats, or a file name is not valid for a
+            clip.
     """
     if not path.is_dir():
         if not path.is_file():
@@ -190,7 +189,7 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
                 if count > MOST_FILES:
                     raise ValueError(f"{path}: it has more than {MOST_FILES:,} files; give its folders one by one")
     there = {suffix: files for suffix, files in kinds.items() if files}
-    sure = [suffix for suffix in there if suffix not in (".csv", ".txt")]  # of these, many are no motion
+    sure = [suffix for suffix in there if suffix not in (".csv", ".txt")]  # many csv and txt files are not motion
     if len(sure) > 1:
         counts = " and ".join(f"{len(there[suffix])} {suffix[1:]}" for suffix in sure)
         raise ValueError(f"{path}: it has {counts} files; put each kind into a folder of its own")
@@ -200,7 +199,7 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
 
 
 def _known(files: list[File], beside: Path, labels: str | Path | None) -> list[File]:
-    """Files with their labels."""
+    """Return the files with their labels."""
     for file in files:
         check_key((file.split, file.name), file.path)
     known = read_labels(beside, labels)
@@ -210,7 +209,7 @@ def _known(files: list[File], beside: Path, labels: str | Path | None) -> list[F
 
 
 def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recording]:
-    """Some recordings of a folder, from its first file to its last."""
+    """Read some recordings of a folder, evenly spaced from its first file to its last."""
     found, wrong = {}, None
     for place in sorted({round(at) for at in np.linspace(0, len(files) - 1, min(SAMPLE, len(files)))}):
         try:
@@ -226,12 +225,13 @@ def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recordin
 
 @dataclass(frozen=True)
 class FileReader:
-    """From a file of one recording to a clip and its skeleton, alike for all files of a folder; see `read_motion`.
+    """Convert files with one recording to clips with their skeletons, in the same way for all files of a folder.
 
     Args:
-        world: how their units and axes are understood.
-        given, up: whether its unit, and its axis, go before what a file says of its own.
-        resampled: frames per second of what is returned; by default the file's.
+        world: units and axes of the files.
+        given, up: whether the unit, and the up axis, of `world` override those in a file.
+        fps, skeleton, joints, onto: same as in `read_motion`.
+        resampled: frames per second of the result; default: the rate of the file.
         missing: whether joints may be missing.
     """
 
@@ -246,14 +246,14 @@ class FileReader:
     missing: bool = False
 
     def __call__(self, file: File, recording: Recording | None = None) -> tuple[Clip, Skeleton, list[str]]:
-        """The clip, the skeleton of it alone, and what is to be said of it.
+        """Return the clip, its own skeleton, and notes about it.
 
         Args:
-            file: which.
-            recording: what it holds, if it was read already.
+            file: file to read.
+            recording: its content, if it was already read.
 
         Raises:
-            ValueError: the file cannot be used; the message has the path.
+            ValueError: the file cannot be used; the message contains the path.
         """
         recording = recording or file.read()
         try:
@@ -299,14 +299,14 @@ def clip_of(
     joints: Sequence[int | str] | Mapping[str, str] | None,
     onto: Skeleton | None,
 ) -> tuple[Clip, Skeleton]:
-    """A clip of what a recording in metres holds, and its skeleton.
+    """Return the clip of a recording in metres, and its skeleton.
 
     Args:
-        recording: in metres.
-        clip: what it is called, and what is known of it.
+        recording: recording in metres.
+        clip: name, split and labels of the clip.
         fps: frames per second.
-        known: the skeleton, where it is.
-        joints, onto: see `read_motion`.
+        known: skeleton of the recording, if known.
+        joints, onto: same as in `read_motion`.
     """
     recording = kept(recording, joints, onto)
     known = onto or (known if joints is None else None)
@@ -324,7 +324,7 @@ def clip_of(
 def kept(
     recording: Recording, joints: Sequence[int | str] | Mapping[str, str] | None, onto: Skeleton | None
 ) -> Recording:
-    """A recording in metres with some of its joints, or with those of a known skeleton and its axis upwards."""
+    """Return a recording in metres with some of its joints, or with the joints and the up axis of a known skeleton."""
     if joints is None and onto is None:
         return recording if recording.loose <= RIGID else replace(recording, rotations=None, offsets=None)
     names, parents = recording.names, recording.parents
@@ -340,16 +340,16 @@ def kept(
 
 
 def upwards(recording: Recording, up: str) -> Recording:
-    """A recording whose other axis is up, turned about x."""
+    """Return a recording rotated about x so that the other axis is up."""
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
     return replace(turned(recording, turn if up == "z" else turn.T), up=up)
 
 
 class Collected:
-    """What clips of one folder have in common, taken in one at a time: they have the same joints and frames per second.
+    """Check that the clips of a folder belong together, one clip at a time: same joints and frames per second.
 
     Args:
-        name: of the folder.
+        name: name of the folder.
     """
 
     def __init__(self, name: str):
@@ -359,7 +359,7 @@ class Collected:
         self._notes: dict[str, list[Path]] = {}
 
     def add(self, path: Path, clip: Clip, skeleton: Skeleton, notes: Sequence[str] = ()) -> str | None:
-        """Takes a clip in, or says why it does not belong to those before."""
+        """Add a clip, or return the reason why it does not match the earlier ones."""
         bones = skeleton.bone_lengths(fullest(clip.positions)[0].astype(np.float64))
         own = float(np.median(extents(clip.positions).max(1)))
         if self._skeleton is None:
@@ -379,7 +379,7 @@ class Collected:
                 f"{path}: {skeleton.fps:g} frames per second, {self._first} has {first.fps:g}; give fps= if their "
                 "headers are wrong, or have `dvae data convert --fps` resample them"
             )
-        there = np.isfinite(bones + self._bones)  # of both
+        there = np.isfinite(bones + self._bones)  # known in both
         size = bones[there].sum() / max(self._bones[there].sum(), 1e-9)
         if there.any() and not 1 / LIKE < size < LIKE:
             return (
@@ -398,19 +398,19 @@ class Collected:
 
     @property
     def skeleton(self) -> Skeleton:
-        """Of all; without a rest pose where they have different ones."""
+        """The common skeleton, without a rest pose if the rest poses differ."""
         assert self._skeleton is not None
         single = len(self._extents) == 1
         name = self._skeleton.name if single or self._skeleton.name != self._first.stem else self._name
         return replace(self._skeleton, name=name, rest=self._skeleton.rest if self._alike else ())
 
     def motion(self, clips: Sequence[Clip], **known: Any) -> MotionSet:
-        """The clips as one set, without rotations where they have different rest poses."""
+        """Return the clips as one set, without rotations if the rest poses differ."""
         clips = clips if self.skeleton.rest else [replace(clip, rotations=None) for clip in clips]
         return MotionSet(clips, self.skeleton, self._name, copy=False, **known)
 
     def said(self, world: World) -> str:
-        """How the files were understood."""
+        """Return a description of how the files were interpreted."""
         found = [f"{world}, a person of {np.median(self._extents):.2f} m"]
         if not self._alike and BENDS not in self._notes:
             found.append("rotations are left out, as rest poses differ")
@@ -424,7 +424,7 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
     """Return the clips of several files, each with its path, as one set.
 
     Raises:
-        ValueError: their joints, frames per second, axes or sizes differ, or two clips have one split and name.
+        ValueError: their joints, frames per second, axes or sizes differ, or two clips have the same split and name.
     """
     collected, clips = Collected(name), []
     skipped: list[tuple[str, str, str]] = []
@@ -443,7 +443,7 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
 def chosen(
     motion: MotionSet, joints: Sequence[int | str] | Mapping[str, str] | None = None, onto: Skeleton | None = None
 ) -> MotionSet:
-    """Clips with some of their joints, or those of a known skeleton; see `read_motion`."""
+    """Return clips with some of their joints, or with the joints of a known skeleton, as in `read_motion`."""
     skeleton, collected, clips = motion.skeleton, Collected(motion.name), []
     offsets = skeleton.offsets.numpy() if skeleton.rest else None
     for clip in motion:

@@ -1,4 +1,4 @@
-"""What a motion file holds, before units, axes and names are settled; and text files of numbers, bounded."""
+"""Content of a motion file before units, axes and names are normalised; and bounded reading of numeric text files."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from ..geometry.skeleton import MOST_JOINTS, Skeleton
 from ..scoring.matching import offsets_of
 
 MOST_TEXT = 2**28
-"""Bytes of a text file of motion: an hour of sixty joints at 60 Hz."""
+"""Maximum size of a motion text file in bytes: an hour of sixty joints at 60 Hz."""
 
 MOST_PLACES = 2**24
-"""Frames times joints of a recording: as long."""
+"""Maximum number of frames times joints in a recording: the same duration."""
 
 
 END = "End"
-"""Of the name of a joint at which a last bone ends."""
+"""Suffix of the name of a joint at the end of a last bone."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One recording as its file has it.
+    """One recording with the units and names of its file.
 
     Args:
-        names: of the joints.
-        parents: index of each joint's parent, -1 for the root; before its children.
-        positions: (F, J, 3) in the file's unit and axes.
-        rotations: (F, J, 4), local quaternions w x y z, continuous; where the file has them.
-        offsets: (J, 3) of the rest pose in the file's unit; with rotations.
-        loose: how far a joint goes from its offset, in the file's unit.
-        fps: frames per second, where the file says.
-        metres: of a unit, where the file says.
-        up: the axis that is, where the file says.
-        skeleton: of these joints, where it stands beside the file.
-        labels: what the file says about it.
-        notes: what of the file was left out or renamed, in a sentence each.
+        names: joint names.
+        parents: index of each joint's parent, -1 for the root; parents precede their children.
+        positions: (F, J, 3) in the unit and axes of the file.
+        rotations: (F, J, 4), local quaternions w x y z without sign changes; None if the file has none.
+        offsets: (J, 3), rest pose in the unit of the file; only with rotations.
+        loose: largest distance of a joint from its offset, in the unit of the file.
+        fps: frames per second, if the file contains it.
+        metres: length of the unit in metres, if the file contains it.
+        up: up axis, if the file contains it.
+        skeleton: skeleton of these joints, if there is one next to the file.
+        labels: labels from the file.
+        notes: one sentence on each part of the file that was left out or renamed.
     """
 
     names: Sequence[str]
@@ -70,7 +70,10 @@ class Recording:
         metres: float | None = None,
         up: str | None = None,
     ) -> Recording:
-        """Of rotations (F, J, 3, 3) and of places against the parent (F, J, 3), the root's against the world."""
+        """Create a recording from rotations (F, J, 3, 3) and positions relative to the parent (F, J, 3).
+
+        For the root, both are relative to the world.
+        """
         offsets, loose = offsets_of(parents, places)
         positions, _ = forward(parents, rotations, places, places[..., 0, :].expand(len(rotations), 3))
         quaternions = continuous(from_matrix(rotations, "quaternion"))
@@ -78,23 +81,23 @@ class Recording:
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a text file, in any of the encodings that motion files come in.
+    """Return the lines of a text file, in any of the encodings of motion files.
 
     Raises:
-        OSError: there is no such file.
-        ValueError: it is larger than any of this kind.
+        OSError: the file does not exist.
+        ValueError: it is too large.
     """
     return files.read(path, MOST_TEXT, links=True).decode("utf-8-sig", errors="replace").splitlines()
 
 
 def numbers(text: str, where: str) -> np.ndarray:
-    """All numbers of a text, separated by white space.
+    """Return all numbers of a text, separated by white space.
 
     Raises:
-        ValueError: something else stands there; or a number is not finite.
+        ValueError: the text contains anything else, or a number that is not finite.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # it stopped at something else
+        warnings.simplefilter("error", DeprecationWarning)  # raised if the text contains anything else
         try:
             found = np.fromstring(text, sep=" ")
         except (DeprecationWarning, ValueError):
@@ -113,13 +116,13 @@ def _is_finite(word: str) -> bool:
 
 
 def check_joints(path: Path, joints: int) -> None:
-    """Refuses more joints than any skeleton has."""
+    """Raise an error if there are more joints than the limit."""
     if joints > MOST_JOINTS:
         raise ValueError(f"{path}: it has more than {MOST_JOINTS:,} joints")
 
 
 def check_size(path: Path, frames: int, joints: int) -> None:
-    """Refuses what would not be held in memory, though its file is small."""
+    """Raise an error if a recording would be too large for memory, even if its file is small."""
     if frames * joints > MOST_PLACES:
         raise ValueError(
             f"{path}: {frames * joints:,} places of joints are more than {MOST_PLACES:,}; cut the recording"

@@ -1,4 +1,4 @@
-"""From what files hold to metres, an up axis and sides: found in the recordings, said, and checked."""
+"""Normalise recordings to metres and an up axis, inferred from the recordings, reported and checked."""
 
 from __future__ import annotations
 
@@ -16,23 +16,25 @@ from ..geometry.rotations import continuous, from_matrix, to_matrix
 from .recording import Recording
 
 HEIGHT = 1.65
-"""Metres of what is taken for a person where a file does not say its unit."""
+"""Assumed height of a person in metres if a file does not contain its unit."""
 
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "1 / .45 inches": 0.0254 / 0.45}
 WITHIN = 1.35
-"""Factor within which a person of `HEIGHT` must be, so that no recording fits two units."""
+"""Maximum ratio to `HEIGHT` of a person's height; small enough that no recording fits two units."""
 
 STANDING = 0.8
-"""Cosine between an axis and the way from feet to head from which people stand along it."""
+"""Minimum cosine between an axis and the direction from feet to head for people to stand along the axis."""
 
 _TOP = re.compile(r"head|neck|skull|face", re.IGNORECASE)
 _BOTTOM = re.compile(r"foot|toe|ankle|heel", re.IGNORECASE)
 
 
 def upright(recording: Recording) -> tuple[str, bool]:
-    """The axis along which the person stands, and whether it points up; by heads and feet, or by the longest extent.
+    """Return the axis along which the person stands, and whether it points up.
 
-    Axes of files are right-handed; most have y or z upwards.
+    It is found from heads and feet, or else from the longest extent.
+
+    Axes of files are right-handed; in most files y or z is up.
     """
     if recording.up:
         return recording.up, True
@@ -43,12 +45,12 @@ def upright(recording: Recording) -> tuple[str, bool]:
 
 
 def doubt(names: Sequence[str], positions: np.ndarray, up: str) -> str:
-    """What speaks against this axis being up: heads that are above feet along another one; nothing, as a rule.
+    """Return a warning if heads are above feet along another axis than `up`, otherwise an empty string.
 
     Args:
-        names: of the joints.
+        names: joint names.
         positions: (F, J, 3).
-        up: the axis.
+        up: assumed up axis.
     """
     bodies = _from_feet_to_head(names, positions)
     if bodies is None or not len(bodies):
@@ -61,7 +63,7 @@ def doubt(names: Sequence[str], positions: np.ndarray, up: str) -> str:
 
 
 def _from_feet_to_head(names: Sequence[str], positions: np.ndarray) -> np.ndarray | None:
-    """(frames that have both, 3), of a thousand or two, where names tell heads and feet."""
+    """Return vectors (frames, 3) from feet to head in up to about 2000 frames; None if no names match."""
     ends = [[place for place, name in enumerate(names) if kind.search(name)] for kind in (_TOP, _BOTTOM)]
     if not all(ends):
         return None
@@ -73,12 +75,13 @@ def _from_feet_to_head(names: Sequence[str], positions: np.ndarray) -> np.ndarra
 
 
 def height_of(recording: Recording) -> float:
-    """About the body's height, in the recording's unit, however it crouches: along its bones from head to foot.
+    """Estimate the body's height in the recording's unit, whatever the pose: the length of the bones from head to foot.
 
-    The median over all that names tell are heads and feet, and over frames; else the body's largest extent.
+    It is the median over all joints whose names identify heads and feet, and over frames; without such names, the
+    body's largest extent.
     """
     parents, places = recording.parents, fullest(recording.positions)
-    chains: list[set[int]] = []  # of each joint those up to the root
+    chains: list[set[int]] = []  # for each joint, the joints up to the root
     for joint, parent in enumerate(parents):
         chains.append({joint} | (chains[parent] if parent >= 0 else set()))
     bones = np.median(np.linalg.norm(places - places[:, [max(parent, 0) for parent in parents]], axis=2), axis=0)
@@ -88,10 +91,10 @@ def height_of(recording: Recording) -> float:
 
 
 def unit(recording: Recording) -> tuple[str, float]:
-    """Name of the file's unit and its metres: what the file says, or that in which a person has a person's size.
+    """Return the name of the file's unit and its length in metres: from the file, or by the size of a person.
 
     Raises:
-        ValueError: there is none.
+        ValueError: no unit fits.
     """
     if recording.metres is not None:
         return "as the file says", recording.metres
@@ -108,12 +111,12 @@ def unit(recording: Recording) -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class World:
-    """How the units and axes of recordings that belong together are understood.
+    """Units and axes of recordings that belong together.
 
     Args:
         unit: name of the files' unit.
-        metres: of one.
-        axis: along which people stand.
+        metres: length of the unit in metres.
+        axis: axis along which people stand.
         upwards: whether it points up.
     """
 
@@ -124,7 +127,7 @@ class World:
 
     @property
     def up(self) -> str:
-        """The axis once settled: y or z. People who stand along x, or upside down, are turned to y."""
+        """The up axis after normalisation: y or z. People who stand along x, or upside down, are rotated to y."""
         return self.axis if self.upwards and self.axis != "x" else "y"
 
     def __str__(self) -> str:
@@ -133,15 +136,15 @@ class World:
 
 
 def understand(recordings: Mapping[str, Recording], metres: float | None = None, up: str | None = None) -> World:
-    """Unit and axes of recordings that belong together: what files say, or what most people in them show.
+    """Return unit and axes of recordings that belong together: from the files, or from most people in them.
 
     Args:
-        recordings: some of them, by what to call them.
-        metres: of the files' unit, instead.
-        up: "y" or "z", instead.
+        recordings: sample of the recordings, by name.
+        metres: length of the files' unit in metres; overrides the inferred one.
+        up: "y" or "z"; overrides the inferred axis.
 
     Raises:
-        ValueError: no unit fits, or another one to each; or what is given is no unit or axis.
+        ValueError: no unit fits, the recordings have different units, or an argument is not a valid unit or axis.
     """
     if up not in (None, "y", "z"):
         raise ValueError(f"the up axis is {up!r}, expected 'y' or 'z'")
@@ -164,9 +167,9 @@ def understand(recordings: Mapping[str, Recording], metres: float | None = None,
 
 
 def settle(recording: Recording, world: World) -> Recording:
-    """A recording in metres, with y or z upwards."""
+    """Return a recording in metres, with y or z up."""
     turn = np.eye(3)
-    if world.axis == "x" or not world.upwards:  # a rotation that takes the person's axis to y
+    if world.axis == "x" or not world.upwards:  # a rotation that maps the person's axis to y
         turn = np.roll(np.eye(3), "yzx".index(world.axis), axis=1)
         turn = turn if world.upwards else np.diag([1.0, -1.0, -1.0]) @ turn
     return replace(
@@ -180,7 +183,7 @@ def settle(recording: Recording, world: World) -> Recording:
 
 
 def turned(recording: Recording, turn: np.ndarray) -> Recording:
-    """A recording whose world is turned by a matrix (3, 3)."""
+    """Return a recording whose world is rotated by a matrix (3, 3)."""
     rotations = recording.rotations
     if rotations is not None and (turn != np.eye(3)).any():
         root = torch.from_numpy(turn) @ to_matrix(torch.from_numpy(rotations[:, 0]).double(), "quaternion")

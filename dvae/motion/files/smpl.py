@@ -1,10 +1,10 @@
-"""AMASS's layout (Mahmood et al. 2019, arXiv 1904.03278): turns of SMPL's joints, read and written without its body.
+"""AMASS's layout (Mahmood et al. 2019, arXiv 1904.03278): rotations of SMPL's joints, without its body.
 
-The files have no lengths of bones; these come from a body under a licence of its own, and the shape parameters `betas`,
-which clips have as a label (see `bodies.betas`). Without it, people are of one average body here: a height of 1.7 m,
-and segments by Drillis and Contini (1966), as figure 4.1 of Winter, Biomechanics and Motor Control of Human Movement,
-has them. So is the place of the pelvis but for a constant: SMPL adds its template's to `trans`. Files that are written
-here hold `offsets` too, and are read by them.
+The files contain no bone lengths. These depend on the SMPL body, which has its own licence, and on the shape parameters
+`betas`, which clips have as a label (`bodies.betas`). Without the SMPL body, all people have one average body: a height
+of 1.7 m, and segments by Drillis and Contini (1966), according to figure 4.1 of Winter, Biomechanics and Motor Control
+of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the position of its template to
+`trans`. Files written here also contain `offsets`, which are used when they are read.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .archive import archive, write_arrays
 from .recording import Recording, check_size
 
 _HEIGHT = 1.7
-_BODY = {  # joint, parent, offset in heights: left towards +x, y up, facing +z
+_BODY = {  # joint, parent, offset relative to the height: left is +x, y up, facing +z
     "Pelvis": ("", 0, 0, 0),
     "L_Hip": ("Pelvis", 0.0955, 0, 0),
     "R_Hip": ("Pelvis", -0.0955, 0, 0),
@@ -55,20 +55,20 @@ _BODY = {  # joint, parent, offset in heights: left towards +x, y up, facing +z
 JOINTS = tuple(_BODY)
 PARENTS = tuple(JOINTS.index(parent) if parent else -1 for parent, *_ in _BODY.values())
 OFFSETS = _HEIGHT * np.array([place for _, *place in _BODY.values()], float)
-"""Of the average body, standing with arms to the sides, (22, 3) in metres."""
+"""Offsets (22, 3) in metres of the average body, standing with arms at its sides."""
 
 MOST_BETAS = 16
-"""Parameters of shape that AMASS's files have."""
+"""Maximum number of shape parameters in AMASS's files."""
 
 _FPS = ("mocap_framerate", "mocap_frame_rate")
 
 
 def read_amass(path: str | Path) -> Recording:
-    """Read an npz of AMASS: the 22 joints of the body, z up; `betas` is a label, numbers with spaces between them.
+    """Read an npz of AMASS: the 22 joints of the body, z up; `betas` becomes a label of space-separated numbers.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is none, or damaged.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not from AMASS, or damaged.
     """
     path = Path(path)
     with archive(path) as members:
@@ -108,15 +108,16 @@ def read_amass(path: str | Path) -> Recording:
 
 
 def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
-    """Write a clip in AMASS's layout: poses (F, 156), trans, mocap_framerate, betas of its label or zeros; and offsets.
+    """Write a clip in AMASS's layout: poses (F, 156), trans, mocap_framerate, betas (its label, or zeros) and offsets.
 
-    Joints are found by what their names mean; those that a skeleton lacks are not turned. Where a bone between two of
-    them bends, all turns are found anew from positions, as by `MotionSet.with_rotations`.
+    Joints are matched by name; SMPL joints that the skeleton does not have keep the identity rotation. If a bone
+    between two matched joints is not rigid, all rotations are estimated from positions, as in
+    `MotionSet.with_rotations`.
 
     Args:
-        path: the npz file.
-        clip: with rotations.
-        skeleton: with their rest pose.
+        path: npz file.
+        clip: clip with rotations.
+        skeleton: skeleton with their rest pose.
 
     Raises:
         ValueError: no joint is the pelvis.
@@ -130,7 +131,7 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     parents = [names.index(parent) if parent else -1 for parent in above]
     kept = Kept(tuple(meant[name] for name in names), tuple(names), tuple(parents))
     positions, rotations, offsets = kept.motion(skeleton.parents, clip.positions.astype(np.float64), clip.rotations)
-    if rotations is None or offsets is None:  # a bone between these joints bends, in the back as a rule
+    if rotations is None or offsets is None:  # a bone between these joints is not rigid, usually in the back
         tree = Skeleton(kept.names, kept.parents, *sides(names), skeleton.up, skeleton.fps)
         single = MotionSet([Clip("", "", positions)], tree).with_rotations()
         rotations, offsets = np.asarray(single.clips[0].rotations, np.float64), single.skeleton.offsets.numpy()
@@ -165,7 +166,7 @@ def _named() -> dict[str, str]:
 
 
 def _above(name: str, names: Sequence[str]) -> str:
-    """The nearest ancestor among these names."""
+    """Return the nearest ancestor among these names."""
     parent = _BODY[name][0]
     while parent and parent not in names:
         parent = _BODY[parent][0]
@@ -173,7 +174,7 @@ def _above(name: str, names: Sequence[str]) -> str:
 
 
 def _standing(names: Sequence[str], parents: Sequence[int]) -> np.ndarray:
-    """Places of some of the average body's joints."""
+    """Return positions of the named joints of the average body."""
     places: dict[str, np.ndarray] = {"": np.zeros(3)}
     for (name, (parent, *_)), offset in zip(_BODY.items(), OFFSETS, strict=True):
         places[name] = places[parent] + offset

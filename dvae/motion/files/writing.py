@@ -1,4 +1,4 @@
-"""Motion to files of every kind that is written: one file, or a folder of one for each clip."""
+"""Write motion in all supported formats, as one file or as a folder with one file per clip."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from .settled import understand
 from .smpl import write_amass
 
 FORMATS = {"npz": ".npz", "bvh": ".bvh", "csv": ".csv", "amass": ".npz"}
-"""What is written, and how the names of its files end. Only `npz` holds many clips in one file."""
+"""Formats and their file name endings. Only `npz` stores many clips in one file."""
 
 
 def format_of(path: str | Path, format: str | None = None) -> str:
-    """The format of what is written to a path: what is told, or what the end of its name says.
+    """Return the output format of a path: the given one, or the one of the file name ending.
 
     Raises:
-        ValueError: neither does, or they contradict each other.
+        ValueError: the format is unknown, or it contradicts the ending.
     """
     suffix = Path(path).suffix.lower()
     if format is None:
@@ -51,21 +51,21 @@ def format_of(path: str | Path, format: str | None = None) -> str:
 def write_motion(path: str | Path, motion: MotionSet, format: str | None = None) -> list[Path]:
     """Write motion for other programs: as npz, BVH, csv or in AMASS's layout.
 
-    BVH is in centimetres and y up, and has one rigid body a clip: where there are no rotations, they are found as
-    `MotionSet.with_rotations` does, and bones have their mean lengths in the clip. A folder gets labels.csv, where
-    there are labels. Where something cannot be written, nothing is.
+    BVH uses centimetres and y up, and one rigid body per clip. Missing rotations are estimated by
+    `MotionSet.with_rotations`, and bones have their mean lengths in the clip. A folder also gets labels.csv if clips
+    have labels. If one clip cannot be written, nothing is written.
 
     Args:
-        path: a file; or, where it has no ending, a folder, which gets a file "split/clip" for each clip.
-        motion: the clips; one alone for a file that is no npz of many.
-        format: one of `FORMATS`; by default as the name of the file ends.
+        path: a file; or a folder (a path without ending), which gets one file "split/clip" per clip.
+        motion: clips; exactly one if the format stores one clip per file and the path is a file.
+        format: one of `FORMATS`; default: the ending of the file name.
 
     Returns:
         The files that were written.
 
     Raises:
-        ValueError: the format is not known, several clips go to a file of one, or their names lead out of the folder;
-            or joints are missing, which a format of rotations cannot say.
+        ValueError: the format is unknown, a file for one clip would get several, a clip name leads out of the folder,
+            or joints are missing in a format of rotations.
         OSError: a file cannot be written.
     """
     path, format = Path(path), format_of(path, format)
@@ -87,7 +87,7 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
 
 @contextmanager
 def _staged(out: Path) -> Iterator[Path]:
-    """Where files are written that go to a folder, or a file to its place, once all of them are whole."""
+    """Yield a temporary path for a file or folder; its files are moved to their final place once all are complete."""
     folder = out.parent if out.suffix else out
     with files.made(folder):
         files.remove_leftovers(folder)
@@ -102,7 +102,7 @@ def _staged(out: Path) -> Iterator[Path]:
 
 
 def write_clip(path: Path, motion: MotionSet, format: str) -> None:
-    """Write a set of one clip, with rotations where the format has them."""
+    """Write a set with one clip, with rotations if the format has them."""
     clip, skeleton = motion.clips[0], motion.skeleton
     if format == "csv":
         write_table(path, skeleton.names, clip.positions)
@@ -119,7 +119,7 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
         write_amass(path, clip, skeleton)
         return
     recording = Recording(skeleton.names, skeleton.parents, clip.positions, clip.rotations, up=skeleton.up)
-    if skeleton.up != "y":  # as animation programs expect
+    if skeleton.up != "y":  # animation programs expect y up
         recording = upwards(recording, "y")
     assert recording.rotations is not None
     names: list[str] = []
@@ -132,7 +132,7 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
 
 
 def _place(path: Path, clip: Clip, format: str) -> Path:
-    """The file of a clip: the path itself, or one in this folder."""
+    """Return the file of a clip: the path itself, or a file in this folder."""
     if path.suffix:
         return path
     inner = Path("" if clip.split == "all" else clip.split, clip.name + FORMATS[format])
@@ -154,25 +154,25 @@ def convert(
     skip_bad: bool = False,
     missing: bool = False,
 ) -> str:
-    """Write the motion of files or folders anew, clip by clip, on several cores.
+    """Convert the motion of files or folders, clip by clip, on several cores.
 
     Args:
-        sources: files and folders, see `read_motion`; archives of clips are joined, and not mixed with others.
-        out: a file or a folder, see `write_motion`.
-        format: of what is written.
-        fps: frames per second of what is written; by default those of the files.
-        onto: a known skeleton to put it onto.
-        jobs: processes; -1 for one on each core.
-        metres, up: see `read_motion`.
-        recorded: frames per second of the files, where they are wrong about it.
-        skip_bad: leave out what cannot be used.
-        missing: keep clips that lack joints (NaN) in some frames.
+        sources: files and folders, as for `read_motion`; archives of clips are joined, but not mixed with other kinds.
+        out: file or folder, as for `write_motion`.
+        format: output format.
+        fps: output frames per second; default: the rate of the files.
+        onto: known skeleton to convert to.
+        jobs: number of processes; -1 for one per core.
+        metres, up: same as in `read_motion`.
+        recorded: true frames per second of the files, if the files are wrong about it.
+        skip_bad: leave out unusable clips.
+        missing: keep clips in which joints are missing (NaN) in some frames.
 
     Returns:
-        What was written, in a sentence or several.
+        A summary in words.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: see `read_motion` and `write_motion`.
+        FileNotFoundError, ValueError, OSError: same as `read_motion` and `write_motion`.
     """
     from joblib import Parallel, delayed
 
@@ -232,7 +232,7 @@ def convert(
 
 
 def _told(source: Path, several: bool) -> list[File]:
-    """Files of a source; of several, each folder is part of the split."""
+    """Return the files of a source; with several sources, the folder name becomes part of the split."""
     files = find_files(source)
     if several and source.is_dir():
         return [replace(f, split=source.name if f.split == "all" else f"{source.name}/{f.split}") for f in files]
@@ -242,7 +242,7 @@ def _told(source: Path, several: bool) -> list[File]:
 def _converted(
     reader: FileReader, file: File, out: Path, format: str, skip_bad: bool
 ) -> tuple[Clip, Skeleton, list[str]] | str:
-    """One file, read and, where each clip has a file, written: what it holds; or why it cannot be used."""
+    """Read one file, and write it if each clip has a file; return its content, or the reason why it is unusable."""
     try:
         clip, skeleton, notes = reader(file)
         if format == "npz":

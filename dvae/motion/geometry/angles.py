@@ -1,10 +1,10 @@
-"""Joint angles: cosines between vectors of a pose, as data for each skeleton, and the limits that real poses keep.
+"""Joint angles: cosines between vectors of a pose, defined for each skeleton, and their limits in real poses.
 
-Source: the angle loss of GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422) and, for Human3.6M and HumanEva-I,
-the angles of its public code. A vector is the position of a joint relative to the root, `"LHip"`, a difference of
-joints, `("LKnee", "-", "LHip")`, or a cross product of vectors, `(first, "x", second)`. Every angle between a
-vector and a plane is the cosine with the plane's normal, so that knees that bend forwards differ from knees that
-bend backwards. Cosines do not change when a pose is turned or scaled, nor when it is mirrored and its sides swapped.
+Source: the angle loss of GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422) and, for Human3.6M and HumanEva-I, the
+angles of its public code. A vector is the position of a joint relative to the root, `"LHip"`, a difference of joints,
+`("LKnee", "-", "LHip")`, or a cross product of vectors, `(first, "x", second)`. The angle between a vector and a plane
+is the cosine with the plane's normal, so knees that bend forwards differ from knees that bend backwards. Cosines do not
+change when a pose is rotated, scaled, or mirrored with its sides exchanged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .skeleton import Skeleton, differences, inverse_lengths
 Vector: TypeAlias = "str | tuple[Vector, str, Vector]"
 
 BLOCK = 4096
-"""Poses whose limits are estimated at once, so that their vectors stay in cache."""
+"""Number of poses whose limits are estimated at once, so that their vectors stay in cache."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Angle:
     """The cosine of the angle between two vectors.
 
     Args:
-        name: what to call it; angles of the same name, those of left and right, share their limits.
-        first, second: the vectors.
-        when: (u, v, sign): only poses in which the inner product of u and v is negative (sign -1), or not
-            negative (sign 1), have this angle.
+        name: name; angles of the same name (left and right) share their limits.
+        first, second: vectors.
+        when: (u, v, sign): only poses with a negative inner product of u and v (sign -1), or with a nonnegative one
+            (sign 1), have this angle.
     """
 
     name: str
@@ -43,13 +43,13 @@ class Angle:
     when: tuple[Vector, Vector, Literal[-1, 1]] | None = None
 
     def mirrored(self) -> Angle:
-        """The same angle of the other side of the body."""
+        """Return the same angle on the other side of the body."""
         when = self.when and (_mirrored(self.when[0]), _mirrored(self.when[1]), self.when[2])
         return Angle(self.name, _mirrored(self.first), _mirrored(self.second), when)
 
 
 def _mirrored(vector: Vector) -> Vector:
-    """Left for right; a reflection turns cross products round."""
+    """Exchange left and right; a reflection reverses cross products."""
     if isinstance(vector, str):
         return {"L": "R", "R": "L"}.get(vector[0], vector[0]) + vector[1:]
     a, operation, b = vector
@@ -109,7 +109,7 @@ def _humaneva() -> Iterator[Angle]:
 
 
 def _trunk_and_limbs(head: Vector) -> Iterator[Angle]:
-    """A set for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head."""
+    """Yield the angles for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head."""
     trunk, across_hips = ("Neck", "-", "Spine"), ("LHip", "-", "RHip")
     hips, shoulders = (across_hips, "x", "Spine"), ("LShoulder", "-", "RShoulder")
     chest = (shoulders, "x", ("Neck", "-", "Chest"))  # normals point to the front
@@ -147,15 +147,15 @@ ANGLES: dict[str, tuple[Angle, ...]] = {
         *_sides(Angle("Shoulder2Chest", ("LShoulder", "-", "LClavicle"), ("Neck", "-", "Chest"))),
     ),
 }
-"""The angles of a skeleton by its name. Human3.6M and HumanEva-I: those of GSPS; cmu21 and bandai21: ours."""
+"""The angles of each skeleton. Human3.6M and HumanEva-I: from GSPS; cmu21 and bandai21: our own definitions."""
 
 
 @dataclass(frozen=True, eq=False)
 class AngleLimits:
-    """Between which cosines the angles of real poses lie.
+    """Limits of the cosines of joint angles in real poses.
 
     Args:
-        names: the angles' names as in `ANGLES`, A of them.
+        names: the names of the A angles, as in `ANGLES`.
         low, high: (A,) smallest and largest cosine.
 
     Raises:
@@ -180,26 +180,26 @@ class AngleLimits:
 
 
 def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
-    """The cosines of all angles of `ANGLES[skeleton.name]`.
+    """Return the cosines of all angles of `ANGLES[skeleton.name]`.
 
-    An angle that a pose does not have (see `Angle.when`) is NaN: it compares false with every limit, and no
-    gradient flows from it. A vector without length (below 1e-6) has cosine 0 with every other, and no gradient.
+    An angle that a pose does not have, because of `Angle.when`, is NaN: comparisons with limits are false, and its
+    gradient is zero. A vector shorter than 1e-6 has cosine 0 with every other vector, and no gradient.
 
     Args:
-        poses: (..., D) metres, D = 3 J, or 3 (J - 1) without the root.
-        skeleton: one of `ANGLES`.
+        poses: (..., D) in metres, D = 3 J, or 3 (J - 1) without the root.
+        skeleton: skeleton of the poses, in `ANGLES`.
 
     Returns:
-        (..., A).
+        Cosines (..., A).
 
     Raises:
-        ValueError: D is neither, or the skeleton has no angles.
+        ValueError: D has another value, or the skeleton has no angles.
     """
     plan = _plan(skeleton, poses.device)
     matrix = differences(skeleton, plan.differences, poses.shape[-1], poses.dtype, poses.device)
     flat = poses.reshape(-1, poses.shape[-1])
     with torch.autocast(poses.device.type, enabled=False):
-        # poses run along the last axis, so that every operation is one over long contiguous rows
+        # poses are on the last axis, so that every operation works on long contiguous rows
         vectors = (matrix.T @ flat.T).unflatten(0, (-1, 3))
     for first, second in plan.crosses:
         crossed = _cross(vectors.index_select(0, first), vectors.index_select(0, second))
@@ -215,25 +215,25 @@ def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """(V, 3, N) twice -> (V, 3, N)."""
+    """Return the cross products (V, 3, N) of two tensors (V, 3, N)."""
     (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
 
 
 def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0.0) -> AngleLimits:
-    """The limits that poses keep, left and right together.
+    """Estimate the angle limits of poses, pooled over left and right.
 
     Args:
-        poses: (..., D) metres, as of `cosines`.
-        skeleton: one of `ANGLES`.
-        quantile: the part of the poses beyond each limit. 0 is the smallest and the largest cosine, as in the
-            paper: one outlier frame widens them; .001 forgets such frames.
+        poses: (..., D) in metres, as in `cosines`.
+        skeleton: skeleton of the poses, in `ANGLES`.
+        quantile: fraction of the poses beyond each limit. 0 gives the smallest and the largest cosine, as in the paper,
+            where one outlier frame widens the limits; .001 ignores such frames.
 
     Returns:
-        The limits; an angle that none of the poses has is free, from -1 to 1.
+        The limits; an angle that no pose has is unrestricted, from -1 to 1.
 
     Raises:
-        ValueError: there is no pose, the quantile is not in [0, .5), or as `cosines`.
+        ValueError: there are no poses, the quantile is not in [0, .5), or `cosines` raises it.
     """
     if not 0 <= quantile < 0.5:
         raise ValueError(f"quantile is {quantile}, expected the part beyond each limit, from 0 to below .5")
@@ -252,7 +252,7 @@ def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0
 
 
 def angle_names(skeleton: Skeleton) -> tuple[str, ...]:
-    """Names of the A angles of a skeleton in the order of `cosines`; left and right have the same.
+    """Return the names of a skeleton's A angles in the order of `cosines`; left and right have the same name.
 
     Raises:
         ValueError: the skeleton has no angles.
@@ -268,26 +268,26 @@ def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
 
 
 class _Plan(NamedTuple):
-    """Which vectors to make, and between which of them the cosines of a skeleton are, by their places."""
+    """Indices of the vectors to compute, and of the pairs of vectors whose cosines are the angles of a skeleton."""
 
     differences: tuple[tuple[int, int], ...]
-    """The first vectors, from joint to joint."""
+    """The basic vectors, as (from, to) joints."""
     crosses: list[tuple[Tensor, Tensor]]
-    """Factors of each round of cross products, which are appended."""
+    """Factors of each round of cross products; the results are appended to the vectors."""
     first: Tensor
     second: Tensor
     partial: Tensor
-    """The angles that some poses do not have, and when: u v < 0, or not."""
+    """The angles that only some poses have, and their condition: u v < 0, or not."""
     u: Tensor
     v: Tensor
     negative: Tensor
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # as of `differences`
+@torch.inference_mode(False)  # for the same reason as `differences`
 def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
     angles = _angles(skeleton)
-    needed: dict[Vector, int] = {}  # vector -> how deep its cross products are nested
+    needed: dict[Vector, int] = {}  # vector -> nesting depth of its cross products
     for angle in angles:
         for vector in (angle.first, angle.second, *(angle.when or ())[:2]):
             _depth(vector, needed)
@@ -314,7 +314,7 @@ def _depth(vector: Vector, needed: dict[Vector, int]) -> int:
 
 
 def _joints(vector: Vector, skeleton: Skeleton) -> tuple[int, int]:
-    """(from, to) of a position or a difference."""
+    """Return (from, to) of a position or a difference."""
     start, end = (skeleton.names[skeleton.root], vector) if isinstance(vector, str) else (vector[2], vector[0])
     lacking = [name for name in (start, end) if name not in skeleton.names]
     if lacking:

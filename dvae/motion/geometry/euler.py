@@ -1,29 +1,29 @@
-"""Errors of Euler angles at a few times, the score of deterministic forecasts of motion, for the best of K futures.
+"""Errors of Euler angles at a few times, for the best of K futures.
 
-With e_t the angles of all joints at time t, and e^k_t those of future k,
+This is the usual score of deterministic motion forecasts. Let e_t be the angles of all joints at time t, and e^k_t the
+angles of future k. The error
 
     error_t(K) = || e_t - e^best_t ||        best = argmin_{k <= K} mean_t || e_t - e^k_t ||
 
-in radians, the mean over windows, at 80, 160, 320, 400, 560 and 1000 ms. The protocol is that of Fragkiadaki, Levine,
-Felsen and Malik, 2015, arXiv 1508.00271, and Jain et al., 2016, arXiv 1511.05298, as the public code of Martinez, Black
-and Romero, 2017, arXiv 1705.02445, has it, from which later work takes it:
+is in radians, averaged over windows, at 80, 160, 320, 400, 560 and 1000 ms. The protocol is due to Fragkiadaki, Levine,
+Felsen and Malik, 2015, arXiv 1508.00271, and Jain et al., 2016, arXiv 1511.05298. The details follow the public code of
+Martinez, Black and Romero, 2017, arXiv 1705.02445, which later work uses:
 
-* Rotations are of joints against their parents. That of the root, which is the body's in the world, is left out.
-* Angles are about z, y and x, axes that turn along. (That code has them of matrices that act on rows, which are the
-  transposed ones.) They are between -pi and pi, and differences of them are taken as they are: one that passes pi is
-  off by 2 pi.
-* The norm is over all angles that vary: those whose standard deviation is above 1e-4. There it is over the frames of a
-  forecast, here over those of all true windows, so that all methods are scored on the same angles.
-* A time is that of the nearest frame, counted from the last observed one.
+* Joint rotations are relative to the parent. The root rotation (the orientation of the body in the world) is ignored.
+* Angles are about the moving axes z, y and x. (The public code uses matrices that act on rows, which are the transposes
+  of ours.) They are between -pi and pi. Differences are not wrapped, so a difference across pi is off by 2 pi.
+* The norm is over all angles that vary, i.e. whose standard deviation is above 1e-4. The public code computes it over
+  the frames of a forecast. We compute it over all true windows, so that all methods are scored on the same angles.
+* Each time uses the nearest frame, counted from the last observed one.
 
-The best of K futures stands for all of them in Aliakbarian et al., 2020, arXiv 1908.00733, who call it the S-MSE of Yan
-et al., 2018, arXiv 1808.04545: "at least one is close to the ground truth" (K = 50, and 1 to 500). They do not say
-whether one future is the best at all times. Here it is: the best by its mean error over the times, so that what is
-scored at 1000 ms is the future that is scored at 80 ms. Fewer futures are the first of the most.
+Aliakbarian et al., 2020, arXiv 1908.00733, score the best of K futures and call it the S-MSE of Yan et al., 2018, arXiv
+1808.04545: "at least one is close to the ground truth" (K = 50, and 1 to 500). They do not say whether the best future
+is the same at all times. Here it is: the best future has the smallest mean error over the times, so the same future is
+scored at 80 ms and at 1000 ms. For smaller K, the first K of all drawn futures are used.
 
-Turns are those of the data, and of models that make turns. Positions do not tell how a bone is turned about itself:
-models that make them are scored with `inverse`, by turns that inverse kinematics finds in positions, of what models
-make and of the truth alike. Errors by the one and by the other do not compare.
+Rotations come from the data, and from models that output rotations. Positions do not determine how a bone is rotated
+about itself. Models of positions are therefore scored with `inverse`: inverse kinematics estimates the rotations, both
+of forecasts and of the truth. Errors with and without `inverse` are not comparable.
 """
 
 from __future__ import annotations
@@ -55,23 +55,23 @@ TIMES = (80, 160, 320, 400, 560, 1000)
 """Milliseconds."""
 COUNTS = (1, 5, 10, 50, 100, 500)
 VARIES = 1e-4
-"""Standard deviation of an angle, in radians, above which it counts."""
+"""Standard deviation of an angle, in radians, above which it is scored."""
 FORM = "euler-zyx"
 MOTION = "motion"
-"""Name in batches of the past as models are given it."""
+"""Name in batches of the past that models receive."""
 
 
 @dataclass(frozen=True)
 class AngleProtocol:
-    """What `Angles` are of.
+    """Settings of `Angles`.
 
     Args:
-        name: of the protocol of the windows.
-        fps: of these.
+        name: name of the protocol of the windows.
+        fps: frames per second of the windows.
         times: milliseconds from the last observed frame.
-        frames: that are nearest to them, from 1.
-        inverse: whether turns are found in positions.
-        observed: frames of an `Angles` before the times: the last observed one.
+        frames: nearest predicted frames, counted from 1.
+        inverse: whether rotations are estimated from positions.
+        observed: number of frames in `Angles` before the times: the last observed one.
     """
 
     name: str
@@ -83,16 +83,16 @@ class AngleProtocol:
 
 
 class Angles:
-    """Held-out windows as Euler angles of joints: of the last observed frame, and at a few times after it.
+    """Euler angles of the joints in test windows: of the last observed frame, and at a few times after it.
 
     Args:
-        windows: of motion.
+        windows: windows of motion.
         times: milliseconds from the last observed frame.
-        inverse: find the turns in positions.
+        inverse: estimate the rotations from positions.
 
     Raises:
-        ValueError: a time that no predicted frame is nearest to, windows that lack joints or the turns of them, or a
-            skeleton without rest pose.
+        ValueError: no predicted frame is nearest to a time, the windows have missing joints or no rotations, or the
+            skeleton has no rest pose.
     """
 
     def __init__(self, windows: Windows, times: Sequence[float] = TIMES, inverse: bool = False) -> None:
@@ -119,30 +119,30 @@ class Angles:
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
-        """Of the windows."""
+        """Keys of the windows."""
         return self.windows.keys
 
     @property
     def fingerprint(self) -> str:
-        """Of the windows and the protocol."""
+        """SHA-256 of the windows and the protocol."""
         return hashlib.sha256(f"{self.windows.fingerprint} {self.protocol}".encode()).hexdigest()
 
     references: ClassVar = Windows.references
 
     @property
     def description(self) -> dict[str, Any]:
-        """How many angles are compared, and of which joints."""
+        """Entries for a record: the joints, and the number of angles that are compared."""
         names = [self.windows.skeleton.names[joint] for joint in self.joints]
         return {"joints": names, "angles": int(self.varying.sum()), "title": ["Euler angles"]}
 
     def all(self) -> Batch:
-        """The angles {"x": (N, 1 + times, A)}, and what models are given of each window."""
+        """Return the angles {"x": (N, 1 + times, A)}, and the past of each window that models receive."""
         batch, observed = self._batch, self.windows.protocol.observed
         return Batch({WHOLE: self._angles[..., self.varying], MOTION: batch.past(observed)})
 
     @cached_property
     def varying(self) -> Tensor:
-        """(3 J',) which angles of the joints that turn vary over the true windows."""
+        """(3 J',) mask of the angles that vary over the true windows; J' joints have children."""
         return self._angles.double().flatten(0, 1).std(0) > VARIES
 
     @cached_property
@@ -151,7 +151,7 @@ class Angles:
 
     @cached_property
     def _angles(self) -> Tensor:
-        """(N, 1 + times, 3 J')."""
+        """(N, 1 + times, 3 J') all angles."""
         now = self.windows.protocol.observed - 1
         frames = [now, *(now + frame for frame in self.protocol.frames)]
         if self.protocol.inverse:
@@ -160,28 +160,28 @@ class Angles:
         return self.of(to_matrix(turns, "quaternion"))
 
     def found(self, x: Tensor) -> Tensor:
-        """Angles (..., 3 J') of positions (..., D), by inverse kinematics."""
+        """Return angles (..., 3 J') of positions (..., D), by inverse kinematics."""
         positions = self.windows.positions(x)
         turns = kinematics.inverse(self.windows.skeleton, positions, self.offsets.to(positions))
         return self.of(turns[..., self.joints, :, :])
 
     def of(self, turns: Tensor) -> Tensor:
-        """Angles (..., 3 J') of the turns of joints (..., J', 3, 3)."""
+        """Return angles (..., 3 J') of joint rotations (..., J', 3, 3)."""
         return from_matrix(turns, FORM).flatten(-2)
 
 
 class Angled(nn.Module):
-    """A model of motion as one of angles, for `evaluate`.
+    """Adapter that turns a model of motion into a model of angles, for `evaluate`.
 
     Args:
-        model: that forecasts.
-        angles: which ones.
+        model: model that forecasts motion.
+        angles: angles to forecast.
 
     Raises:
-        ValueError: a model that makes no turns, where they are not to be found in positions.
+        ValueError: the model does not output rotations, and `inverse` is not set.
     """
 
-    likelihood = False  # what is scored is not the model's own
+    likelihood = False  # the angles have no likelihood under the model
 
     def __init__(self, model: Any, angles: Angles) -> None:
         super().__init__()
@@ -197,14 +197,14 @@ class Angled(nn.Module):
             )
 
     def is_drawn(self, means: bool = False) -> bool:
-        """As the model decides."""
+        """Return whether forecasts are draws; the model decides."""
         return self.model.is_drawn(means) if isinstance(self.model, Emitting) else not means
 
     def forecast(self, batch: Batch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
-        """{"x": (S, B, times, A)}, angles at all times, of which there are as many as the horizon."""
+        """Return {"x": (S, B, times, A)}, the angles at all times; the horizon equals their number."""
         frames, inverse = self.angles.protocol.frames, self.angles.protocol.inverse
         places, last, made = [frame - 1 for frame in frames], max(frames), _Made()
-        with alone, made:  # at once, where it is seen
+        with alone, made:  # in one chunk, so that `_Made` sees all draws
             at_once = {} if inverse else {"chunk": 2**62}
             futures = self.model.forecast(batch[MOTION], last, samples, **options, **at_once)[WHOLE]
         if inverse:
@@ -220,7 +220,7 @@ class Angled(nn.Module):
 
 
 class _Made(Messenger):
-    """Keeps x as a model makes it, (S B, T, D), before it is shown as positions."""
+    """Record x as the model outputs it, (S B, T, D), before its conversion to positions."""
 
     value: Tensor
 
@@ -240,23 +240,23 @@ def euler_errors(
     batch_size: int = 8,
     progress: bool = True,
 ) -> Evaluation:
-    """Errors of Euler angles of the best of K futures, beside zero velocity: see the file.
+    """Evaluate the Euler angle errors of the best of K futures, together with the zero-velocity reference.
 
     Args:
-        models: by name.
-        windows: held-out ones. With turns, unless `inverse`.
-        times: in milliseconds.
-        counts: K; the most are drawn, and fewer are the first of them.
-        inverse: find the turns in positions, for models that make positions and what they are compared with.
-        seed: of the draws of every model.
+        models: models by name.
+        windows: test windows; they need rotations unless `inverse` is set.
+        times: milliseconds from the last observed frame.
+        counts: values of K; the largest number is drawn, and a smaller K uses the first of them.
+        inverse: estimate rotations from positions, for models of positions and those they are compared with.
+        seed: seed of the draws of every model.
         batch_size: windows forecast at once, with all of their futures.
         progress: whether to show a progress bar.
 
     Returns:
-        An evaluation with a score "400 ms, best of 50" for each time and number, clustered by clip.
+        An evaluation with a score "400 ms, best of 50" for each time and K, clustered by clip.
 
     Raises:
-        ValueError: times beyond the windows, or windows or models without turns where they are not to be found.
+        ValueError: a time is beyond the windows, or windows or models have no rotations and `inverse` is not set.
     """
     if not counts or min(counts) < 1:
         raise ValueError(f"the best is of at least one future, got {list(counts)}")
@@ -273,11 +273,11 @@ def euler_errors(
 
 
 def _measures(angles: Angles, counts: Sequence[int]) -> list[Measure]:
-    """A score for each time and number."""
+    """Return one score for each time and K."""
 
-    @lru_cache(maxsize=1)  # times come one after the other
+    @lru_cache(maxsize=1)  # scores ask for one time after the other
     def best(forecasts: Tensor, truth: Tensor, count: int) -> Tensor:
-        """Errors (B, times) of the best of the first futures."""
+        """Return the errors (B, times) of the best of the first `count` futures."""
         errors: Tensor = (forecasts[:, :count] - truth[:, None]).norm(dim=-1)
         return errors[torch.arange(len(errors)), errors.mean(-1).argmin(1)]
 

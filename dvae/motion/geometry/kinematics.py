@@ -1,10 +1,10 @@
-"""Kinematics: from rotations of joints to positions, and back.
+"""Kinematics: from joint rotations to positions, and back.
 
-A rest pose is where each joint is from its parent while nothing is turned, (J, 3) in metres. Rotations are local: of a
-joint against its parent, and of the root against the world; the turn of a joint moves what hangs from it.
+A rest pose is the offset (J, 3) in metres of each joint from its parent in an unrotated pose. Rotations are local:
+joints relative to their parents, and the root relative to the world. The rotation of a joint moves all its descendants.
 
-What positions do not say is how a bone is turned about itself where one joint alone hangs from it; it is turned as
-little as possible against its parent.
+Positions do not determine the rotation of a bone about itself if its joint has only one child. Such a joint is rotated
+as little as possible relative to its parent.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,20 @@ from .rotations import across, procrustes
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 TIE = 1e-6
-"""Weight of the parent's turn beside unit vectors, where these leave the turn about themselves open."""
+"""Weight of the parent's rotation relative to unit vectors; it fixes rotations that the vectors leave open."""
 
 
 def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:
-    """Where joints are: one product of matrices for each generation of the tree, over all poses at once.
+    """Return joint positions by forward kinematics, with one matrix product per generation of the tree.
 
     Args:
         parents: index of each joint's parent, -1 for the root.
-        rotations: (..., J, 3, 3), local.
-        offsets: of a rest pose in metres, (J, 3); or any that broadcast against (..., J, 3).
-        root: place of the root (..., 3); that of the rest pose is not read.
+        rotations: (..., J, 3, 3), local rotations.
+        offsets: (J, 3) rest pose in metres, or any shape that broadcasts against (..., J, 3).
+        root: (..., 3) position of the root; the root's offset in the rest pose is ignored.
 
     Returns:
-        positions (..., J, 3), and turns against the world (..., J, 3, 3).
+        positions (..., J, 3), and rotations relative to the world (..., J, 3, 3).
     """
     generations = [[list(parents).index(-1)]]
     while below := [joint for joint, parent in enumerate(parents) if parent in generations[-1]]:
@@ -39,7 +39,7 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
     order = [joint for joints in generations for joint in joints]
     first_to_last = indices(order, rotations)
     many = [len(joints) for joints in generations]
-    # by index_select, whose gradient costs less than that of a list of indices
+    # index_select has a cheaper gradient than indexing by a list
     first, *turns = rotations.index_select(-3, first_to_last).split(many, -3)
     _, *bones = offsets.index_select(-2, first_to_last)[..., None].split(many, -3)
     turned, placed = [first], [root[..., None, :]]
@@ -53,23 +53,25 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
 
 
 def resting(parents: Sequence[int], offsets: Tensor) -> Tensor:
-    """Joints (..., J, 3) with nothing turned and the root at 0, of offsets from their parents (..., J, 3)."""
+    """Return the rest pose (..., J, 3) with the root at 0, from offsets (..., J, 3) from the parents."""
     unturned = torch.eye(3).to(offsets).expand(len(parents), 3, 3)
     return forward(parents, unturned, offsets, offsets.new_zeros(*offsets.shape[:-2], 3))[0]
 
 
 def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
-    """Local rotations of which `forward` makes poses as near as bones of these lengths allow.
+    """Return local rotations with which `forward` approximates poses as closely as the bone lengths allow.
 
-    Each joint is turned by Procrustes' rotation of the unit vectors to the joints that hang from it; exactly onto
-    one that hangs from it alone, and then as little as possible against its parent. An end has its parent's turn.
+    Each joint with several children is rotated by Procrustes analysis of the unit vectors to its children. A joint with
+    one child is aligned with it exactly, by the smallest rotation relative to its parent. A joint without children
+    keeps its parent's rotation.
 
     Args:
+        skeleton: skeleton of the poses.
         positions: (..., J, 3).
-        offsets: of a rest pose, (J, 3).
+        offsets: (J, 3), rest pose.
 
     Returns:
-        (..., J, 3, 3).
+        Rotations (..., J, 3, 3).
     """
     shape = (*positions.shape[:-2], 3, 3)
     unturned = torch.eye(3, dtype=positions.dtype, device=positions.device).expand(shape)
@@ -93,19 +95,21 @@ def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
 
 
 def swing(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (..., 3, 3) from one unit vector to another: half a turn about it, then about their middle.
+    """Return the smallest rotation (..., 3, 3) from one unit vector to another.
 
-    Of the many onto a vector's opposite, one; none, where the end is zero.
+    It is half a turn about `start`, then half a turn about the middle of both. If `end` is opposite to `start`, one of
+    the many rotations is returned; if `end` is zero, the identity.
     """
-    start = torch.nn.functional.normalize(start, dim=-1)  # or rounding would grow from joint to joint
+    start = torch.nn.functional.normalize(start, dim=-1)  # otherwise rounding errors grow from joint to joint
     middle = start + end
-    opposite = middle.norm(dim=-1, keepdim=True) < torch.finfo(middle.dtype).eps ** 0.5  # below, rounding rules
+    # below this, rounding dominates
+    opposite = middle.norm(dim=-1, keepdim=True) < torch.finfo(middle.dtype).eps ** 0.5
     middle = torch.nn.functional.normalize(torch.where(opposite, across(start), middle), dim=-1)
     return _half_turn(middle) @ _half_turn(start)
 
 
 def orthogonal(turn: Tensor) -> Tensor:
-    """A rotation (..., 3, 3) without the rounding of the products that it came from, or it would grow along a chain.
+    """Remove rounding errors from a rotation (..., 3, 3), which would grow along a chain of products.
 
     One step of Newton's iteration for the polar factor (Higham 1986).
     """
@@ -113,21 +117,23 @@ def orthogonal(turn: Tensor) -> Tensor:
 
 
 def _half_turn(axis: Tensor) -> Tensor:
-    """(..., 3, 3) about a unit vector."""
+    """Return the rotation (..., 3, 3) by half a turn about a unit vector."""
     return 2 * axis[..., :, None] * axis[..., None, :] - torch.eye(3, dtype=axis.dtype, device=axis.device)
 
 
 def rest(skeleton: Skeleton, positions: Tensor, rounds: int = 10) -> Tensor:
-    """A rest pose for poses of one body: the mean of them all, seen from the front, with bones of their mean lengths.
+    """Return a rest pose for poses of one body: their mean, facing forward, with bones of mean length.
 
-    Where several joints hang from one, they are as far from each other as in the poses (generalised Procrustes
-    analysis, Gower 1975).
+    If a joint has several children, the angles between them are those of the poses, by generalised Procrustes analysis
+    (Gower 1975).
 
     Args:
-        positions: (N, J, 3).
+        skeleton: skeleton of the poses.
+        positions: (N, J, 3) in metres.
+        rounds: iterations of the Procrustes analysis.
 
     Returns:
-        (J, 3), the root's 0.
+        Offsets (J, 3), zero for the root.
     """
     joints = [joint for joint, parent in enumerate(skeleton.parents) if parent >= 0]
     parents = [skeleton.parents[joint] for joint in joints]

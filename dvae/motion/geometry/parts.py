@@ -1,4 +1,4 @@
-"""Parts of the body: legs, arms and torso of the skeletons that are known by name, and unions of them."""
+"""Parts of the body: legs, arms and torso of the skeletons known by name, and unions of them."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ LIMBS: dict[str, dict[str, tuple[str, ...]]] = {
         **{arm: (f"{joints[0][0]}Clavicle", *joints) for arm, joints in _ARMS.items()},
     },
 }
-"""Skeleton to its five parts, every joint but the root in one of them."""
+"""The five parts of each skeleton; every joint except the root is in exactly one of them."""
 
 UNIONS = {"lower": ("right_leg", "left_leg"), "upper": ("torso", "left_arm", "right_arm")}
 
 
 def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """The joints of each part.
+    """Return the joints of each part.
 
     Args:
-        skeleton: the tree.
-        parts: each a name, such as "lower", "upper", "torso", "left_arm", or a name and what is in it,
-            "name=member+member", where a member is such a part or a joint.
+        skeleton: skeleton.
+        parts: names of parts, such as "lower", "upper", "torso", "left_arm", or definitions "name=member+member", where
+            a member is a part or a joint.
 
     Returns:
-        Part to its joints, as places among all joints but the root, ascending.
+        Mapping from part to its joints, as ascending indices among all joints except the root.
 
     Raises:
-        ValueError: a part that is not known, or joints that are in no part or in several.
+        ValueError: a part is unknown, or a joint is in no part or in several.
     """
     found: dict[str, tuple[int, ...]] = {}
     for text in parts:
@@ -64,17 +64,17 @@ def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[in
 
 
 def places_of(skeleton: Skeleton, members: Iterable[str]) -> tuple[int, ...]:
-    """The joints of parts, or single ones.
+    """Return the joints of parts and of single joints.
 
     Args:
-        skeleton: the tree.
-        members: each such a part as in `body_parts`, or a joint.
+        skeleton: skeleton.
+        members: names of parts, as in `body_parts`, or of joints.
 
     Returns:
-        Places among all joints but the root, ascending, as often as they are named.
+        Ascending indices among all joints except the root; joints that are named several times are repeated.
 
     Raises:
-        ValueError: one that is not known.
+        ValueError: a name is unknown.
     """
     limbs = LIMBS.get(skeleton.name, {})
     joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]

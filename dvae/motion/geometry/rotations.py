@@ -1,20 +1,21 @@
-"""Rotations in the forms that files and models use, to and from matrices.
+"""Conversions between rotation matrices and the forms that files and models use.
 
-Everything is right-handed, acts on columns, is batched over leading dimensions and differentiable; the conversions are
-roma's (Brégier 2021, arXiv 2103.16317). It takes as long to import as torch does, so that it is imported where
-something is turned.
+All rotations are right-handed, act on column vectors, are batched over leading dimensions and differentiable. The
+conversions use roma (Brégier 2021, arXiv 2103.16317), which is imported only when needed because its import is as slow
+as that of torch.
 
-Derivatives to a rotation are right everywhere, those from one but where a form jumps: a quaternion to its opposite,
-where another of its numbers becomes the largest; a vector at half a turn, to the other end of its axis; Euler angles
-where one is half a turn, or the second one brings the axes of the others together.
+Derivatives of conversions to matrices are always correct. Derivatives of conversions from matrices are correct except
+where a form is discontinuous: a quaternion changes sign where another of its components becomes the largest; a vector
+changes to the opposite end of its axis at half a turn; Euler angles jump at half a turn, and where the second angle
+aligns the axes of the other two.
 
 | form | numbers | |
 |---|---|---|
 | `matrix` | 9 | row after row |
-| `quaternion` | 4 | w x y z; of the two for one rotation, see `in_time` |
-| `vector` | 3 | axis times angle in radians, the exponential map; of the many, see `in_time` |
+| `quaternion` | 4 | w x y z; `in_time` chooses one of the two for a rotation |
+| `vector` | 3 | axis times angle in radians, the exponential map; `in_time` chooses one of many |
 | `6d` | 6 | the matrix's first column, then its second (Zhou et al. 2019, arXiv 1812.07035) |
-| `euler-zyx`, ... | 3 | radians, about axes that turn along, the first of them first; read with any number of axes |
+| `euler-zyx`, ... | 3 | radians, about moving (intrinsic) axes, in this order; reading accepts any number of axes |
 """
 
 import re
@@ -31,10 +32,10 @@ _WHOLE = re.compile(r"euler-([xyz])(?!\1)([xyz])(?!\2)([xyz])")
 
 
 def size(form: str) -> int:
-    """Numbers of a rotation in a form.
+    """Return the number of values of a rotation in a form.
 
     Raises:
-        ValueError: an unknown form.
+        ValueError: the form is unknown.
     """
     if form not in SIZES and not _EULER.fullmatch(form):
         raise ValueError(f"rotations have no form {form!r}; expected {', '.join(SIZES)}, or euler- and axes as in zyx")
@@ -42,13 +43,14 @@ def size(form: str) -> int:
 
 
 def to_matrix(values: Tensor, form: str) -> Tensor:
-    """Matrices (..., 3, 3) of rotations (..., `size(form)`); quaternions and 6d of any length are taken.
+    """Return matrices (..., 3, 3) of rotations (..., `size(form)`); quaternions and 6d need not be normalised.
 
-    What says nothing leaves unturned: a quaternion shorter than rounding (`finfo.eps`), and of 6d a first vector so
-    short, which is read as x; a second one so short, or along the first, as one across that.
+    Degenerate values have defaults. A quaternion shorter than `finfo.eps` is the identity. In 6d, a first vector of
+    such length is replaced by the x axis; a second vector of such length, or parallel to the first, by a perpendicular
+    one.
 
     Raises:
-        ValueError: an unknown form, or another number of numbers.
+        ValueError: the form is unknown, or the number of values does not match it.
 
     Example:
         >>> to_matrix(torch.tensor([0.0, 0.0, torch.pi / 2]), "vector").round()[0]
@@ -67,7 +69,7 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
     if form == "6d":
         shortest = torch.finfo(values.dtype).eps
         first, second = values.unflatten(-1, (2, 3)).unbind(-2)
-        # asked first, for gradients of what is not chosen cost as much as those of what is
+        # the condition avoids a `where` in the usual case, which would double the cost of gradients
         if (short := first.norm(dim=-1, keepdim=True) < shortest).any():
             first = torch.where(short, constant((1.0, 0.0, 0.0), values), first)
         with torch.no_grad():
@@ -81,10 +83,10 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
 
 
 def from_matrix(rotations: Tensor, form: str) -> Tensor:
-    """Rotations (..., 3, 3) in a form, (..., `size(form)`).
+    """Convert rotation matrices (..., 3, 3) to a form, (..., `size(form)`).
 
     Raises:
-        ValueError: an unknown form, or no matrices.
+        ValueError: the form is unknown, or the shape is not (..., 3, 3).
     """
     if rotations.shape[-2:] != (3, 3):
         raise ValueError(f"expected matrices (..., 3, 3), got {tuple(rotations.shape)}")
@@ -105,37 +107,38 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
 
 
 def normalised(quaternions: Tensor) -> Tensor:
-    """(..., 4) of unit length; unturned where they are shorter than rounding."""
+    """Return quaternions (..., 4) of unit length; those shorter than `finfo.eps` become the identity."""
     none = quaternions.norm(dim=-1, keepdim=True) < torch.finfo(quaternions.dtype).eps
     quaternions = torch.where(none, constant((1.0, 0.0, 0.0, 0.0), quaternions), quaternions)
     return torch.nn.functional.normalize(quaternions, dim=-1)
 
 
 def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
-    """The same rotations by quaternions (..., 4) of which each lies nearer to the one before than its opposite does.
+    """Return the same rotations as quaternions (..., 4) whose signs avoid jumps: each is nearest to its predecessor.
 
     Args:
-        quaternions: of unit length.
-        dim: of time; of (F, J, 4), the first.
+        quaternions: quaternions of unit length.
+        dim: dimension of time; the default is the first dimension of (F, J, 4).
     """
     with torch.no_grad():
         opposite = (quaternions * quaternions.roll(1, dim)).sum(-1, keepdim=True) < 0
         opposite = opposite.movedim(dim, 0)
-        opposite[:1] = False  # the first has none before it
+        opposite[:1] = False  # the first has no predecessor
         signs = 1 - 2 * (opposite.cumsum(0) % 2).movedim(0, dim).to(quaternions.dtype)
     return quaternions * signs
 
 
 def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
-    """Rotations (..., T, J, 3, 3) in a form as `from_matrix` gives it, without its jumps from frame to frame.
+    """Convert rotations (..., T, J, 3, 3) to a form without the jumps of `from_matrix` between frames.
 
-    Where a rotation has several quaternions or vectors, a frame has the one nearest to that of the frame before; the
-    first has the quaternion with w >= 0, or the vector of at most half a turn. So a frame depends on none after it.
+    If a rotation has several quaternions or vectors, each frame uses the one nearest to the previous frame. The first
+    frame uses the quaternion with w >= 0, or the vector of at most half a turn. A frame therefore never depends on
+    later frames.
 
     Args:
-        rotations: (..., T, J, 3, 3), or (..., T, J, 4) where quaternions are given.
-        form: that is asked for.
-        given: "matrix" or "quaternion".
+        rotations: (..., T, J, 3, 3), or (..., T, J, 4) for quaternions.
+        form: form of the result.
+        given: form of `rotations`, "matrix" or "quaternion".
     """
     if given == form == "quaternion":
         values = normalised(rotations)
@@ -147,15 +150,15 @@ def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
 
 
 def _unwrapped(vectors: Tensor) -> Tensor:
-    """Vectors (..., T, J, 3), each with so many whole turns about its axis that it is nearest to the one before.
+    """Add whole turns about the axis to vectors (..., T, J, 3), so that each is nearest to its predecessor.
 
-    One after the other, since where a vector lies says which turns are nearest for the next.
+    The loop is sequential, because the choice for a vector depends on the choice for its predecessor.
     """
     first, *others = vectors.unbind(-3)
     found = [first]
     for vector in others:
         angle = vector.norm(dim=-1, keepdim=True)
-        unturned = angle < 100 * torch.finfo(angle.dtype).eps  # about any axis, as the rest is rounding
+        unturned = angle < 100 * torch.finfo(angle.dtype).eps  # any axis would do: the vector is only rounding error
         axis = torch.nn.functional.normalize(torch.where(unturned, found[-1], vector), dim=-1)
         turns = ((found[-1] * axis).sum(-1, keepdim=True) - angle) / (2 * torch.pi)
         found.append(vector + 2 * torch.pi * turns.round() * axis)
@@ -163,13 +166,16 @@ def _unwrapped(vectors: Tensor) -> Tensor:
 
 
 def across(vectors: Tensor) -> Tensor:
-    """For each of unit vectors (..., 3) another one at right angles to it, near the axis that it has least of."""
+    """Return unit vectors perpendicular to unit vectors (..., 3), near the axis of their smallest component."""
     least = torch.nn.functional.one_hot(vectors.abs().argmin(-1), 3).to(vectors)
     return torch.nn.functional.normalize(least - (least * vectors).sum(-1, keepdim=True) * vectors, dim=-1)
 
 
 def procrustes(products: Tensor) -> Tensor:
-    """The rotations (..., 3, 3) nearest to matrices: of targets times sources, those that turn these onto those."""
+    """Return the rotations (..., 3, 3) nearest to matrices.
+
+    For a product of targets and transposed sources, this is the rotation that best aligns the sources with the targets.
+    """
     roma = optional("roma", "motion")
 
     found: Tensor = roma.special_procrustes(products)

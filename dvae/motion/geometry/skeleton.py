@@ -1,8 +1,8 @@
-"""Skeletons: which joints there are, how they hang together, and which way is up.
+"""Skeletons: the joints, the tree that connects them, and the up axis.
 
-Positions are metres, (..., joints, 3), right-handed: with y up, a person facing +z has their left side
-towards +x. The presets' trees are those of Human3.6M (17 of its 32 joints) and HumanEva-I (15 joints) as the
-motion prediction papers use them (Mao, Liu and Salzmann 2021, GSPS).
+Positions are in metres, (..., joints, 3), right-handed: with y up, a person facing +z has their left side towards +x.
+The presets are Human3.6M (17 of its 32 joints) and HumanEva-I (15 joints) as motion prediction papers use them (Mao,
+Liu and Salzmann 2021, GSPS).
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from ...constants import indices
 from ..naming import readings
 
 MOST_JOINTS = 1000
-"""A body scanner's suit has two hundred markers; matrices here grow with the square of the number."""
+"""Maximum number of joints. A mocap suit has two hundred markers; matrices here grow with the square of the number."""
 
 MOST_TEXT = 2**24
-"""Bytes of a text file that are read."""
+"""Maximum size of a text file in bytes."""
 
 
 @contextmanager
 def text_of(path: Path, most: int = MOST_TEXT) -> Iterator[TextIO]:
-    """What a text file holds, to be read within the context.
+    """Open a text file, to be read within the context.
 
     Raises:
-        OSError: there is no such file.
-        ValueError: it has more than `most` bytes, or is no UTF-8.
+        OSError: the file does not exist.
+        ValueError: it has more than `most` bytes, or is not UTF-8.
     """
     try:
         yield io.TextIOWrapper(io.BytesIO(files.read(path, most, links=True)), encoding="utf-8-sig")
@@ -52,15 +52,15 @@ def text_of(path: Path, most: int = MOST_TEXT) -> Iterator[TextIO]:
 
 
 def brief(value: Any) -> str:
-    """A value as text, shortened where it is long, deep or a very large number."""
+    """Return a value as text, shortened if it is long, deeply nested or a very large number."""
     try:
         return reprlib.repr(value)
-    except ValueError:  # more digits than Python writes
+    except ValueError:  # more digits than Python converts
         return f"a number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
 
 
 def is_name(text: str) -> bool:
-    """Whether a text can be shown as a name: of some length, no terminal's commands, no halves of letters."""
+    """Return whether a text is printable as a name: not too long, no control characters, no surrogates."""
     return len(text) <= 1000 and not any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text)
 
 
@@ -73,7 +73,7 @@ def _is(value: Any, kind: type) -> bool:
 
 
 def _values(given: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]:
-    """A list's values, if each is of a kind."""
+    """Return the values of a list as a tuple, after a check of their type."""
     if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable):
         raise ValueError(f"{what} is {brief(given)}, expected a list of {expected}")
     values = tuple(given)
@@ -94,7 +94,7 @@ FIELDS = {
     "up": "up_axis",
     "fps": "fps",
 }
-"""Of a skeleton, and what files call them."""
+"""Fields of a skeleton, and their names in files."""
 
 
 @dataclass(frozen=True)
@@ -105,15 +105,15 @@ class Skeleton:
         names: joint names, all different.
         parents: index of each joint's parent, -1 for the root; in any order.
         left, right: indices of the joints on the body's left and right side.
-        up: the vertical axis, "y" or "z".
+        up: vertical axis, "y" or "z".
         fps: frames per second of the motion recorded on this skeleton.
-        name: what to call it.
-        lengths: reference bone lengths in metres in the order of `edges`; empty where people differ.
-        rest: where each joint is from its parent while nothing is turned, x y z after x y z, in metres, the root's
-            zero; empty where no rotations are known.
+        name: name.
+        lengths: reference bone lengths in metres in the order of `edges`; empty if people differ.
+        rest: flattened offsets (J, 3) of each joint from its parent in the rest pose, in metres, zero for the root;
+            empty if there are no rotations.
 
     Raises:
-        ValueError: the joints do not form one tree, names repeat, or a side names a joint that is not there.
+        ValueError: the joints do not form one tree, names repeat, or a side contains an unknown joint.
     """
 
     names: tuple[str, ...]
@@ -189,10 +189,10 @@ class Skeleton:
         return self.parents.index(-1)
 
     def find(self, joint: str) -> int:
-        """Index of a joint by its name, or by one that means the same, such as left_wrist for LWrist.
+        """Return the index of a joint by its name or an equivalent name, such as left_wrist for LWrist.
 
         Raises:
-            ValueError: an unknown name, with the nearest one.
+            ValueError: the name is unknown; the message suggests the nearest one.
         """
         joint = str(joint)
         if joint in self.names:
@@ -212,17 +212,17 @@ class Skeleton:
 
     @property
     def order(self) -> list[int]:
-        """The joints, every parent before its children: generation after generation, each in the order of the names."""
+        """The joints in breadth-first order, so that parents precede their children."""
         tree = nx.DiGraph(self.edges)
         tree.add_node(self.root)
         return [joint for generation in nx.bfs_layers(tree, self.root) for joint in sorted(generation)]
 
     @property
     def offsets(self) -> Tensor:
-        """Of the rest pose, (J, 3), float64.
+        """The rest pose (J, 3), float64.
 
         Raises:
-            ValueError: none is known.
+            ValueError: the skeleton has no rest pose.
         """
         if not self.rest:
             raise ValueError(
@@ -233,22 +233,22 @@ class Skeleton:
 
     @property
     def vertical(self) -> int:
-        """Index of the up axis in a position's three coordinates."""
+        """Index of the up axis among the three coordinates."""
         return "xyz".index(self.up)
 
     def without_root(self, joints: Tensor) -> Tensor:
-        """Joints (..., J, 3) but for the root."""
+        """Return joints (..., J, 3) without the root, (..., J - 1, 3)."""
         return torch.cat([joints[..., : self.root, :], joints[..., self.root + 1 :, :]], -2)
 
     def with_root(self, joints: Tensor, value: float = 0.0) -> Tensor:
-        """Joints (..., J, 3) as they are, or of those without a root, with one of this value."""
+        """Return joints (..., J, 3); if the root is missing, insert it with the given value."""
         if joints.shape[-2] == self.joints:
             return joints
         root = torch.full_like(joints[..., :1, :], value)
         return torch.cat([joints[..., : self.root, :], root, joints[..., self.root :, :]], -2)
 
     def bone_lengths(self, positions: Any) -> Any:
-        """Bone lengths in metres: positions (..., J, 3), numpy or torch -> (..., J - 1), as in `edges`."""
+        """Return bone lengths (..., J - 1), ordered as `edges`, of positions (..., J, 3), numpy or torch, in metres."""
         if positions.shape[-2:] != (self.joints, 3):
             raise ValueError(
                 f"positions have shape {tuple(positions.shape)}, expected (..., {self.joints}, 3) for "
@@ -262,28 +262,27 @@ class Skeleton:
         return ((ends[0] - ends[1]) ** 2).sum(-1) ** 0.5
 
     def limbs(self, poses: Tensor) -> Tensor:
-        """Vectors from parent to child in metres: poses (..., D) -> (..., J - 1, 3), as in `edges`.
+        """Return vectors (..., J - 1, 3) from parent to child in metres, in the order of `edges`.
 
         Args:
-            poses: joint positions one after another, D = 3 J; or without the root, which is the origin,
-                D = 3 (J - 1).
+            poses: (..., D), concatenated joint positions, D = 3 J; or D = 3 (J - 1) without the root at the origin.
 
         Raises:
-            ValueError: D is neither.
+            ValueError: D has another value.
         """
         incidence = differences(self, tuple(self.edges), poses.shape[-1], poses.dtype, poses.device)
-        with torch.autocast(poses.device.type, enabled=False):  # differences of positions need all their digits
+        with torch.autocast(poses.device.type, enabled=False):  # differences of positions need full precision
             bones: Tensor = (poses @ incidence).unflatten(-1, (-1, 3))
         return bones
 
     def ends(self, limbs: Tensor) -> Tensor:
-        """Where limbs end when each begins where its parent ends and the root is the origin; the way back from `limbs`.
+        """Return the end points of chained limbs with the root at the origin; the inverse of `limbs`.
 
         Args:
-            limbs: (..., J - 1, 3), as in `edges`.
+            limbs: (..., J - 1, 3), in the order of `edges`.
 
         Returns:
-            poses (..., 3 (J - 1)), without the root.
+            Poses (..., 3 (J - 1)), without the root.
         """
         chains = _chains(self, limbs.dtype, limbs.device)
         with torch.autocast(limbs.device.type, enabled=False):
@@ -291,20 +290,20 @@ class Skeleton:
         return poses
 
     def directions(self, poses: Tensor) -> Tensor:
-        """Unit vectors along the limbs: poses (..., D) -> (..., 3 (J - 1)), zero for a limb without length.
+        """Return unit vectors along the limbs (..., 3 (J - 1)) of poses (..., D); zero for a limb of length zero.
 
         Raises:
-            ValueError: D is as `limbs` does not take it.
+            ValueError: D is not valid for `limbs`.
         """
         limbs = self.limbs(poses)
         return (limbs * inverse_lengths(limbs)[..., None]).flatten(-2)
 
     @property
     def sides(self) -> tuple[list[int], list[int]]:
-        """The joints where left and where right chains leave the trunk: hips and shoulders.
+        """The joints where the left and right chains leave the trunk: hips and shoulders.
 
         Raises:
-            ValueError: the skeleton does not say what is left and right.
+            ValueError: the skeleton does not define left and right.
         """
         left = [joint for joint in self.left if self.parents[joint] not in self.left]
         right = [joint for joint in self.right if self.parents[joint] not in self.right]
@@ -313,20 +312,20 @@ class Skeleton:
         return left, right
 
     def heading(self, positions: Tensor) -> Tensor:
-        """Angle about the up axis, in radians, from which a person faces.
+        """Return the angle about the up axis, in radians, of the direction that a person faces.
 
-        The left-right axis is the sum over the left ones of the `sides`, less that over the right ones. Zero is the
-        left side towards +x: facing +z where y is up, -y where z is up.
+        The left-right axis is the sum over the left joints of `sides` minus the sum over the right joints. Heading zero
+        has the left side towards +x: facing +z if y is up, -y if z is up.
 
         Args:
-            positions: (..., J, 3); sides that are NaN are left out.
+            positions: (..., J, 3); NaN sides are ignored.
 
         Returns:
-            (...,), NaN where a side is NaN altogether; `rotate_about_up(positions, -heading, up)` turns everybody to
-            heading zero.
+            Angles (...,), NaN if all joints of a side are NaN. `rotate_about_up(positions, -heading, up)` gives
+            everybody heading zero.
 
         Raises:
-            ValueError: the skeleton does not say what is left and right.
+            ValueError: the skeleton does not define left and right.
         """
         plane = [(self.vertical + 1) % 3, (self.vertical + 2) % 3]
         level = positions.index_select(-1, indices(plane, positions))
@@ -336,17 +335,18 @@ class Skeleton:
         return torch.atan2(across[..., 1], across[..., 0]) - towards_x
 
     def heading_near(self, positions: Tensor, frame: int) -> Tensor:
-        """The `heading` at a frame of motion some of whose joints are missing; 0 where none up to it tells any.
+        """Return the `heading` at a frame of motion with missing joints; 0 if no frame up to it has a heading.
 
-        It is taken from the frame that has most of the `sides`, at least one left and one right; of several, from the
-        last one. Later frames are not read: what is turned so to be forecast knows nothing of its future.
+        The heading comes from the frame with the most `sides`, at least one left and one right; of several such frames,
+        from the last one. Later frames are not used, so a window that is rotated for a forecast reveals nothing about
+        its future.
 
         Args:
             positions: (..., T, J, 3), NaN where a joint was not observed.
-            frame: which of the T.
+            frame: index of the frame.
 
         Returns:
-            (...,).
+            Angles (...,) in radians.
         """
         positions = positions[..., : frame + 1, :, :]
         time = torch.arange(positions.shape[-3], device=positions.device)
@@ -358,18 +358,18 @@ class Skeleton:
 
     @staticmethod
     def _side(places: Tensor) -> Tensor:
-        """The sum (..., 2) of places (..., n, 2), where those that are NaN count as the mean of the others."""
+        """Sum positions (..., n, 2) to (..., 2); NaN positions count as the mean of the others."""
         there = places.isfinite().all(-1, keepdim=True)
         found: Tensor = torch.where(there, places, 0.0).sum(-2) * (there.shape[-2] / there.sum(-2))
         return found
 
     @classmethod
     def from_json(cls, path: str | Path) -> Skeleton:
-        """Read a skeleton file as `to_json` writes it.
+        """Read a skeleton file in the format of `to_json`.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is no JSON object, lacks joint_names or parents, or describes no skeleton.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is not a JSON object, has no joint_names or parents, or does not describe a skeleton.
         """
         path = Path(path)
         try:
@@ -379,7 +379,7 @@ class Skeleton:
             raise ValueError(f"{path}: expected JSON with joint_names and parents (it is nested too deeply)") from error
         except json.JSONDecodeError as error:
             raise ValueError(f"{path}: expected JSON with joint_names and parents ({error})") from error
-        except ValueError as error:  # a number of more digits than Python reads
+        except ValueError as error:  # a number with more digits than Python reads
             raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
         missing = [key for key in ("joint_names", "parents") if not isinstance(fields, dict) or key not in fields]
         if missing:
@@ -393,7 +393,7 @@ class Skeleton:
                     f"bone_lengths_m has {len(lengths)} entries, expected one for each of {len(parents)} joints"
                 )
             given = {field: fields[key] for field, key in FIELDS.items() if key in fields}
-            # the file has one entry per joint, and a zero for the root
+            # the file has one entry per joint, zero for the root
             bones = tuple(length for length, parent in zip(lengths, parents, strict=bool(lengths)) if parent != -1)
             rest = fields.get("rest_m", ())
             named = {"name": path.absolute().parent.name, **given}
@@ -402,7 +402,7 @@ class Skeleton:
             raise ValueError(f"{path}: {error}") from error
 
     def to_json(self, path: str | Path) -> None:
-        """Write the skeleton as a JSON file that people can read; it replaces an older one once it is whole."""
+        """Write the skeleton as a readable JSON file; an existing file is replaced only after a complete write."""
         fields = {**{key: getattr(self, field) for field, key in FIELDS.items()}, "units": "m"}
         if self.lengths:
             lengths = iter(self.lengths)
@@ -414,27 +414,27 @@ class Skeleton:
 
 
 SHORTEST = 1e-6
-"""A vector shorter than this, in metres, has no direction."""
+"""Length in metres below which a vector has no direction."""
 
 
 def inverse_lengths(vectors: Tensor, dim: int = -1) -> Tensor:
-    """One over the lengths of vectors along a dimension; zero, and without gradient, where one has no length."""
+    """Return the inverse lengths of vectors along a dimension; zero, without gradient, for vectors of length zero."""
     squares = vectors.square().sum(dim)  # linalg.vector_norm is ten times slower over three numbers
     return squares.clamp_min(SHORTEST**2).rsqrt().masked_fill(squares < SHORTEST**2, 0)
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
+@torch.inference_mode(False)  # the cached result must support gradients, even if the first call is in inference mode
 def differences(
     skeleton: Skeleton, pairs: tuple[tuple[int, int], ...], size: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """The matrix (D, 3 P) with which poses (..., D) become the vectors from joint to joint of P pairs.
+    """Return the matrix (D, 3 P) that maps poses (..., D) to the vectors between the joints of P pairs.
 
     Coordinates are ordered as in poses, xyz of the first pair first. One matrix product is ten times as fast as
-    to gather both ends and subtract (measured: 200,000 poses of 48 numbers, forward and backward).
+    gathering both ends and subtracting (measured: 200,000 poses of 48 numbers, forward and backward).
 
     Raises:
-        ValueError: D is neither 3 J nor 3 (J - 1), the root at the origin and left out.
+        ValueError: D is neither 3 J nor 3 (J - 1), which means that the root is at the origin and left out.
     """
     joints = skeleton.joints
     if size not in (3 * joints, 3 * (joints - 1)):
@@ -454,7 +454,7 @@ def differences(
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _chains(skeleton: Skeleton, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The inverse (D, D) of `differences` of the bones, D = 3 (J - 1): each joint is the sum of the bones before it."""
+    """Return the inverse (D, D) of `differences` for all bones: a joint is the sum of the bones up to it."""
     bones = differences(skeleton, tuple(skeleton.edges), 3 * (skeleton.joints - 1), torch.float64, torch.device("cpu"))
     chains: Tensor = torch.linalg.inv(bones).round().to(device, dtype)
     return chains
@@ -485,10 +485,10 @@ HUMAN36M = Skeleton(
     name="human36m",
 )
 # fmt: on
-"""The 17 joints of Human3.6M that the papers keep, as in VideoPose3D's archive: z up, 50 Hz."""
+"""The 17 joints of Human3.6M that papers use, as in VideoPose3D's archive: z up, 50 Hz."""
 
 HUMAN36M_KEPT = (0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 17, 18, 19, 25, 26, 27)
-"""Which of the archive's 32 joints these are; `load` takes them by itself from an archive of 32 joints."""
+"""Indices of these 17 joints among the archive's 32; `read_motion` selects them from an archive of 32."""
 
 # fmt: off
 HUMANEVA = Skeleton(

@@ -1,4 +1,4 @@
-"""Views of motion: people who face one way, bones that keep their lengths, and turns in place of positions."""
+"""Views of motion: windows with a fixed heading, bones of constant length, and rotations instead of positions."""
 
 from __future__ import annotations
 
@@ -18,30 +18,32 @@ from .rotations import in_time, size, to_matrix
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 HEADING = "heading"
-"""Name in batches of the angles (B,) by which windows were turned, in radians."""
+"""Name in batches of the angles (B,) by which windows were rotated, in radians."""
 LENGTHS = "bone_lengths"
-"""Name in batches of the lengths (B, J - 1) of windows' bones, in metres, in the order of `Skeleton.edges`."""
+"""Name in batches of the bone lengths (B, J - 1) of windows, in metres, in the order of `Skeleton.edges`."""
 TURNS = "turns"
-"""Name beside windows of the turns (B, T, 4 J) of all joints, quaternions w x y z one after the other."""
+"""Name in `Batch.beside` of the rotations (B, T, 4 J) of all joints, as concatenated quaternions w x y z."""
 
 
 @dataclass(frozen=True)
 class Heading(View):
-    """Windows turned about the up axis so that one of their poses has heading zero.
+    """Windows rotated about the up axis so that one of their poses has heading zero.
 
-    Given the heading, a window and its turned one are a rotation apart: volumes, lengths and angles stay. The heading
-    itself nothing scores, so that bounds are those of turned windows: they compare with those of models that turn
-    windows by the same pose, and with no others.
+    The original and the rotated window differ by a rotation, which preserves volumes, lengths and angles. The heading
+    itself is not modelled. Bounds are therefore bounds of rotated windows: compare them only with models that rotate
+    windows by the same pose.
 
-    Missing entries stay missing, of every joint both horizontal coordinates or neither, as a turn mixes them. Where
-    hips and shoulders lack in that pose, the nearest earlier one that has some of them tells the heading; a window none
-    of whose poses up to that one does stays as it is (`Skeleton.heading_near`), and so does its past in a forecast.
+    Missing values stay missing. The two horizontal coordinates of a joint must be both observed or both missing,
+    because a rotation mixes them. If hips or shoulders are missing in the pose, the heading comes from the nearest
+    earlier pose that has some of them (`Skeleton.heading_near`). Without such a pose, the window is not rotated, and
+    neither is its past in a forecast.
 
     Args:
-        skeleton: with left and right.
-        frames: O; the pose is the last of the first O frames, or of a window that is shorter.
+        skeleton: skeleton with left and right joints.
+        frames: number of frames O; the pose is the last of the first O frames, or of a shorter window.
         pose: variable (B, D) that is the pose; None for a frame of x.
-        turned: names of what turns, (..., B, T, D) with D = 3 J, or 3 (J - 1) without the root, which is the origin.
+        turned: names of the variables to rotate, (..., B, T, D) with D = 3 J, or 3 (J - 1) without the root at the
+            origin.
     """
 
     skeleton: Skeleton
@@ -79,12 +81,12 @@ class Heading(View):
         return data if heading is None else self._turn(data, heading)
 
     def of(self, x: Tensor) -> Tensor:
-        """Headings (...) of windows (..., T, D), or of poses (..., D); NaN where a joint was not observed."""
+        """Return headings (...) of windows (..., T, D), or of poses (..., D); unobserved joints are NaN."""
         frames = x[..., None, :] if self.pose else x
         return self.skeleton.heading_near(self._joints(frames), min(self.frames, frames.shape[-2]) - 1)
 
     def face(self, x: Tensor) -> Tensor:
-        """Windows (..., T, D) turned each by its own heading."""
+        """Return windows (..., T, D), each rotated to heading zero."""
         return self._rotated(x, -self.of(x), 2)
 
     def _turn(self, values: Batch, angle: Tensor) -> Batch:
@@ -95,13 +97,13 @@ class Heading(View):
         return rotate_about_up(x.unflatten(-1, (-1, 3)), angle[(..., *[None] * dims)], self.skeleton.up).flatten(-2)
 
     def _observed(self, data: Batch) -> Tensor:
-        """Headings (B,) of what was observed of the data."""
+        """Return headings (B,) computed from observed values."""
         source = self.pose or WHOLE
         x, seen = data[source], data.mask(source)
         return self.of(x if seen is None else torch.where(seen, x, torch.nan))
 
     def _joints(self, poses: Tensor) -> Tensor:
-        """Joints (..., J, 3) of poses (..., D), with the root where that was dropped."""
+        """Return joints (..., J, 3) of poses (..., D), adding a dropped root at the origin."""
         sizes = 3 * self.skeleton.joints, 3 * self.skeleton.joints - 3
         if poses.shape[-1] not in sizes:
             raise ValueError(
@@ -111,7 +113,7 @@ class Heading(View):
         return self.skeleton.with_root(poses.unflatten(-1, (-1, 3)))
 
     def _check_mask(self, name: str, mask: Tensor) -> None:
-        """Refuses missing entries that leave half of what a turn mixes."""
+        """Raise an error if a joint has only one observed horizontal coordinate."""
         skeleton, joints = self.skeleton, mask.unflatten(-1, (-1, 3))
         across = [axis for axis in range(3) if axis != skeleton.vertical]
         mixed = joints[..., across[0]] != joints[..., across[1]]
@@ -126,21 +128,21 @@ class Heading(View):
 
 @dataclass(frozen=True)
 class Bones(View):
-    """Unit vectors along the bones in place of positions; on the way back bones have the lengths they were seen with.
+    """Unit vectors along the bones instead of positions; the inverse restores the observed bone lengths.
 
-    The direction of the bone that ends at a joint has that joint's place among the coordinates; a root that the
-    protocol keeps stays where it is. Whatever a model makes in place of directions is put to length, so that bones are
-    those of the person by construction.
+    The direction of the bone that ends at a joint replaces the coordinates of this joint; a root that the protocol
+    keeps is not changed. The inverse rescales any output of the model to the bone lengths, so that they are correct by
+    construction.
 
-    This is no bijection. Lengths are taken as given, one for a bone and window, so that what they vary by within a
-    window is lost; and a direction has two degrees of freedom in three numbers, so that no density of positions follows
-    from one of directions: `log_det` refuses. A model sees so whose x is a function of its parents, as with
-    `distributions.Directions`, and which learns from energies.
+    This view is not a bijection. Lengths are given, one per bone and window, so their variation within a window is
+    lost. A direction has two degrees of freedom in three numbers, so a density of directions does not define one of
+    positions, and `log_det` raises an error. Use this view for models whose x is a function of its parents, as with
+    `distributions.Directions`, and that are trained by energies.
 
     Args:
-        skeleton: of the poses.
-        frames: O; lengths are the means over the first O frames, or over those that there are.
-        pieces: coordinates of x that batches and forecasts hold under names of their own, as positions too.
+        skeleton: skeleton of the poses.
+        frames: number of frames O; lengths are means over the first O frames, or over all frames if there are fewer.
+        pieces: subsets of the coordinates of x that batches and forecasts contain under their own names, as positions.
     """
 
     skeleton: Skeleton
@@ -186,7 +188,7 @@ class Bones(View):
         )
 
     def _rooted(self, joints: Tensor, x: Tensor) -> Tensor:
-        """What all joints but the root have (..., J - 1, 3) as (..., D), with the root of x where it has one."""
+        """Flatten values (..., J - 1, 3) of all joints except the root to (..., D), and insert the root of x if any."""
         if x.shape[-1] == 3 * self.skeleton.joints:
             root = self.skeleton.root
             own = x.unflatten(-1, (-1, 3))[..., root : root + 1, :]
@@ -194,12 +196,12 @@ class Bones(View):
         return joints.flatten(-2)
 
     def _named(self, values: Batch, x: Tensor) -> Batch:
-        """The values, with this x wherever they hold x or a piece of it."""
+        """Return the values with x and its pieces replaced."""
         pieces = {name: x[..., list(places)] for name, places in self.pieces.items() if name in values}
         return values | pieces | ({WHOLE: x} if WHOLE in values else {})
 
     def _joined(self, data: Batch, held: Mapping[str, Sequence[int]]) -> Tensor:
-        """The whole of pieces, 0 elsewhere; every bone of theirs begins at the root or in one of them."""
+        """Return x assembled from pieces, 0 elsewhere; the start of each bone must be the root or in a piece."""
         size = 1 + max(place for places in self.pieces.values() for place in places)
         joints = [j for j in range(self.skeleton.joints) if j != self.skeleton.root or size == 3 * self.skeleton.joints]
         there = {joints[place // 3] for places in held.values() for place in places} | {self.skeleton.root}
@@ -216,7 +218,7 @@ class Bones(View):
         return whole
 
     def _mean(self, lengths: Tensor, steps: Tensor | None) -> Tensor:
-        """(B, J - 1) of (B, O, J - 1), over the frames that are no padding."""
+        """Average lengths (B, O, J - 1) to (B, J - 1) over the frames that are not padding."""
         if steps is None:
             return lengths.mean(1)
         valid = valid_steps(steps, lengths.shape[1])[..., None]
@@ -235,24 +237,24 @@ class Bones(View):
 
 @dataclass(frozen=True)
 class Rotations(View):
-    """Turns of joints in place of positions, and bones that keep their lengths.
+    """Joint rotations instead of positions, and bones of constant length.
 
-    x is positions (B, T, D) in metres on either side of a model; what the model sees is first the root's place, where
-    x has it, then the turn of every joint from which others hang, in `form`, without jumps (`rotations.in_time`). The
-    turns are those that lie beside the data; of data without they are found (`kinematics.inverse`), with twists of
-    their own. Bones have the lengths that they have in the data, on average, or in the rest pose, where there are none.
+    Outside the model, x is positions (B, T, D) in metres. The model sees the position of the root, if x has it, and
+    then the rotation of every joint with children, in `form` and without jumps (`rotations.in_time`). Rotations are
+    taken from the data, or else estimated by `kinematics.inverse`, including the twist. Bones have their mean length in
+    the data, or their length in the rest pose if data are unavailable.
 
-    Densities are of these numbers, not of positions, which have other volumes and one dimension for each bone more:
-    bounds compare with those of models that see the same.
+    Densities are densities of these numbers, not of positions, which have other volumes and one more dimension per
+    bone. Compare bounds only with models that use the same view.
 
     Args:
-        skeleton: with a rest pose.
-        form: of the turns: "6d", "quaternion" or "vector", of which any numbers are turns; see
+        skeleton: skeleton with a rest pose.
+        form: form of the rotations: "6d", "quaternion" or "vector", in which all values are valid rotations; see
             `dvae.motion.geometry.rotations`.
-        root: whether x has the root, D = 3 J; otherwise it is the origin, and D = 3 (J - 1).
+        root: whether x has the root, D = 3 J; otherwise the root is the origin, and D = 3 (J - 1).
 
     Raises:
-        ValueError: an unknown form, or a skeleton without rest pose.
+        ValueError: the form is unknown, or the skeleton has no rest pose.
     """
 
     skeleton: Skeleton
@@ -263,22 +265,22 @@ class Rotations(View):
 
     def __post_init__(self) -> None:
         size(self.form)
-        offsets = self.skeleton.offsets  # which says what to do where there are none
+        offsets = self.skeleton.offsets  # raises an error that explains how to get a rest pose
         object.__setattr__(self, "_offsets", tuple(map(tuple, offsets.tolist())))
 
     @property
     def measured(self) -> str:  # type: ignore[override]
-        """What densities are of."""
+        """Name of the values that densities refer to."""
         return f"turns of joints ({self.form})"
 
     @property
     def turning(self) -> list[int]:
-        """The joints from which others hang; the turns of all others cannot be seen."""
+        """The joints with children; the rotations of all others are not observable."""
         return sorted({parent for parent, _ in self.skeleton.edges})
 
     @property
     def size(self) -> int:
-        """Numbers of a frame that the model sees."""
+        """Number of values per frame that the model sees."""
         return 3 * self.root + size(self.form) * len(self.turning)
 
     @override
@@ -303,7 +305,7 @@ class Rotations(View):
             matrices = kinematics.inverse(skeleton, positions, constant(self._offsets, x))[..., self.turning, :, :]
             found = in_time(matrices, self.form)
         else:
-            turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # of a past, no more than that
+            turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # a past uses only its own frames
             found = in_time(turns.index_select(-2, indices(self.turning, turns)).to(x), self.form, "quaternion")
         place = [positions[..., skeleton.root, :]] if self.root else []
         seen[WHOLE] = torch.cat([*place, found.flatten(-2)], -1)

@@ -1,1 +1,1 @@
-"""Judges: models that are fitted to real motion, and say what they find of motion that a method makes."""
+"""Metric models: models fitted to real motion that score the motion of other models."""

@@ -1,4 +1,4 @@
-"""Criticism of models of motion: statistics for `dvae.predictive_checks`, and pictures of a `dvae.traverse`."""
+"""Model criticism for motion: statistics for `dvae.predictive_checks`, and figures of a `dvae.traverse`."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 
 def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
-    """What predictive checks compare of motion.
+    """Return the statistics of motion for predictive checks.
 
     * speed: mean over frames and joints, by first differences.
     * acceleration: the same by second differences.
     * bone length: mean over frames and bones.
-    * bone stretch: standard deviation of a bone's length over time by its mean, mean over bones; 0 for real bones.
-    * foot height: of the feet above the lowest joint in the same frame, mean over frames and feet. Where one foot
-      stands it is the height above the ground; it needs no ground, so that it means the same with and without the
-      pelvis's own motion. Feet are the ends of the chains whose names say foot, toe, ankle or heel; a skeleton without
-      such names has no foot height.
+    * bone stretch: standard deviation of a bone's length over time, divided by its mean, averaged over bones; 0 for
+      real bones.
+    * foot height: height of the feet above the lowest joint in the same frame, averaged over frames and feet. If one
+      foot is on the ground, it is the height above the ground. It does not depend on global motion. Feet are the ends
+      of chains whose names contain foot, toe, ankle or heel; a skeleton without such names has no foot height.
 
-    Where joints are missing, means are over the differences, bones and feet that are known, and the lowest joint is
-    that of those that are.
+    If joints are missing, means are over the known differences, bones and feet, and the lowest joint is the lowest
+    known one.
     """
     skeleton = windows.skeleton
     up, fps = skeleton.vertical, skeleton.fps
@@ -67,14 +67,14 @@ def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
 def draw_traversal(
     found: Traversal, windows: Windows | Exchanged, frame: int = -1, sequence: int = 0, rows: int = 6
 ) -> Figure:
-    """Poses of one sequence at one frame: a row for each coordinate, that of most effect first.
+    """Draw poses of one sequence at one frame, one row per latent coordinate, the one with the largest effect first.
 
     Args:
-        found: by `dvae.traverse`.
-        windows: of the skeleton, whose `positions` turn x into poses.
-        frame: which frame of the sequence, the last by default.
-        sequence: which sequence of the batch.
-        rows: how many coordinates to draw.
+        found: result of `dvae.traverse`.
+        windows: windows of the skeleton; `positions` converts x to poses.
+        frame: index of the frame, the last by default.
+        sequence: index of the sequence in the batch.
+        rows: number of coordinates to draw.
     """
     from ..drawing.plot import SPACING, bare, facing, pose
 

@@ -1,13 +1,13 @@
-"""Energies: what makes samples of motion bad, as pure functions, lower where samples are better.
+"""Energies: penalties for samples of motion, as pure functions; lower is better.
 
-They are no likelihoods: a model takes them in through `pyro.factor`, and an objective weighs them (`Evidence`'s
-`energy_weights`). Source: GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422), with the normalisation of its public
-code, where nothing else is said.
+Energies are not likelihoods. A model includes them through `pyro.factor`, and an objective weights them (`Evidence`'s
+`energy_weights`). Unless noted otherwise, the source is GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422), with the
+normalisation of its public code.
 
-Shapes everywhere: samples (S, B, T, D), S samples for each of B sequences, T frames of D coordinates in metres; the
-result is (B,), and its mean over the batch is the paper's term. Which frames count is up to the caller, who passes
-these frames alone. What is NaN in a truth, a history or a reference was not observed, and does not count. Gradients
-flow to the samples. Every function raises ValueError for shapes that do not fit.
+Shapes everywhere: samples (S, B, T, D), S samples for each of B sequences, T frames of D coordinates in metres. The
+result is (B,); its mean over the batch is the paper's term. The caller passes only the frames that count. NaN values in
+a truth, a history or a reference were not observed and do not count. Gradients flow to the samples. Every function
+raises ValueError if shapes do not match.
 """
 
 from collections.abc import Callable
@@ -23,11 +23,11 @@ from ..geometry.angles import AngleLimits, angle_names, cosines
 from ..geometry.skeleton import Skeleton, differences
 
 BLOCK = 2**18
-"""Numbers that are worked on at once on a CPU, so that what is made of them stays in cache."""
+"""Number of values processed at once on a CPU, so that intermediate results stay in cache."""
 
 
 def best_of_many(samples: Tensor, truth: Tensor) -> Tensor:
-    """Squared error of the best sample: min_s sum_{t,d} (x_s - x)^2. GSPS's reconstruction term L_r.
+    """Return the squared error of the best sample: min_s sum_{t,d} (x_s - x)^2. GSPS's reconstruction term L_r.
 
     Args:
         samples: (S, B, T, D).
@@ -43,18 +43,18 @@ def best_of_many(samples: Tensor, truth: Tensor) -> Tensor:
 
 
 def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> Tensor:
-    """Squared error of the best sample for each admissible future: min_s sum_{t,d} (x_s - y_m)^2, pooled.
+    """Return the squared error of the best sample for each admissible future: min_s sum_{t,d} (x_s - y_m)^2, pooled.
 
-    e_b = (B / M) sum over the valid futures of b, with M valid futures in the whole batch, so that the mean over
-    the batch is the mean over all valid futures. GSPS's multimodal reconstruction term L_mm.
+    e_b = (B / M) sum over the valid futures of b, with M valid futures in the whole batch. The mean over the batch is
+    therefore the mean over all valid futures. GSPS's multimodal reconstruction term L_mm.
 
     Args:
         samples: (S, B, T, D).
-        pseudo: (B, M, T, D), the admissible futures; invalid ones are not read.
+        pseudo: (B, M, T, D), admissible futures; invalid ones are ignored.
         valid: (B, M) bool.
 
     Returns:
-        (B,), square metres; zeros where no future is valid.
+        (B,), square metres; zeros if no future is valid.
     """
     _check(samples)
     _, sequences, *frame_shape = samples.shape
@@ -64,7 +64,7 @@ def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> T
         raise ValueError(f"valid has dtype {valid.dtype}, expected torch.bool")
     sequence, future = valid.nonzero(as_tuple=True)
     truths = pseudo[sequence, future]
-    with torch.no_grad():  # ||x - y||^2 - ||y||^2 = ||x||^2 - 2 x y, relative to one sample lest digits cancel
+    with torch.no_grad():  # ||x - y||^2 - ||y||^2 = ||x||^2 - 2 x y, relative to one sample to avoid cancellation
         offsets = (samples - samples[:1]).transpose(0, 1).flatten(2)
         targets = (pseudo - samples[0, :, None]).masked_fill(~valid[..., None, None], 0).flatten(2)
         distances = offsets.square().sum(2)[:, None] - 2 * targets @ offsets.mT
@@ -74,33 +74,33 @@ def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> T
 
 
 def _errors(samples: Tensor, truth: Tensor) -> Tensor:
-    """Squared errors, 0 where the truth is NaN."""
+    """Return squared errors, 0 where the truth is NaN."""
     return torch.where(truth.isnan(), 0.0, samples - truth).square()
 
 
 def _chosen(samples: Tensor, sample: Tensor, sequence: Tensor) -> Tensor:
-    """samples[sample, sequence], (N, T, D)."""
+    """Return samples[sample, sequence], (N, T, D)."""
     return samples.flatten(0, 1).index_select(0, sample * samples.shape[1] + sequence)
 
 
 def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
-    """How alike the samples are: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||_1 / scale).
+    """Return the similarity of the samples: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||_1 / scale).
 
-    GSPS's diversity term L_div takes it of each body part alone, among samples that share the earlier parts.
+    GSPS's diversity term L_div applies it to each body part separately, among samples that share the earlier parts.
 
     Args:
         samples: (S, B, T, D).
         scale: alpha, metres; the distance is the sum over all T D coordinates.
 
     Returns:
-        (B,), from 0 to 1 (all samples equal); zeros where there is no pair.
+        (B,), from 0 to 1 (all samples equal); zeros if there is only one sample.
     """
     _check(samples)
     if not scale > 0:
         raise ValueError(f"scale is {scale}, expected a distance above 0, in metres")
     first, second = torch.triu_indices(len(samples), len(samples), 1, device=samples.device)
     one = torch.eye(len(samples), dtype=samples.dtype, device=samples.device)
-    pairs = one[first] - one[second]  # as a matrix product, a third faster than by indices
+    pairs = one[first] - one[second]  # a matrix product is a third faster than indexing
 
     def energy(x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
@@ -112,16 +112,16 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
 
 
 def gaussian_diversity(samples: Tensor, scale: float) -> Tensor:
-    """How alike the samples are: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||^2 / scale). DLow's E_d.
+    """Return the similarity of the samples: mean over the pairs i < j of exp(-||vec(x_i) - vec(x_j)||^2 / scale).
 
-    Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code.
+    DLow's E_d (Yuan and Kitani, 2020, arXiv 2003.08386), with the normalisation of its public code.
 
     Args:
         samples: (S, B, T, D).
         scale: square metres.
 
     Returns:
-        (B,), from 0 to 1 (all samples equal); zeros where there is no pair.
+        (B,), from 0 to 1 (all samples equal); zeros if there is only one sample.
     """
     if not scale > 0:
         raise ValueError(f"scale is {scale}, expected a squared distance above 0, in square metres")
@@ -132,10 +132,10 @@ def gaussian_diversity(samples: Tensor, scale: float) -> Tensor:
 
 
 def determinantal_diversity(samples: Tensor, quality: Tensor, scale: float) -> Tensor:
-    """Minus the expected number of samples that a determinantal point process chooses: -tr(I - (L + I)^-1).
+    """Return minus the expected number of samples that a determinantal point process selects: -tr(I - (L + I)^-1).
 
-    L_ij = r_i r_j exp(-||vec(x_i) - vec(x_j)||^2 / scale). Samples that are alike are seldom chosen together, and
-    one of low quality seldom at all. The loss of DSF (Yuan and Kitani, 2020, arXiv 1907.04967).
+    L_ij = r_i r_j exp(-||vec(x_i) - vec(x_j)||^2 / scale). Similar samples are rarely selected together, and samples of
+    low quality are rarely selected. The loss of DSF (Yuan and Kitani, 2020, arXiv 1907.04967).
 
     Args:
         samples: (S, B, T, D).
@@ -153,28 +153,28 @@ def determinantal_diversity(samples: Tensor, quality: Tensor, scale: float) -> T
     one = torch.eye(len(samples), dtype=distances.dtype, device=distances.device)
     with torch.autocast(samples.device.type, enabled=False):
         kernel = r[:, :, None] * r[:, None] * (-distances / scale).exp()
-        left: Tensor = torch.linalg.inv_ex(kernel + one)[0]  # that of inv is waited for
+        left: Tensor = torch.linalg.inv_ex(kernel + one)[0]  # unlike inv, inv_ex does not synchronise with the device
     return left.diagonal(dim1=1, dim2=2).sum(1) - len(samples)
 
 
 def _squared_distances(samples: Tensor) -> Tensor:
-    """||vec(x_i) - vec(x_j)||^2 of all pairs of samples, over all T D coordinates.
+    """Return ||vec(x_i) - vec(x_j)||^2 of all pairs of samples, over all T D coordinates.
 
     Args:
         samples: (S, B, T, D).
 
     Returns:
-        (B, S, S), square metres, in single precision at least.
+        (B, S, S), square metres, at least in single precision.
     """
     with torch.autocast(samples.device.type, enabled=False):
         x = samples.to(torch.promote_types(samples.dtype, torch.float32)).transpose(0, 1).flatten(2)
-        x = x - x.mean(1, keepdim=True)  # lest digits cancel below
+        x = x - x.mean(1, keepdim=True)  # avoids cancellation below
         squares = x.square().sum(2)
         return squares[:, :, None] + squares[:, None] - 2 * x @ x.mT
 
 
 def history_error(samples: Tensor, history: Tensor) -> Tensor:
-    """Squared error of the observed frames as samples repeat them: mean_{t,s} sum_d (x_s - x)^2. GSPS's L_x.
+    """Return the squared error of the samples in the observed frames: mean_{t,s} sum_d (x_s - x)^2. GSPS's L_x.
 
     Args:
         samples: (S, B, O, D), the O observed frames.
@@ -188,14 +188,14 @@ def history_error(samples: Tensor, history: Tensor) -> Tensor:
 
 
 def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tensor:
-    """Squared errors of limb lengths: mean_{t,s} sum_limbs (length - reference length)^2. GSPS's L_limb.
+    """Return the squared errors of limb lengths: mean_{t,s} sum_limbs (length - reference length)^2. GSPS's L_limb.
 
-    GSPS takes all frames, the repeated history too, and the first observed pose for reference.
+    GSPS uses all frames, including the repeated history, and the first observed pose as reference.
 
     Args:
         samples: (S, B, T, D).
-        reference: (B, D), a pose of each sequence; a constant. Limbs that it lacks have any length.
-        skeleton: the joints; D = 3 J, or 3 (J - 1) without the root.
+        reference: (B, D), one pose of each sequence, treated as a constant. Limbs with missing joints are ignored.
+        skeleton: skeleton of the poses; D = 3 J, or 3 (J - 1) without the root.
 
     Returns:
         (B,), square metres.
@@ -215,17 +215,17 @@ def _limb_errors(samples: Tensor, expected: Tensor, limbs: Tensor) -> Tensor:
 
 
 def _lengths(poses: Tensor, limbs: Tensor) -> Tensor:
-    """Of the limbs, vectors as `Skeleton.limbs` has them."""
+    """Return limb lengths; `limbs` is the matrix that maps poses to limb vectors."""
     with torch.autocast(poses.device.type, enabled=False):
         vectors: Tensor = (poses @ limbs).unflatten(-1, (-1, 3))
-    return vectors.square().sum(-1).clamp_min(1e-30).sqrt()  # the gradient at 0 is 0, not NaN
+    return vectors.square().sum(-1).clamp_min(1e-30).sqrt()  # makes the gradient at 0 zero instead of NaN
 
 
 class _InBlocks(Function):
-    """energy(samples, *constants) of a few sequences at a time, and its gradient in the same pass.
+    """Evaluate energy(samples, *constants) for a few sequences at a time, together with its gradient.
 
-    What is made of the samples on the way to an energy is several times their size: in blocks it stays in cache and
-    takes no memory (measured: half the time of limb lengths, a fifth of pairwise distances).
+    Intermediate results of an energy are several times as large as the samples. In blocks they stay in cache and need
+    little memory (measured: half the time for limb lengths, a fifth for pairwise distances).
     """
 
     @staticmethod
@@ -253,20 +253,20 @@ class _InBlocks(Function):
 
 
 def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Tensor:
-    """Squared excess of the joint angles over their limits, in cosines. GSPS's L_a.
+    """Return the squared excess of the joint angles over their limits, in cosines. GSPS's L_a.
 
     sum_angles [mean_{cos < low} (cos - low)^2 if low >= -.98] + [mean_{cos > high} (cos - high)^2 if high <= .98]
 
-    where a mean is over the violating entries of the whole batch, left and right, and not over all. A sequence's
-    energy is its share of that, times B.
+    Each mean is over the violating entries of the whole batch, left and right, not over all entries. The energy of a
+    sequence is its share of this sum, times B.
 
     Args:
-        samples: (S, B, T, D), of GSPS the predicted frames.
-        limits: as `motion.estimate_angle_limits` returns them.
-        skeleton: one of `motion.angles.ANGLES`; D = 3 J, or 3 (J - 1) without the root.
+        samples: (S, B, T, D); GSPS uses the predicted frames.
+        limits: result of `motion.estimate_angle_limits`.
+        skeleton: skeleton of the poses, in `motion.angles.ANGLES`; D = 3 J, or 3 (J - 1) without the root.
 
     Returns:
-        (B,), without unit; zeros where no limit is exceeded.
+        (B,), without unit; zeros if all angles are within their limits.
     """
     _check(samples)
     names = angle_names(skeleton)
@@ -283,7 +283,7 @@ def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Te
 
 
 class _JointAngles(Function):
-    """In blocks; and differentiates only the poses that exceed a limit, which are few once a model has learnt."""
+    """Compute the excess in blocks, and differentiate only poses that exceed a limit (few, after training)."""
 
     @staticmethod
     def forward(ctx: Any, samples: Tensor, low: Tensor, high: Tensor, same: Tensor, skeleton: Skeleton) -> Tensor:
@@ -307,7 +307,7 @@ class _JointAngles(Function):
         poses = samples.flatten(0, 2)
         gradient = torch.zeros_like(poses)
         every = torch.arange(len(poses), device=poses.device)
-        # which they are would be waited for on a GPU
+        # finding these poses would synchronise with a GPU
         chosen = slopes.any(1).nonzero()[:, 0] if poses.device.type == "cpu" else every
         for rows in chosen.split(_poses_at_once(samples)):
             slope = slopes[rows] * outputs[0][rows // frames % sequences, None]
@@ -322,15 +322,15 @@ def _poses_at_once(samples: Tensor) -> int:
 
 
 def pose_prior_energy(samples: Tensor, prior: Callable[[Tensor], tuple[Tensor, Tensor]], skeleton: Skeleton) -> Tensor:
-    """How far the poses are from a prior's centre: -mean_{t,s} sum log N(z; 0, 1), z of unit limb directions.
+    """Return the distance of poses from a prior's centre: -mean_{t,s} sum log N(z; 0, 1), z of unit limb directions.
 
-    GSPS's L_nf. The log-determinant of the prior's flow is left out, as there, so that this is no density.
+    GSPS's L_nf. As in GSPS, the log-determinant of the prior's flow is left out, so this is not a density.
 
     Args:
-        samples: (S, B, T, D); GSPS takes every third predicted frame, from a random one of the first three.
-        prior: a function of directions (..., 3 (J - 1)), zeros for limbs without length, that returns z of the same
-            shape and a log-determinant (...).
-        skeleton: the joints; D = 3 J, or 3 (J - 1) without the root.
+        samples: (S, B, T, D); GSPS uses every third predicted frame, starting at a random one of the first three.
+        prior: function from directions (..., 3 (J - 1)), zeros for limbs of length zero, to z of the same shape and a
+            log-determinant (...).
+        skeleton: skeleton of the poses; D = 3 J, or 3 (J - 1) without the root.
 
     Returns:
         (B,), nats.

@@ -1,4 +1,4 @@
-"""Joints of one skeleton by those of another: names that mean the same, and motion put onto fewer joints."""
+"""Match the joints of two skeletons by the meaning of their names, and reduce motion to a subset of joints."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..geometry.skeleton import Skeleton
 from ..naming import letters, readings
 
 RIGID = 1e-3
-"""Metres by which a bone between kept joints may change and still count as one."""
+"""Tolerance in metres within which a bone between kept joints counts as rigid."""
 
 PARTS = {
     "pelvis": "hips hip pelvis root midhip",
@@ -35,8 +35,10 @@ PARTS = {
     "wrist": "fingerbase wrist hand",
     "hand": "hand fingers",
 }
-"""Parts of the body and how files call them, the surest first. A joint stands for one part: who has an ankle and a foot
-has a toe there, and who has an arm and a shoulder a clavicle."""
+"""Parts of the body and their names in files, the most specific first.
+
+A joint is matched to one part. A skeleton with an ankle and a foot uses the foot as toe; one with an arm and a
+shoulder uses the shoulder as clavicle."""
 
 _MIDDLE = ("pelvis", "spine", "chest", "neck", "upperneck", "head", "headtop")
 _FURTHER = {"hip": "knee", "knee": "ankle", "ankle": "toe", "elbow": "wrist", "shoulder": "elbow", "wrist": "hand"}
@@ -48,17 +50,17 @@ _FURTHER |= {
     "upperneck": "head",
     "head": "headtop",
 }
-"""What is at the end of a bone that begins at a part."""
+"""The part at the far end of a bone that begins at a part."""
 
 
 def parts(names: Sequence[str]) -> dict[str, int]:
-    """Which joint is which part, as in {"pelvis": 0, "l hip": 1}; joints that mean no part are left out."""
+    """Map parts to joints, as in {"pelvis": 0, "l hip": 1}; joints that match no part are left out."""
     words: dict[tuple[str, str], int] = {}
     for joint, name in enumerate(names):
         for meant in readings(name):
             words.setdefault(meant, joint)
     for side in ("l", "r"):
-        if (side, "radius") in words:  # Acclaim's, in which the wrist is the second half of the forearm
+        if (side, "radius") in words:  # in Acclaim files, the wrist is the second half of the forearm
             words.pop((side, "wrist"), None)
     found: dict[str, int] = {}
 
@@ -72,7 +74,7 @@ def parts(names: Sequence[str]) -> dict[str, int]:
     for part, meaning in PARTS.items():
         for side in ("",) if part in _MIDDLE else ("l", "r"):
             take(part, side, meaning.split())
-    for part, next_one in _FURTHER.items():  # files do not name ends, readers do
+    for part, next_one in _FURTHER.items():  # files do not name the ends of chains; our readers do
         for side in ("",) if part in _MIDDLE else ("l", "r"):
             if f"{side} {part}".strip() in found:
                 own = readings(names[found[f"{side} {part}".strip()]])
@@ -81,15 +83,15 @@ def parts(names: Sequence[str]) -> dict[str, int]:
 
 
 def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> list[int]:
-    """Which of the joints of these names each joint of a skeleton is.
+    """Return the index of the joint that matches each joint of a skeleton.
 
     Args:
-        names: of a file's joints.
-        skeleton: whose joints are looked for.
-        said: a file's name to the skeleton's, where names alone do not tell.
+        names: names of a file's joints.
+        skeleton: skeleton whose joints are matched.
+        said: mapping from names in the file to names in the skeleton, if names alone are not sufficient.
 
     Raises:
-        ValueError: some are not found.
+        ValueError: some joints have no match.
     """
     told = {new: find(names, old) for old, new in (said or {}).items()}
     if unknown := told.keys() - set(skeleton.names):
@@ -114,28 +116,28 @@ def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | No
 
 
 def against_world(parents: Sequence[int], rotations: Tensor) -> Tensor:
-    """Turns (F, J, 3, 3) against the world, of those of joints against their parents."""
+    """Return rotations (F, J, 3, 3) relative to the world, from rotations relative to the parents."""
     nowhere = rotations.new_zeros(len(parents), 3)
     return forward(parents, rotations, nowhere, rotations.new_zeros(len(rotations), 3))[1]
 
 
 def offsets_of(parents: Sequence[int], bones: Tensor) -> tuple[Tensor, float]:
-    """Mean places (J, 3) of joints against their parents, the root's 0; and how far one goes from its own.
+    """Return mean offsets (J, 3) of joints from their parents, zero for the root, and the largest deviation from them.
 
     Args:
-        parents: of the joints, -1 for the root.
-        bones: (F, J, 3), as parents see them.
+        parents: index of each joint's parent, -1 for the root.
+        bones: (F, J, 3), offsets in the frames of the parents.
     """
     bones = torch.where(torch.tensor(parents)[:, None] < 0, 0.0, bones)
-    offsets = bones[0] + (bones - bones[0]).mean(0)  # what does not change is kept to the last bit
+    offsets = bones[0] + (bones - bones[0]).mean(0)  # exact if the offsets are constant
     return offsets, float((bones - offsets).norm(dim=-1).max())
 
 
 def find(names: Sequence[str], joint: str) -> int:
-    """Place of a joint by its name as a file has it.
+    """Return the index of a joint by its exact name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: the name is unknown.
     """
     if joint not in names:
         raise ValueError(f"no joint {joint!r}; there are {', '.join(names)[:600]}")
@@ -144,12 +146,12 @@ def find(names: Sequence[str], joint: str) -> int:
 
 @dataclass(frozen=True)
 class Kept:
-    """Joints that are kept of a skeleton, and what tree they make.
+    """A subset of the joints of a skeleton, and its tree.
 
     Args:
-        joints: their places.
-        names: what they are called now.
-        parents: by place among these, -1 for the root.
+        joints: indices of the joints.
+        names: new names of the joints.
+        parents: index of each joint's parent among the kept joints, -1 for the root.
     """
 
     joints: tuple[int, ...]
@@ -158,10 +160,12 @@ class Kept:
 
     @classmethod
     def of(cls, names: Sequence[str], parents: Sequence[int], joints: Sequence[int | str] | Mapping[str, str]) -> Kept:
-        """Some joints, by place or name; or by name with a new one. Each hangs from its nearest ancestor that is kept.
+        """Select joints by index or name, or by a mapping from names to new names.
+
+        The parent of each joint is its nearest kept ancestor.
 
         Raises:
-            ValueError: an unknown joint, or one twice; or they do not hang together.
+            ValueError: a joint is unknown or repeated, or the joints do not form one tree.
         """
         renamed = list(joints.values()) if isinstance(joints, Mapping) else None
         chosen = []
@@ -185,18 +189,21 @@ class Kept:
 
     @classmethod
     def onto(cls, names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> Kept:
-        """The joints of a known skeleton, found by what their names mean; see `match`."""
+        """Select the joints of a known skeleton, which `match` finds by the meaning of their names."""
         return cls(tuple(match(names, skeleton, said)), skeleton.names, skeleton.parents)
 
     def motion(
         self, parents: Sequence[int], positions: np.ndarray, rotations: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-        """Their positions; and their rotations and offsets, or none where a bone between two of them bends.
+        """Return positions, rotations and offsets of the kept joints.
+
+        Rotations and offsets are None if the motion has no rotations, or if a bone between two kept joints is not
+        rigid.
 
         Args:
-            parents: of all joints.
+            parents: parents of all joints.
             positions: (F, J, 3) of all joints in metres.
-            rotations: (F, J, 4) of all joints against their parents, quaternions.
+            rotations: (F, J, 4) of all joints relative to their parents, as quaternions.
         """
         places = positions[:, list(self.joints)]
         if rotations is None:
@@ -205,7 +212,7 @@ class Kept:
         world = against_world(parents, local)[:, list(self.joints)]
         above = [joint if parent < 0 else parent for joint, parent in enumerate(self.parents)]
         seen = torch.from_numpy(places).double()
-        bones = (world[:, above].mT @ (seen - seen[:, above])[..., None]).squeeze(-1)  # as the parent sees them
+        bones = (world[:, above].mT @ (seen - seen[:, above])[..., None]).squeeze(-1)  # in the frame of the parent
         offsets, loose = offsets_of(self.parents, bones)
         if loose > RIGID:
             return places, None, None

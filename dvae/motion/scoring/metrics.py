@@ -1,14 +1,14 @@
 """Errors of forecast motion, as pure functions on arrays.
 
 The errors follow the evaluation code of DLow (Yuan and Kitani 2020, arXiv:2003.08386) and GSPS (Mao, Liu and Salzmann
-2021, arXiv:2108.08422); the median versions are those of HiT-DVAE (Bie et al. 2022, arXiv:2204.01565). They reward the
-best (or the median) of K samples and are not proper: a forecaster gains by spreading its samples. APDE and CMD are
-those of BeLFusion (Barquero, Escalera and Palmero 2023, arXiv:2211.14304); they ask for as much diversity and motion as
-real futures have.
+2021, arXiv:2108.08422); the median versions follow HiT-DVAE (Bie et al. 2022, arXiv:2204.01565). They reward the best
+(or the median) of K samples and are not proper: a forecaster gains by spreading its samples. APDE and CMD follow
+BeLFusion (Barquero, Escalera and Palmero 2023, arXiv:2211.14304); they require as much diversity and motion as real
+futures have.
 
-Shapes are those of `dvae.inference.evaluation.metrics`, with truths `(..., M, T, D)` where M futures are admissible. A
-displacement is the Euclidean norm over *all* D coordinates of a frame, in the unit of the data (metres); it is not a
-mean over joints. Where the last frame of a truth was not observed, the final error is at the last frame that was.
+Shapes are the same as in `dvae.inference.evaluation.metrics`; truths are `(..., M, T, D)` if M futures are admissible.
+A displacement is the Euclidean norm over *all* D coordinates of a frame, in the unit of the data (metres). It is not a
+mean over joints. If the last frame of a truth was not observed, the final error uses the last observed frame.
 """
 
 import torch
@@ -32,7 +32,7 @@ from ...inference.evaluation.references import distances, last_places
 
 
 def average_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """ADE: displacement averaged over the T frames, of the best of the K samples.
+    """Return the ADE: the displacement averaged over the T frames, of the best of the K samples.
 
     Args:
         samples: `(..., K, T, D)`.
@@ -45,40 +45,39 @@ def average_displacement_error(samples: Array, truth: Array) -> Tensor:
 
 
 def final_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """FDE: displacement at the last frame, of the sample that is best there. Shapes as in ADE."""
+    """Return the FDE: the displacement at the last frame, of the sample that is best there. Shapes as in ADE."""
     return per_window(over_observed(lambda x, y: displacement(x[:, -1], y[-1]).amin()), *as_pair(samples, truth))
 
 
 def median_average_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """ADEm: median over the K samples of the mean displacement (even K: mean of the middle two)."""
+    """Return the ADEm: the median over the K samples of the mean displacement (even K: mean of the middle two)."""
     return per_window(over_observed(lambda x, y: _median(displacement(x, y).mean(-1))), *as_pair(samples, truth))
 
 
 def median_final_displacement_error(samples: Array, truth: Array) -> Tensor:
-    """FDEm: median over the K samples of the final displacement (even K: mean of the middle two)."""
+    """Return the FDEm: the median over the K samples of the final displacement (even K: mean of the middle two)."""
     return per_window(over_observed(lambda x, y: _median(displacement(x[:, -1], y[-1]))), *as_pair(samples, truth))
 
 
 def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: bool = True) -> list[Tensor]:
-    """Multimodal ground truth: for every window, those that were in almost the same pose when their future began.
+    """Return the multimodal ground truth: for every window, the windows with almost the same last observed pose.
 
-    Two windows belong together when their last observed poses are at a Euclidean distance *below* the threshold, over
-    all coordinates; where some are missing, see `distances`. By default as in the evaluation of DLow (Yuan and Kitani
-    2020): a window belongs to itself, and one that nobody joins keeps its single truth and is scored like the others,
-    as every evaluation here does. (GSPS leaves such windows out of every metric, so that its published numbers are on a
-    subset.)
+    Two windows belong together if the Euclidean distance of their last observed poses is *below* the threshold, over
+    all coordinates; `distances` handles missing values. The default follows the evaluation of DLow (Yuan and Kitani
+    2020): a window belongs to itself. A window without others keeps its single truth and is scored like all windows, as
+    in every evaluation here. (GSPS leaves such windows out of every metric, so its published numbers are on a subset.)
 
     Args:
-        windows: N windows; the protocol says what is observed.
+        windows: N windows; their protocol defines the observed frames.
         threshold: largest distance (exclusive), in the unit of the data; 0.5 m in the papers.
-        itself: whether a window is among its own truths. Without, it may have none, and its multimodal errors are
+        itself: whether a window is among its own truths. If not, it may have no truth, and its multimodal errors are
             undefined.
 
     Returns:
         N index tensors `(M_n,)`, ascending; `futures[truths[n]]` are the truths `(M_n, T, D)` of window n.
 
     Raises:
-        ValueError: a threshold that is not positive.
+        ValueError: the threshold is not positive.
     """
     observed = windows.protocol.observed
     if not threshold > 0:
@@ -94,17 +93,17 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
 
 
 def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:
-    """How multimodal errors are to be read, for the caption of a table."""
+    """Return the explanation of multimodal errors for the caption of a table."""
     closer = f"all windows whose last poses are closer than {threshold:g} m{', itself included' if itself else ''}"
     return f"MM: over the futures of {closer}; {alone} of {windows} have no other"
 
 
 def multimodal_errors(samples: Array, truths: Array) -> Tensor:
-    """MMADE, MMFDE, MMADEm and MMFDEm at once: errors to each of M admissible futures, averaged over them.
+    """Return MMADE, MMFDE, MMADEm and MMFDEm: errors to each of M admissible futures, averaged over these futures.
 
     Args:
         samples: `(..., K, T, D)`.
-        truths: `(..., M, T, D)`, the futures that `multimodal_truths` finds, the true one among them.
+        truths: `(..., M, T, D)`, futures from `multimodal_truths`, including the true one.
 
     Returns:
         `(..., 4)`, in the unit of the data.
@@ -119,37 +118,37 @@ def multimodal_errors(samples: Array, truths: Array) -> Tensor:
 
 
 def multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMADE: the ADE to each of the admissible futures, averaged over them: `(...)`, see `multimodal_errors`."""
+    """Return the MMADE `(...)`: the ADE to each admissible future, averaged over these futures."""
     return multimodal_errors(samples, truths)[..., 0]
 
 
 def multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMFDE: the FDE to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    """Return the MMFDE: the FDE to each admissible future, averaged over these futures. Shapes as in MMADE."""
     return multimodal_errors(samples, truths)[..., 1]
 
 
 def median_multimodal_average_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMADEm: the ADEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    """Return the MMADEm: the ADEm to each admissible future, averaged over these futures. Shapes as in MMADE."""
     return multimodal_errors(samples, truths)[..., 2]
 
 
 def median_multimodal_final_displacement_error(samples: Array, truths: Array) -> Tensor:
-    """MMFDEm: the FDEm to each of the admissible futures, averaged over them. Shapes as in MMADE."""
+    """Return the MMFDEm: the FDEm to each admissible future, averaged over these futures. Shapes as in MMADE."""
     return multimodal_errors(samples, truths)[..., 3]
 
 
 def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
-    """APDE: |APD of the samples - APD of the M admissible futures| (BeLFusion).
+    """Return the APDE: |APD of the samples - APD of the M admissible futures| (BeLFusion).
 
-    Where the true future alone is admissible there is no diversity to compare with; paper and public code leave such
-    windows out of the mean, and the value is NaN.
+    If only the true future is admissible, it has no diversity, and the value is NaN. The paper and its public code
+    leave such windows out of the mean.
 
     Args:
         samples: `(..., K, T, D)`.
         truths: `(..., M, T, D)`, as for MMADE.
 
     Returns:
-        `(...)`, in the unit of the data; NaN for M = 1, and where no two truths have a number in common.
+        `(...)`, in the unit of the data; NaN if M = 1, or if no two truths have an observed value in common.
     """
 
     def score(x: Tensor, y: Tensor) -> Tensor:
@@ -159,11 +158,12 @@ def average_pairwise_distance_error(samples: Array, truths: Array) -> Tensor:
 
 
 def cumulative_motion_distance(motion: Array, real: Array) -> Tensor:
-    """CMD, the area between cumulative motion as forecast and at its real pace: sum_{t=1}^{T-1} (T - t) |M_t - M|.
+    """Return the CMD, the area between forecast and real cumulative motion: sum_{t=1}^{T-1} (T - t) |M_t - M|.
 
-    M_t is what joints move by from frame t to t + 1 of the T predicted ones, the mean over joints, samples and windows,
-    and M the mean of true motion over frames too. It is sum_i sum_{t<=i} |M_t - M| (BeLFusion): what goes wrong early
-    counts in all later frames. True motion itself, which has no steady pace, is not at 0.
+    M_t is the distance that joints move from frame t to t + 1 of the T predicted frames, averaged over joints, samples
+    and windows. M is the mean of the true motion, over frames too. The sum equals sum_i sum_{t<=i} |M_t - M|
+    (BeLFusion), so early errors count in all later frames. True motion does not have a CMD of 0, because its pace
+    varies.
 
     Args:
         motion: `(..., T - 1)`, M_1 to M_{T-1}.
@@ -183,16 +183,16 @@ def cumulative_motion_distance(motion: Array, real: Array) -> Tensor:
 
 
 def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: Tensor) -> tuple[float, ...]:
-    """The CMD of a set of windows, as a jackknife pseudo-value of each clip (see `jackknife_pseudo_values`).
+    """Return the CMD of a set of windows as a jackknife pseudo-value for each clip (`jackknife_pseudo_values`).
 
-    It is computed for each class of motion, and averaged with the classes' shares of the windows.
+    The CMD is computed for each class of motion, and averaged with weights proportional to the number of windows.
 
     Args:
-        motion: `(N, T - 1)`, what joints move by in the forecasts of each window; NaN where that cannot be compared. A
-            step of which no window tells counts as one at the true pace.
-        real: `(N,)`, and in its true future, over all frames.
-        classes: `(N,)`, whole numbers.
-        places: `(N,)`, the clip of every window, from 0 to C - 1.
+        motion: `(N, T - 1)`, motion of the joints in the forecasts of each window; NaN where it cannot be compared. A
+            step that is NaN in all windows counts as a step at the true pace.
+        real: `(N,)`, mean motion in the true future of each window, over all frames.
+        classes: `(N,)`, integer classes.
+        places: `(N,)`, clip of every window, from 0 to C - 1.
     """
 
     def distance(kept: Tensor) -> Tensor:
@@ -209,7 +209,7 @@ def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: 
 
 
 def _cross(samples: Tensor, truths: Tensor) -> Tensor:
-    """Displacement of each of (K, T, D) from each of (M, T, D), averaged over frames, and at the last: (2, K, M)."""
+    """Return displacements between (K, T, D) and (M, T, D), averaged over frames and at the last frame: (2, K, M)."""
 
     def both(apart: Tensor) -> Tensor:
         return torch.stack([apart.mean(0), apart[-1]])
@@ -218,7 +218,7 @@ def _cross(samples: Tensor, truths: Tensor) -> Tensor:
     if centre.isnan().any():
         each = over_observed(lambda x, y: both(displacement(x, y).T))
         return torch.stack([each(samples, truth) for truth in truths], -1)
-    # |x - y|^2 as products, as cdist has it but for its copies; about the centre the cancellation is harmless.
+    # |x - y|^2 by matrix products, like cdist without its copies. Centring keeps the cancellation harmless.
     x, y = ((frames - centre).transpose(0, 1) for frames in (samples, truths))
     squares = x.square().sum(-1)[:, :, None] + y.square().sum(-1)[:, None]
     return both(squares.baddbmm_(x, y.mT, alpha=-2).clamp_(min=0).sqrt_())

@@ -1,41 +1,42 @@
 """Scores of forecast motion, for `dvae.evaluate(models, windows, scores=dvae.motion.scores)`.
 
-The motion papers compare K futures with the true one in metres (`displacements`; definitions in
+Motion papers compare K futures with the true one in metres (`displacements`; definitions in
 `dvae.motion.scoring.metrics`). Their futures are means of the emission. Forecasts are therefore means by default
-(`Measure.of_means`), and the table says "mean emission"; `draw_emission=True` adds the noise of the emission. Where
-windows move through space (a protocol with root="relative"), these are of poses relative to their own root, as in
-TrajeVAE's evaluation; "global ADE" and "global FDE" are of all joints where they are in the world. Where the same
-joints' paths are given in all windows, "path error" is the mean distance of these joints from their paths, over all K
+(`Measure.of_means`), and the table says "mean emission"; `draw_emission=True` adds the noise of the emission. If
+windows include global motion (a protocol with root="relative"), these scores compare poses relative to their own root,
+as in TrajeVAE's evaluation. "global ADE" and "global FDE" compare all joints in world coordinates. If the paths of the
+same joints are given in all windows, "path error" is the mean distance of these joints from their paths, over all K
 futures.
 
-Two scores ask for as much diversity and motion as there really is (BeLFusion: Barquero, Escalera and Palmero 2023,
-arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, the mean over windows that share
-their last pose with another one. *CMD* (`cumulative_motion_distance`) is of what joints move by from frame to
-frame, for each class of motion and averaged by the classes' shares of the windows, as in the public code. A class is
-the label "content" of a clip; where clips have none, all windows are one class. The pace of a class is that of the true
-futures of the windows at hand, in the public code a constant for each of its data sets. CMD is a number of the whole
-set, with a jackknife over clips, and real motion, which has no steady pace, is not at 0. Where joints are missing, a
-joint counts in the steps at both ends of which it was observed, of futures as of the truth.
+Two scores compare diversity and motion with their true amounts (BeLFusion: Barquero, Escalera and Palmero 2023,
+arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, averaged over the windows whose
+last pose is shared by another window. *CMD* (`cumulative_motion_distance`) compares the motion of joints between
+frames. As in the public code, it is computed for each class of motion, and averaged with weights proportional to the
+number of windows. The class of a clip is its label "content"; without such labels, all windows form one class. The pace
+of a class is the pace of the true futures of the evaluated windows; the public code uses a constant for each of its
+data sets. CMD is one number for the whole set, with a jackknife over clips. Real motion does not score 0, because its
+pace varies. If joints are missing, a step of a joint counts only if the joint was observed in both frames, in futures
+as in the truth.
 
-Bodies have limb stretch, limb jitter and limb-angle errors (SkeletonDiffusion: Curreli et al. 2025, arXiv:2501.06035,
-equation 13). With l_t the length of a limb in frame t of a future, and m that in the true one, its mean over frames,
-*limb stretch* is mean_t |l_t - m| / m and *limb jitter* mean_t |l_{t+1} - l_t| / m, and with "RMS" the root of the mean
-square; all are means over limbs and futures. The public code has |mean_t l_t - m| / m for the mean stretch, in which
-what lengths vary by about their mean does not count; ours is the paper's. The *limb-angle error* is the mean over
-frames and joints of the error of the angle between a limb and the next one, of the future with the least, in degrees:
-the mean angle error (MAE) of the public code. Ours: shares and not hundredths, of all limbs, where the code leaves out
-those at the pelvis and has angles along chains of its own choice. The *bone-length error* compares with the observed
-frames. Bones that are shorter than `SHORTEST` in some window, whose ends some files have at one place, are in none of
-these, and a note says how many.
+Three scores measure the body: limb stretch, limb jitter and limb-angle error (SkeletonDiffusion: Curreli et al. 2025,
+arXiv:2501.06035, equation 13). Let l_t be the length of a limb in frame t of a future, and m its mean length over the
+frames of the true future. *Limb stretch* is mean_t |l_t - m| / m and *limb jitter* is mean_t |l_{t+1} - l_t| / m; the
+"RMS" versions use the root of the mean square. All are averaged over limbs and futures. For the mean stretch, the
+public code uses |mean_t l_t - m| / m, which ignores variation about the mean; we follow the paper. The *limb-angle
+error* is the error of the angle between adjacent limbs in degrees, averaged over frames and joints, of the best future.
+It is the mean angle error (MAE) of the public code. We report fractions instead of percentages, and use all limbs; the
+public code leaves out the limbs at the pelvis and uses angles along its own choice of chains. The *bone-length error*
+compares with the observed frames. Bones shorter than `SHORTEST` in some window are excluded from all these scores,
+because some files put both ends at one place. A note gives their number.
 
-*Jerk* is the mean over frames, joints and futures of the length of the third derivative of a joint's place, by third
-differences, in m/s³: that of a motion that shakes, or that does not go on as it was, is high, and that of one without
-movement low. The last three observed frames belong to it; that of real motion is in the table's notes.
+*Jerk* is the length of the third derivative of a joint's position, by third differences, in m/s³, averaged over frames,
+joints and futures. It is high for motion that shakes or does not continue the observed motion, and low for motion that
+stands still. The last three observed frames are included. The jerk of real motion is in the notes of the table.
 
-A classifier adds two scores under its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the share of the K futures
-that it gives the window's true class. *FID* is the Fréchet distance between its features of the true futures and of all
-K generated ones of all windows together, a number of the whole set, whose standard error is a jackknife over clips
-(`metrics.frechet_pseudo_values`).
+A classifier adds two scores with its name (Bie et al. 2022, arXiv:2204.01565). *ACC* is the fraction of the K futures
+that it assigns to the true class of the window. *FID* is the Fréchet distance between its features of the true futures
+and of all K generated ones of all windows. It is one number for the whole set; its standard error is a jackknife over
+clips (`metrics.frechet_pseudo_values`).
 """
 
 import hashlib
@@ -70,30 +71,30 @@ from .metrics import (
 )
 
 SEAM = 3
-"""Observed frames of which the jerk of a future is, too, so that it has that of the seam."""
+"""Number of observed frames included in the jerk, so that it covers the transition to the future."""
 TOGETHER = 64
-"""Windows, one after the other, whose multimodal ground truths are compared together: they have many in common."""
+"""Number of consecutive windows whose ground truths are compared together, because they share many futures."""
 
 
 def scores(
     windows: HeldOutWindows, pose_prior: Any = None, classifiers: Mapping[str, Any] | None = None
 ) -> list[Measure]:
-    """The scores of the motion papers, for these windows alone.
+    """Return the scores of the motion papers for these windows.
 
-    What they rest on (the ground truth of the multimodal errors, the features of the true futures) is found here, once
-    for all models.
+    Reference values (the ground truth of the multimodal errors, the features of the true futures) are computed once
+    here, for all models. The returned scores are therefore valid for these windows only.
 
     Args:
-        windows: those that are evaluated on.
-        pose_prior: a fitted pose prior, to score single poses of the forecasts: minus the mean log density of the
+        windows: windows of the evaluation.
+        pose_prior: fitted pose prior that scores single poses of the forecasts: minus the mean log density of the
             flow's z, without the log-determinant (the NLL of GSPS, arXiv:2108.08422).
-        classifiers: `{name: fitted action classifier}`, to score futures by what they show: "ACC name" and "FID name",
-            and a reference row of real motion. Fitted under the same protocol, they saw no test clip.
+        classifiers: `{name: fitted action classifier}`, for the scores "ACC name" and "FID name" and a reference row of
+            real motion. Classifiers must be fitted under the same protocol and without test clips.
 
     Raises:
-        TypeError: windows of no skeleton.
-        ValueError: windows whose skeleton, frames or labels are not those of a classifier, or too few for normal fits
-            to its features; or whose observed frames are not those of the pose prior.
+        TypeError: the windows have no skeleton.
+        ValueError: the skeleton, frames or labels of the windows do not match a classifier; there are too few windows
+            for normal fits to its features; or the observed frames do not match the pose prior.
     """
     if not isinstance(windows, Windows | Exchanged):
         raise TypeError(
@@ -126,20 +127,20 @@ _MEDIAN = (
     Measure("FDEm", paired(median_final_displacement_error), "m"),
 )
 _MULTIMODAL = ("MMADE", "MMFDE", "MMADEm", "MMFDEm")
-"""In the order of `multimodal_errors`."""
+"""Names in the order of `multimodal_errors`."""
 
 
 def displacements(
     windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x, threshold: float | None = None
 ) -> list[Measure]:
-    """Diversity, errors of the best and of the median future, and proper scores, in metres; of arrays, too.
+    """Return diversity, errors of the best and of the median future, and proper scores, in metres; also for arrays.
 
     Args:
-        windows: among which multimodal ground truth is found, unless poses were exchanged: windows that begin like
-            such a pose go on from others.
-        body: what of frames (..., T, D) is compared.
-        threshold: distance below which last observed frames are alike, in the unit of the data; by default the
-            protocol's `multimodal_threshold`, or 0.5 where it has none, as in the papers.
+        windows: windows for the multimodal ground truth. Exchanged windows have none, because windows that begin with
+            the exchanged pose have other paths.
+        body: function that selects the compared part of frames (..., T, D).
+        threshold: distance below which last observed frames count as the same, in the unit of the data; default: the
+            protocol's `multimodal_threshold`, or else 0.5, as in the papers.
     """
 
     def of_body(measure: Measure) -> Measure:
@@ -148,7 +149,7 @@ def displacements(
 
         return replace(measure, function=function, unit="m", of_means=True)
 
-    diversity = lru_cache(maxsize=1)(metrics.average_pairwise_distance)  # for all scores of a batch
+    diversity = lru_cache(maxsize=1)(metrics.average_pairwise_distance)  # shared by all scores of a batch
 
     def energy(forecasts: Tensor, truth: Tensor, *_: Any) -> Tensor:
         return metrics.energy_score(forecasts, truth, None if truth.isnan().any() else diversity(forecasts))
@@ -165,7 +166,7 @@ def _multimodal(
     diversity: Callable[[Tensor], Tensor],
     threshold: float | None,
 ) -> list[Measure]:
-    """Errors averaged over the futures of all windows in almost the same pose, and the APDE."""
+    """Return errors averaged over the futures of all windows in almost the same pose, and the APDE."""
     threshold = getattr(windows.protocol, "multimodal_threshold", 0.5) if threshold is None else threshold
     truths = multimodal_truths(windows, threshold)
     futures = body(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :])
@@ -173,7 +174,7 @@ def _multimodal(
     said: dict[str, Any] = {"threshold": threshold, "itself": True, "alone": lonely}
     shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
 
-    @lru_cache(maxsize=1)  # for all scores of a batch
+    @lru_cache(maxsize=1)  # shared by all scores of a batch
     def errors(forecasts: Tensor, index: Tensor) -> Tensor:
         pairs = zip(forecasts, index.tolist(), strict=True)
         return torch.stack([multimodal_errors(window, futures[truths[n]]) for window, n in pairs])
@@ -198,11 +199,11 @@ def _multimodal(
 
 
 def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
-    """The APD of each of some sets of futures; sets have many pairs in common, whose distance is found once.
+    """Return the APD of each of several sets of futures; distances of pairs that sets share are computed once.
 
     Args:
         futures: (N, T, D).
-        sets: which of them; of one future alone the diversity is NaN.
+        sets: indices of the futures in each set; the APD of a single future is NaN.
     """
     among = torch.cat([*sets]).unique()
     rows = futures[among].flatten(1).double()
@@ -210,7 +211,7 @@ def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
     if centre.isnan().any():
         apds = [metrics.average_pairwise_distance(futures[held]) if len(held) > 1 else None for held in sets]
         return torch.stack([futures.new_tensor(math.nan) if apd is None else apd for apd in apds])
-    rows = rows - centre  # or distances that are small beside the rows would blur in products
+    rows = rows - centre  # otherwise distances that are small compared with the rows lose precision in products
     products = rows @ rows.T
     squares = products.diagonal()
     apart = (squares[:, None] + squares).sub_(products, alpha=2).clamp_(min=0).sqrt_().fill_diagonal_(0.0)
@@ -220,9 +221,9 @@ def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
 
 
 def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
-    """Frames (..., T, D) relative to their own root, which is left out."""
+    """Return a function that makes frames (..., T, D) relative to their own root and drops the root."""
 
-    @lru_cache(maxsize=2)  # of forecasts and futures, for all scores of a batch
+    @lru_cache(maxsize=2)  # for forecasts and futures, shared by all scores of a batch
     def body(x: Tensor) -> Tensor:
         joints = x.unflatten(-1, (-1, 3))
         return skeleton.without_root(joints - joints[..., skeleton.root, None, :]).flatten(-2)
@@ -243,7 +244,7 @@ def _path_error(windows: Windows | Exchanged) -> Measure:
 
 
 def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
-    """The bones that have a length in every window, as places among `Skeleton.edges`, and a note on the others."""
+    """Return the bones with a length in every window, as indices into `Skeleton.edges`, and a note on the others."""
     lengths = mean_of_known(windows.skeleton.bone_lengths(windows.positions(Batch(windows.all()).mask_to_nan())), 1)
     short = (lengths < SHORTEST).any(0)
     note = f"limbs and bone lengths: {int(short.sum())} of {len(short)} bones are shorter than {SHORTEST:g} m; left out"
@@ -251,7 +252,7 @@ def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
 
 
 def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Measure]:
-    """Errors of bone lengths, stretch and jitter of limbs, and errors of the angles between them."""
+    """Return errors of bone lengths, stretch and jitter of limbs, and errors of the angles between them."""
     skeleton = windows.skeleton
 
     edges = [skeleton.edges[bone] for bone in bones]
@@ -260,22 +261,22 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
     first, second = ([pair[side] for pair in pairs] for side in (0, 1))
 
     def limbs(x: Tensor) -> Tensor:
-        """(3, limbs, ..., T) of frames (..., T, D)."""
+        """Return limb vectors (3, limbs, ..., T) of frames (..., T, D)."""
         joints = _coordinates(windows.positions(x).flatten(-2))
         return joints.index_select(1, indices(ends, x)) - joints.index_select(1, indices(starts, x))
 
-    @lru_cache(maxsize=1)  # of forecasts, for all scores of a batch
+    @lru_cache(maxsize=1)  # for forecasts, shared by all scores of a batch
     def lengths(x: Tensor) -> Tensor:
-        """(B, limbs, ..., T)."""
+        """Return limb lengths (B, limbs, ..., T)."""
         return torch.stack([_norm(limbs(window)) for window in x])
 
     @lru_cache(maxsize=1)
     def relative(forecasts: Tensor, truth: Tensor) -> Tensor:
-        """Errors (B, limbs, K, T) of lengths, in those of the truth."""
+        """Return relative errors (B, limbs, K, T) of lengths."""
         return lengths(forecasts) / mean_of_known(lengths(truth), -1)[..., None, None] - 1
 
     def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
-        """The mean over limbs and futures of a score (B, limbs, K) of relative errors."""
+        """Average a score (B, limbs, K) of relative errors over limbs and futures."""
         return lambda forecasts, truth, past, index: mean_of_known(score(relative(forecasts, truth)), (1, 2))
 
     scores: dict[str, Callable[[Tensor], Tensor]] = {
@@ -295,7 +296,7 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
     found = [Measure(name, function, "relative", **shared) for name, function in functions.items()]
 
     def angles(x: Tensor) -> Tensor:
-        """(pairs, ..., T)."""
+        """Return angles between limbs, (pairs, ..., T)."""
         vectors = limbs(x)
         u, v = (vectors.index_select(1, indices(each, x)) for each in (first, second))
         return torch.atan2(_norm(_cross(u, v)), (u * v).sum(0)).rad2deg()
@@ -309,26 +310,26 @@ def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Me
 
 
 def _coordinates(x: Tensor) -> Tensor:
-    """Joints (..., T, D) with their coordinates first, (3, D / 3, ..., T): numbers that are alike lie side by side."""
+    """Return joints (..., T, D) as (3, D / 3, ..., T), so that equal coordinates are contiguous."""
     found: Tensor = x.unflatten(-1, (-1, 3)).movedim((-1, -2), (0, 1)).contiguous()
     return found
 
 
 def _norm(vectors: Tensor) -> Tensor:
-    """(...) of vectors (3, ...): in a third of the time of torch's norm over a first dimension, or less."""
+    """Return norms (...) of vectors (3, ...), at least three times as fast as torch's norm over the first dimension."""
     x, y, z = vectors
     found: Tensor = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
     return found
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
-    """Cross products of vectors (3, ...)."""
+    """Return cross products of vectors (3, ...)."""
     (a, b, c), (x, y, z) = first, second
     return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
-    """CMD, class by class."""
+    """Return the CMD, computed class by class."""
     label = "content"
     try:
         labels = windows.labels(label)
@@ -339,7 +340,7 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
     body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
 
     def moved(x: Tensor) -> Tensor:
-        """What joints move by, (B, ..., T - 1), of frames (B, ..., T, D)."""
+        """Return mean steps of the joints, (B, ..., T - 1), of frames (B, ..., T, D)."""
         steps = (_norm(_coordinates(window).diff(dim=-1)) for window in body(x))
         return torch.stack([mean_of_known(each, 0) for each in steps]).double()
 
@@ -360,12 +361,12 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
 
 
 def _jerk(windows: Windows | Exchanged) -> Measure:
-    """How joints shake, the seam included."""
+    """Return the jerk, including the transition from the observed frames."""
     body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
     start = max(windows.protocol.observed - SEAM, 0)
 
     def jerk(x: Tensor) -> Tensor:
-        """(B, ...) of frames (B, ..., T, D)."""
+        """Return the jerk (B, ...) of frames (B, ..., T, D)."""
         changes = (_norm(_coordinates(window).diff(n=3, dim=-1)) for window in body(x))
         return torch.stack([mean_of_known(each, (0, -1)) for each in changes]) * windows.protocol.fps**3
 
@@ -379,7 +380,7 @@ def _jerk(windows: Windows | Exchanged) -> Measure:
 
 
 def _where_true(forecasts: Tensor, truth: Tensor) -> Tensor:
-    """Forecasts (B, K, T, D), NaN where the truth (B, T, D) was not observed."""
+    """Return forecasts (B, K, T, D), NaN where the truth (B, T, D) was not observed."""
     missing = truth.isnan()
     return forecasts.masked_fill(missing[:, None], torch.nan) if missing.any() else forecasts
 
@@ -401,7 +402,7 @@ def _pose_nll(prior: Any, observed: int) -> Measure:
 
 
 def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[Measure | None, Measure]:
-    """ACC, where a class of some window is known, and FID."""
+    """Return the ACC, if the class of some window is known, and the FID."""
     if windows.missing:
         raise ValueError(
             f"ACC and FID {name} are of features of whole futures, but these windows lack joints; leave the classifier "
@@ -416,7 +417,7 @@ def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[M
     note += f"; {unknown} of {len(labels)} windows are of no class it knows" if unknown else ""
     shared: Any = {"truth": "real motion", "note": note, "basis": basis}
 
-    @lru_cache(maxsize=1)  # for both scores of a batch
+    @lru_cache(maxsize=1)  # shared by both scores of a batch
     def features(futures: Tensor) -> Tensor:
         with reproducibly(classifier, 0):
             found: Tensor = classifier.features(on_device_of(classifier, {"x": futures})["x"])
@@ -440,10 +441,10 @@ def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[M
 
 
 def _labels(name: str, classifier: Any, windows: Windows | Exchanged) -> list[str]:
-    """The true labels of windows that suit a classifier.
+    """Return the true labels of windows that match a classifier.
 
     Raises:
-        ValueError: windows that do not.
+        ValueError: the windows do not match the classifier.
     """
     size = 3 * len(windows.joints)
     if windows.skeleton != classifier.skeleton or size != classifier.size:

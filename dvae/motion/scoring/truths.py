@@ -1,17 +1,18 @@
-"""Pseudo ground truth: futures of other people that a window in almost the same pose might have had as well.
+"""Pseudo ground truth: plausible alternative futures of a window, taken from other windows in almost the same pose.
 
 Mao, Liu and Salzmann, 2021, "Generating smooth pose sequences for diverse human motion prediction" (GSPS),
-arXiv:2108.08422. The candidates are windows of the training clips, kept as unit limb directions d and posed with the
-limb lengths of the window x that asks. Of these,
+arXiv:2108.08422. The candidates are windows of the training clips. They are stored as unit limb directions d, and posed
+with the limb lengths of the window x. A candidate is admissible if
 
     |last observed pose of candidate - last observed pose of x| < threshold          over all coordinates
     mean joint distance of candidate's future from x's          >= minimum           so that near copies drop out
 
-at most `most`, drawn without replacement, follow the observed frames of x.
+At most `most` admissible candidates, drawn without replacement, follow the observed frames of x.
 
-Candidates are tried in random order until enough of them meet the conditions. Matrix products with candidates of
-average limb lengths sort out most of the others beforehand: a mean of distances over frames is at most their root mean
-square, and other limb lengths move a joint by no more than the sum of the differences on its way to the root.
+Candidates are tried in random order until enough of them meet the conditions. Most of the others are excluded in
+advance by matrix products with candidates of average limb lengths. This is valid for two reasons: a mean of distances
+over frames is at most their root mean square, and other limb lengths move a joint by at most the sum of the differences
+along its path to the root.
 """
 
 from __future__ import annotations
@@ -26,23 +27,23 @@ from ...data.sequences import bridged
 from ..data.protocols import Windows
 from ..geometry.views import Heading
 
-_ROUNDING = 1e-3  # of |x|, by which a distance from matrix products may be off in single precision
+_ROUNDING = 1e-3  # relative to |x|: bounds the error of distances from matrix products in single precision
 
 
 class PseudoTruths:
-    """Further futures of training windows, found among the training clips.
+    """Alternative futures of training windows, found among the training clips.
 
     Args:
-        windows: whose clips they are taken from, and whose protocol says what is observed.
-        threshold: metres, distance of last observed poses, as vectors, below which futures are shared.
-        minimum: metres, mean joint distance that a future keeps from the window's own.
-        most: M, the largest number of futures of a window.
-        stride: frames between the starts of candidates in a clip; the paper has 20, on HumanEva-I 15.
-        heading: compare people as if all faced the same way when the future begins: candidates are turned about the
-            up axis so that their last observed frame has heading zero, and windows are expected as `turn` gives them.
+        windows: windows whose clips provide the futures; their protocol defines the observed frames.
+        threshold: maximum distance of last observed poses, as vectors, in metres.
+        minimum: minimum mean joint distance from the window's own future, in metres.
+        most: M, maximum number of futures per window.
+        stride: frames between the starts of candidates in a clip; the paper uses 20, and 15 on HumanEva-I.
+        heading: compare poses independently of heading. Candidates are rotated about the up axis so that their last
+            observed frame has heading zero; windows must be rotated in the same way by `turn`.
 
     Raises:
-        ValueError: numbers out of range, windows without a future, or a heading that the skeleton does not tell.
+        ValueError: a number is out of range, the windows have no future, or the skeleton does not define a heading.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class PseudoTruths:
         parents, root = windows.skeleton.parents, windows.skeleton.root
         nodes = [joint for joint in range(len(parents)) if windows.protocol.root != "drop" or joint != root]
         self._root = nodes.index(root) if root in nodes else None
-        self._limbs = torch.eye(len(nodes))  # limb vectors = _limbs @ joints; the root's is its own position
+        self._limbs = torch.eye(len(nodes))  # limb vectors = _limbs @ joints; for the root, its own position
         for node, joint in enumerate(nodes):
             if parents[joint] in nodes:
                 self._limbs[node, nodes.index(parents[joint])] = -1
@@ -81,7 +82,7 @@ class PseudoTruths:
         x = bridged(listed["x"], listed.mask())[:, self._observed - 1 :]
         self._average = self._lengths(x[:, 0].unflatten(-1, (-1, 3))).mean(0)
         self._last = torch.empty(len(x), len(nodes) * 3)
-        self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # so that products and sums run over rows
+        self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # products and sums run along rows
         for block in torch.arange(len(x)).split(512):
             joints = (Heading(self._skeleton).face(x[block]) if heading else x[block]).unflatten(-1, (-1, 3))
             lengths = self._lengths(joints)
@@ -91,27 +92,27 @@ class PseudoTruths:
         self._squares = self._futures.square().sum((2, 3))
 
     def __len__(self) -> int:
-        """The number of candidates."""
+        """Return the number of candidates."""
         return len(self._last)
 
     def turn(self, x: Tensor) -> Tensor:
-        """Windows (..., T, D), turned about the up axis so that the last observed frame has heading zero."""
+        """Return windows (..., T, D), rotated about the up axis so that the last observed frame has heading zero."""
         return Heading(self._skeleton, self._observed).face(x)
 
     def of(self, x: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Further futures of windows.
+        """Return alternative futures of windows.
 
         Args:
-            x: (B, T, D) float32, drawn from the windows; with `heading` turned as `turn` does.
-            generator: its state decides which are taken where there are more than M, and stays as it is, so that the
-                windows drawn next are the same with and without this.
+            x: (B, T, D) float32, drawn from the windows; rotated by `turn` if `heading` is set.
+            generator: random generator for the choice among more than M futures. Its state is not changed, so that the
+                windows drawn next are the same with and without pseudo ground truth.
 
         Returns:
-            (B, M, T, D), the observed frames of x followed by another future, and (B, M) whether there is one; zeros
-            where there is none.
+            (B, M, T, D), the observed frames of x followed by an alternative future, and (B, M), whether it is valid.
+            Invalid entries are zeros.
 
         Raises:
-            ValueError: x of another shape.
+            ValueError: x has another shape.
         """
         expected = (self._windows.length, self._windows.size)
         if x.ndim != 3 or x.shape[1:] != expected:
@@ -122,7 +123,7 @@ class PseudoTruths:
         own = torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator.clone_state())))
         order = torch.rand(len(x), len(self), generator=own)
         order.masked_fill_(~self._possible(now, future, lengths), torch.inf)
-        # Limb vectors of average lengths, stretched, and put together again.
+        # computes limb vectors of average length, rescales them, and assembles the poses again
         posing = self._chains @ ((lengths / self._average.clamp(min=1e-9))[:, :, None] * self._limbs)
 
         pseudo = x.new_zeros(len(x), self.most, *expected)
@@ -149,7 +150,7 @@ class PseudoTruths:
         return pseudo, valid
 
     def _possible(self, now: Tensor, future: Tensor, lengths: Tensor) -> Tensor:
-        """(B, N) candidates that may meet the conditions; no other one does."""
+        """Return (B, N), whether a candidate may meet the conditions; all others are excluded for certain."""
         off = (lengths - self._average).abs() @ self._chains.T
         size = now.unflatten(-1, (-1, 3)).norm(dim=-1)
         slack = (off + _ROUNDING * size).norm(dim=-1, keepdim=True)
@@ -165,7 +166,7 @@ class PseudoTruths:
         return possible
 
     def _lengths(self, joints: Tensor) -> Tensor:
-        """Limb lengths (..., n) of poses (..., n, 3); one for a root, which keeps its place."""
+        """Return limb lengths (..., n) of poses (..., n, 3); 1 for a root, which keeps its position."""
         lengths: Tensor = (self._limbs @ joints).norm(dim=-1)
         if self._root is not None:
             lengths[..., self._root] = 1
@@ -177,8 +178,8 @@ class WithPseudoTruths:
     """Training windows drawn together with their pseudo ground truth.
 
     Args:
-        windows: to draw from.
-        truths: where further futures come from.
+        windows: windows to draw from.
+        truths: source of alternative futures.
     """
 
     windows: Windows
@@ -186,15 +187,15 @@ class WithPseudoTruths:
 
     @property
     def fingerprint(self) -> str:
-        """That of the windows."""
+        """Fingerprint of the windows."""
         return self.windows.fingerprint
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Draw windows as `Windows.sample` does, turned to heading zero where `truths.heading` says so.
+        """Draw windows like `Windows.sample`, rotated to heading zero if `truths.heading` is set.
 
         Returns:
-            "x" (B, T, D), "pseudo" (B, M, T, D) and "valid" (B, M), as of `PseudoTruths.of`; "mask" where joints may be
-            missing, whose gaps are bridged before futures are exchanged.
+            "x" (B, T, D), "pseudo" (B, M, T, D) and "valid" (B, M), as from `PseudoTruths.of`. If joints may be
+            missing, also "mask"; missing values are interpolated before the search for futures.
         """
         batch = self.windows.sample(batch_size, generator)
         x = bridged(batch["x"], batch.mask())
