@@ -2,7 +2,7 @@
 
 All rotations are right-handed, act on column vectors, are batched over leading dimensions and differentiable. The
 conversions use roma (Brégier 2021, arXiv 2103.16317), which is imported only when needed because its import is as slow
-as that of torch.
+as the import of torch.
 
 Derivatives of conversions to matrices are always correct. Derivatives of conversions from matrices are correct except
 where a form is discontinuous: a quaternion changes sign where another of its components becomes the largest; a vector

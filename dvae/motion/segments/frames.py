@@ -45,7 +45,8 @@ ORIGIN = "origin"
 ROUNDS = 4
 """Iterations that correct the loss of interpolation to N frames and back; each halves the loss at least.
 
-Largest errors over 91 frames of bandai2 and cmu8 at 30 a second: 4 and 13 mm before, .2 and .7 mm after."""
+For segments of 91 frames of bandai2 and cmu8 at 30 frames a second, the largest errors fall from 4 and 13 mm to .2
+and .7 mm."""
 
 STEADY = 1e-3
 """Smallest standard deviation of a rotation component; smaller values are replaced by it."""
@@ -172,9 +173,8 @@ class TimedFrames:
             motion: clips with rotations, at any frame rate.
 
         Returns:
-            A batch: x (B, N, D), and the information that `back` needs: the heading (B,) in radians and the origin (B,
-                3) in
-            metres of first frames, and the body as offsets (B, J, 3) of its rest pose.
+            A batch of x (B, N, D) and the information that `back` needs: the heading (B,) in radians and the origin
+            (B, 3) in metres of first frames, and the body as offsets (B, J, 3) of its rest pose.
 
         Raises:
             ValueError: a clip has no rotations, only one frame, or another skeleton.

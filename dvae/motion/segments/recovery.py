@@ -79,7 +79,7 @@ class Recovered:
 
     @property
     def errors(self) -> dict[str, Tensor]:
-        """Errors (B,) if the truth is known: of vertices in metres, frame by frame of chi, and of durations in seconds."""
+        """Errors (B,) if the truth is known: of vertices in metres, per frame of chi, and of durations in seconds."""
         if self.truth is None:
             return {}
         model, (x, shape), truth = self.found.model, (self.found.x, self.found.shape), self.truth
