@@ -68,7 +68,7 @@ def read_amass(path: str | Path) -> Recording:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is not from AMASS, or damaged.
+        ValueError: the file has another layout, or is damaged.
     """
     path = Path(path)
     with archive(path) as members:

@@ -56,7 +56,7 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
 
 
 def alignment(local: np.ndarray) -> tuple[np.ndarray, float]:
-    """Align a sequence with each frame of a reference, at a pace from half to twice its pace.
+    """Align a sequence with a reference, at a pace from half to twice the pace of the reference.
 
     Steps are one frame in both, or one in one and two in the other. First and last frames are matched.
 
