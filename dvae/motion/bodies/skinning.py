@@ -24,8 +24,8 @@ UNTOLD = 1e-5
 class Body(nn.Module):
     """A surface on a tree of joints, with shape parameters. Metres, y up, facing +z.
 
-    Its tensors are non-persistent buffers and never part of a state dict: the file of a body may have a restrictive
-    licence, and must not be distributed with the weights of a model.
+    Its tensors are non-persistent buffers and never part of a state dict. The file of a body may have a restrictive
+    licence, and must then not be distributed with the weights of a model.
 
     Args:
         names: joint names.
