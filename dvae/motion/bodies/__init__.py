@@ -1,5 +1,4 @@
-"""Bodies with a surface: linear blend skinning, a low-polygon person made by code, files in the layout of `smplx`, and
-motion put onto them.
+"""Bodies with a surface: linear blend skinning, a low-polygon person, `smplx` files, and fitting of motion.
 
 >>> person = dvae.motion.bodies.human()
 >>> unturned = torch.eye(3).expand(2, 5, person.joints, 3, 3)

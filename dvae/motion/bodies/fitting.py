@@ -1,19 +1,20 @@
-"""Motion put onto a body: the turns of its own joints, its place, and the parameters of its shape.
+"""Fit motion to a body: the rotations of its joints, its position, and its shape parameters.
 
-What a source has are places of joints, which anatomy names and every source puts elsewhere. So no joint is pulled to
-where the source has it. Turns are taken from what means the same on any skeleton, against the same on the body at rest:
+Sources contain positions of joints, but every source places joints differently in the anatomy. Joints are therefore not
+pulled to the positions in the source. Instead, rotations are computed from directions that mean the same on any
+skeleton, relative to the same directions of the body at rest:
 
-* **pelvis**: the line through the hips, and the way from their middle to where the spine begins.
-* **chest**: the line through the clavicles, or else the shoulders, and the way from where the spine begins to the
-  neck. Joints of the spine share the turn between pelvis and chest evenly, and are then turned together so that the
-  neck is in its direction (in cmu8, 12 mm off instead of 28).
-* **limbs**: along their bones. About itself, a thigh or an upper arm is turned as little as possible against the trunk
-  while it is stretched, and as its hinge says where knee or elbow is bent.
-* **neck**: along the way to the head. **Ankles**: along the way to the toes, less how steep that is in a foot that
-  stands flat.
-* **Ends**, and joints that the source lacks, stay against their parents as they rest.
+* **pelvis**: the line through the hips, and the direction from their midpoint to the start of the spine.
+* **chest**: the line through the clavicles, or else the shoulders, and the direction from the start of the spine to the
+  neck. The joints of the spine share the rotation between pelvis and chest evenly. They are then rotated together so
+  that the neck has the right direction (in cmu8, this reduces its error from 28 to 12 mm).
+* **limbs**: along their bones. The twist of a thigh or an upper arm is minimal relative to the trunk while the limb is
+  straight, and follows its hinge when the knee or elbow is bent.
+* **neck**: towards the head. **Ankles**: towards the toes, minus the slope of a foot that stands flat.
+* **Joints without children**, and joints that the source does not have, keep their rest rotation relative to the
+  parent.
 
-The middle of the hips is where the source has it.
+The midpoint of the hips is at its position in the source.
 """
 
 from __future__ import annotations
@@ -41,50 +42,50 @@ from ..segments.frames import AT_ONCE, resting_offsets
 from .skinning import Body
 
 WITHIN = 0.01
-"""Metres by which a length of a body may be off for what a parameter of 1 costs."""
+"""Deviation of a length in metres that costs as much as a parameter value of 1."""
 
 MOST = 3.0
-"""Of a fitted parameter, either way; one person in four hundred has more."""
+"""Bound on the absolute value of a fitted parameter; one person in four hundred exceeds it."""
 
 SAME = 1e-3
-"""Metres within which lengths are of one body, and joints at rest those of a shape."""
+"""Tolerance in metres within which lengths belong to the same body, and joints at rest to the same shape."""
 
 STRETCHED = 0.25
-"""Sine of a knee's or an elbow's bend at which it says as much of how its limb is turned about itself as the trunk."""
+"""Sine of the bend of a knee or elbow at which hinge and trunk have equal influence on the twist of the limb."""
 
 STILL = 0.15
-"""Metres a second, below which ankle and toes are those of a foot that stands flat."""
+"""Speed in metres a second below which ankle and toes belong to a foot that stands flat."""
 
 APART = 0.03
-"""Metres between clavicles of which each begins at its side; others begin in the middle, and tell no girdle."""
+"""Minimum distance in metres between clavicles; closer ones begin in the middle of the body and are ignored."""
 
 ALIKE = 0.5
-"""Cosine between bones at rest from which turns against two rest poses mean the same; arms that hang are at 0."""
+"""Minimum cosine between bones at rest for rotations to be comparable between two rest poses; hanging arms are at 0."""
 
 _LIMBS = {"hip knee ankle": (1.0, 0.0, 0.0), "shoulder elbow wrist": (0.0, -1.0, 0.0)}
-"""Of the left side, and the axis about which they bend at rest, where the right one's is mirrored."""
+"""Limbs of the left side, and the axis about which they bend at rest; it is mirrored for the right side."""
 
 _NEEDED = ["pelvis", *(f"{side} {part}" for limb in _LIMBS for part in limb.split() for side in "lr")]
 
 
 def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> MotionSet:
-    """Motion on the joints of a body, with its turns; how is said at the head of this file.
+    """Fit motion to the joints of a body; the documentation of this module describes how.
 
-    Motion on these joints whose turns are from about the same rest pose, as AMASS's are, keeps its turns.
+    Motion on these joints, with rotations from a similar rest pose (e.g. from AMASS), keeps its rotations.
 
     Args:
-        motion: on any skeleton with pelvis, hips, knees, ankles, shoulders, elbows and wrists.
-        body: such as `human()`.
-        shapes: its parameters, one for all clips (S,) or one each (N, S), such as `betas`; by default they are fitted
-            to the lengths of bones, and the same for all clips in which these are.
+        motion: motion on any skeleton with pelvis, hips, knees, ankles, shoulders, elbows and wrists.
+        body: target body, such as `human()`.
+        shapes: shape parameters, (S,) for all clips or (N, S), e.g. from `betas`. Default: fitted to the bone lengths,
+            equal for all clips with the same lengths.
 
     Returns:
-        The same clips with y up: positions of the body's joints in metres, and rotations. `shapes_of` says whose they
-        are; the rest pose of the skeleton is that of the mean of them. The translation of the body is the place of its
-        root less that at rest.
+        The same clips with y up, with positions of the body's joints in metres, and rotations. `shapes_of` returns the
+        shape parameters. The rest pose of the skeleton belongs to the mean shape. The translation of the body is the
+        position of its root minus its position at rest.
 
     Raises:
-        ValueError: a joint that is needed is not there, or missing in a frame; or shapes do not fit.
+        ValueError: a required joint is missing in the skeleton or in a frame, or the shapes have a wrong size.
     """
     if lacking := [clip for clip in motion if np.isnan(clip.positions).any()]:
         raise ValueError(
@@ -110,7 +111,7 @@ def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> Motio
     alike = zip(np.cumsum(frames) // AT_ONCE, whose, each.tolist(), strict=True)
 
     def turns() -> Iterator[tuple[Tensor, Tensor]]:
-        """Of clips one after the other, found for several of one body at once."""
+        """Yield rotations and root positions of each clip, computed for several clips of one body at once."""
         for _, together in groupby(enumerate(alike), key=itemgetter(1)):
             some = [n for n, _ in together]
             marks = {part: torch.cat([seen[n][part] for n in some]) for part in seen[0]}
@@ -121,30 +122,30 @@ def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> Motio
 
 
 def shapes_of(motion: MotionSet, body: Body) -> Tensor:
-    """Parameters (N, S) of the bodies of clips that `fitted` or `retargeted` made, or `TimedFrames` brought back.
+    """Return shape parameters (N, S) of clips from `fitted`, `retargeted` or `TimedFrames.back`.
 
-    They are told by where joints are from their parents; see `Body.shape_of`. Of other motion they mean nothing.
+    They are computed from the offsets of joints by `Body.shape_of`. For other motion they are meaningless.
 
     Raises:
-        ValueError: the clips are on other joints, or have no rotations.
+        ValueError: the clips have other joints, or no rotations.
     """
     _check(motion, body)
     return body.shape_of(resting_offsets(motion))
 
 
 def retargeted(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
-    """The same turns on other bodies, whose places are scaled about the origin.
+    """Return the same rotations on other bodies, with positions scaled about the origin.
 
-    That is by the height of the root above the soles at rest. So speeds, in lengths of legs, are the same; and whoever
-    stood on a floor of height 0 stands on it.
+    The scale is the ratio of the heights of the root above the soles at rest. Speeds in leg lengths are therefore
+    preserved, and people who stand on a floor at height 0 still do.
 
     Args:
-        motion: on the body's joints, as from `fitted`.
-        body: the same.
-        shapes: its parameters, one for all clips (S,) or one each (N, S).
+        motion: motion on the body's joints, e.g. from `fitted`.
+        body: body of the motion.
+        shapes: new shape parameters, (S,) for all clips or (N, S).
 
     Raises:
-        ValueError: the clips are on other joints, or have no rotations; or shapes do not fit.
+        ValueError: the clips have other joints or no rotations, or the shapes have a wrong size.
     """
     _check(motion, body)
     each = _shapes(shapes, motion, body)
@@ -156,12 +157,12 @@ def retargeted(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
 
 
 def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
-    """What AMASS's files say of shapes, (N, S): the first parameters of each clip's label `betas`.
+    """Return the shape parameters in AMASS's files, (N, S): the first values of each clip's label `betas`.
 
-    They are of the body that the files were fitted with, SMPL-H as a rule (`read_body`), and of no other.
+    They are valid only for the body that the files were fitted with, usually SMPL-H (`read_body`).
 
     Raises:
-        ValueError: a clip has none, or fewer.
+        ValueError: a clip has no betas, or too few.
     """
     found = []
     for clip in motion:
@@ -176,13 +177,13 @@ def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
 
 
 class _Source(NamedTuple):
-    """Which joints of a skeleton and of a body mean the same.
+    """Corresponding joints of a skeleton and of a body.
 
     Attributes:
-        there: joints of the skeleton by part, of those parts that both have.
+        there: joints of the skeleton by part, for the parts that both have.
         own: joints of the body.
-        waist, top: where the spine begins and ends.
-        girdle: what is on both sides of the chest.
+        waist, top: parts where the spine begins and ends.
+        girdle: part on both sides of the chest.
     """
 
     there: Mapping[str, int]
@@ -193,14 +194,15 @@ class _Source(NamedTuple):
 
     @classmethod
     def of(cls, motion: MotionSet, body: Body) -> _Source:
-        """By what names mean."""
+        """Match the joints by the meaning of their names."""
         skeleton, pose = motion.skeleton, motion.clips[0].positions[0]
         there, own = parts(skeleton.names), parts(body.names)
         if {"l clavicle", "r clavicle"} <= there.keys():
             ends = [there.pop(f"{side} clavicle") for side in "lr"]
             if np.linalg.norm(pose[ends[0]] - pose[ends[1]]) > APART:
                 there |= {"l clavicle": ends[0], "r clavicle": ends[1]}
-        for part, higher in (("neck", "upperneck"), ("head", "headtop")):  # with two of them, the lower is in the chest
+        # if there are two, the lower one is in the chest
+        for part, higher in (("neck", "upperneck"), ("head", "headtop")):
             there |= {part: there[higher]} if higher in there else {}
         for what, found, names, needed in (
             (f"skeleton {skeleton.name!r}", there, skeleton.names, _NEEDED),
@@ -221,11 +223,11 @@ class _Source(NamedTuple):
         )
 
     def seen(self, places: Tensor) -> dict[str, Tensor]:
-        """Places (..., 3) by part, of those of the skeleton's joints (..., J, 3)."""
+        """Return positions (..., 3) by part, from the skeleton's joints (..., J, 3)."""
         return _marks(places, self.there)
 
     def lengths(self, marks: Mapping[str, Tensor]) -> Tensor:
-        """Of limbs (the mean of both sides), of widths, and of the trunk to shoulders and top, (..., 8) in metres."""
+        """Return lengths (..., 8) in metres: limbs (mean of both sides), widths, trunk to shoulders and to top."""
 
         def length(start: str, end: str) -> Tensor:
             found: Tensor = (marks[end] - marks[start]).norm(dim=-1)
@@ -238,7 +240,7 @@ class _Source(NamedTuple):
         return torch.stack([*limbs, *widths, *trunk], -1)
 
     def shape(self, body: Body, lengths: Tensor) -> Tensor:
-        """Parameters (S,) of the body of about these lengths (8,)."""
+        """Return the shape parameters (S,) of a body with approximately these lengths (8,)."""
         size = body.parameters_of_shape
         average, *units = _joints(body, torch.cat([lengths.new_zeros(1, size), torch.eye(size).to(lengths)]))
         changes = torch.stack(units, -1) - average[..., None]
@@ -250,7 +252,7 @@ class _Source(NamedTuple):
         return torch.from_numpy(scipy.optimize.least_squares(off, np.zeros(size), bounds=(-MOST, MOST)).x)
 
     def steepness(self, seen: Iterable[Mapping[str, Tensor]], fps: float) -> Tensor:
-        """Angle from ankles down to the toes of feet that stand flat; NaN where none does."""
+        """Return the median angle of descent from ankles to toes for feet that stand flat; NaN if none does."""
         found = [torch.zeros(0, dtype=torch.float64)]
         if self.there.keys() >= {"l toe", "r toe"}:
             for marks in seen:
@@ -262,13 +264,13 @@ class _Source(NamedTuple):
         return every.median() if len(every) else every.new_tensor(torch.nan)
 
     def turns(self, body: Body, seen: Mapping[str, Tensor], joints: Tensor, steep: Tensor) -> tuple[Tensor, Tensor]:
-        """Local rotations (F, J, 3, 3) of a clip, and places of its root (F, 3).
+        """Return local rotations (F, J, 3, 3) of a clip, and positions of its root (F, 3).
 
         Args:
-            body: with its joints at rest.
-            seen: places by part, (F, 3) each.
-            joints: (J, 3).
-            steep: see `steepness`.
+            body: target body.
+            seen: positions by part, (F, 3) each.
+            joints: (J, 3), joints of the body at rest.
+            steep: result of `steepness`.
         """
         rest, parents, root = _marks(joints, self.own), body.parents, body.parents.index(-1)
 
@@ -280,13 +282,13 @@ class _Source(NamedTuple):
         world = {root: across("hip", "hips", self.waist)}
 
         def carried(joint: int) -> Tensor:
-            """Its turn, or that of what carries it."""
+            """Return the world rotation of a joint, or of its nearest ancestor with one."""
             while joint not in world:
                 joint = parents[joint]
             return world[joint]
 
         def point(start: str, end: str, resting: Tensor | None = None) -> None:
-            """Turn a part so that another is in its direction, as little as possible."""
+            """Rotate a part by the smallest rotation that aligns it with the direction to another part."""
             turn, bone = carried(self.own[start]), rest[end] - rest[start] if resting is None else resting
             world[self.own[start]] = (
                 swing(turn @ normalize(bone, dim=-1), normalize(seen[end] - seen[start], dim=-1)) @ turn
@@ -327,13 +329,13 @@ class _Source(NamedTuple):
 
 
 def _marks(places: Tensor, joints: Mapping[str, int]) -> dict[str, Tensor]:
-    """Places (..., 3) by part, and the middles of hips and shoulders, of places (..., J, 3)."""
+    """Return positions (..., 3) by part, and the midpoints of hips and shoulders, from joints (..., J, 3)."""
     marks = {part: places[..., joint, :] for part, joint in joints.items()}
     return marks | {f"{part}s": (marks[f"l {part}"] + marks[f"r {part}"]) / 2 for part in ("hip", "shoulder")}
 
 
 def _turn(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
-    """The rotation (..., 3, 3) of one vector onto another, and of two more as near to each other as that leaves."""
+    """Return the rotation (..., 3, 3) that maps one vector onto another, and a second pair as closely as possible."""
     frames = []
     for first, second in (start, end):
         first = normalize(first, dim=-1)
@@ -343,18 +345,18 @@ def _turn(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
 
 
 def _down(bones: Tensor) -> Tensor:
-    """Angle of bones (..., 3) below the horizontal."""
+    """Return the angle of bones (..., 3) below the horizontal."""
     return torch.atan2(-bones[..., 1], bones[..., [0, 2]].norm(dim=-1))
 
 
 def _sloping(bone: Tensor, angle: Tensor) -> Tensor:
-    """A bone (3,) whose direction is so far below the horizontal."""
+    """Return a unit vector in the horizontal direction of a bone (3,), at this angle below the horizontal."""
     ahead = normalize(bone * bone.new_tensor([1.0, 0, 1]), dim=-1)
     return ahead * angle.cos() - bone.new_tensor([0.0, 1, 0]) * angle.sin()
 
 
 def _bodies(motion: MotionSet) -> list[list[int]]:
-    """The places of clips in which bones have the same lengths."""
+    """Group the indices of clips with the same bone lengths."""
     groups: list[tuple[Tensor, list[int]]] = []
     for n, clip in enumerate(motion):
         lengths = motion.skeleton.bone_lengths(tensor_of(clip.positions).double()).mean(0)
@@ -367,12 +369,12 @@ def _bodies(motion: MotionSet) -> list[list[int]]:
 
 
 def _joints(body: Body, shapes: Tensor) -> Tensor:
-    """Places (N, J, 3) of bodies (N, S) at rest with the root at 0."""
+    """Return joint positions (N, J, 3) of bodies (N, S) at rest with the root at 0."""
     return resting(body.parents, body.offsets(shapes))
 
 
 def standing(body: Body, shapes: Tensor) -> Tensor:
-    """Heights (N,) of the root above the soles of bodies (N, S) at rest, in metres, float64."""
+    """Return heights (N,) of the root above the soles of bodies (N, S) at rest, in metres, float64."""
     found = []
     for some in shapes.to(body.template).split(256):
         vertices, joints = body.at_rest(some)
@@ -381,7 +383,7 @@ def standing(body: Body, shapes: Tensor) -> Tensor:
 
 
 def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
-    """(N, S), float64, of one for all or one each."""
+    """Return shapes (N, S), float64, expanded to all clips."""
     size = body.parameters_of_shape
     if shapes.shape not in ((size,), (len(motion), size)):
         raise ValueError(
@@ -391,7 +393,7 @@ def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
 
 
 def _kept(motion: MotionSet, body: Body) -> Tensor:
-    """Parameters (N, S) of motion that has the body's turns: those that joints tell, or else of about these lengths."""
+    """Return shapes (N, S) of motion that has the body's rotations: from joint offsets, or else from bone lengths."""
     source, found = _Source.of(motion, body), []
     for offsets in resting_offsets(motion):
         shape = body.shape_of(offsets)
@@ -402,14 +404,14 @@ def _kept(motion: MotionSet, body: Body) -> Tensor:
 
 
 def _turns(clip: Clip, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
-    """Local rotations (F, J, 3, 3) of a clip, and places of its root (F, 3)."""
+    """Return local rotations (F, J, 3, 3) of a clip, and positions of its root (F, 3)."""
     assert clip.rotations is not None
     local = to_matrix(tensor_of(clip.rotations).double(), "quaternion")
     return local, tensor_of(clip.positions[:, skeleton.root]).double()
 
 
 def _turned_alike(motion: MotionSet, body: Body) -> bool:
-    """Whether turns are those of the body's joints, from about its rest pose."""
+    """Return whether the rotations belong to the body's joints and refer to a similar rest pose."""
     skeleton = motion.skeleton
     if not skeleton.rest or any(clip.rotations is None for clip in motion):
         return False
@@ -429,7 +431,7 @@ def _check(motion: MotionSet, body: Body) -> None:
 
 
 def _y_up(motion: MotionSet) -> MotionSet:
-    """Motion with y up, turned about x; rest poses are as they are, in which nothing is said of the world."""
+    """Return motion with y up, rotated about x; the rest pose does not depend on the world and is not changed."""
     if motion.skeleton.up == "y":
         return motion
     turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
@@ -445,7 +447,7 @@ def _y_up(motion: MotionSet) -> MotionSet:
 
 
 def _made(motion: MotionSet, body: Body, shapes: Tensor, turns: Iterable[tuple[Tensor, Tensor]]) -> MotionSet:
-    """Clips of bodies (N, S) with local rotations (F, J, 3, 3) and places of the root (F, 3)."""
+    """Return clips on bodies (N, S) with local rotations (F, J, 3, 3) and root positions (F, 3)."""
     offsets, clips = body.offsets(shapes), []
     for clip, bones, (local, place) in zip(motion, offsets, turns, strict=True):
         quaternions = continuous(from_matrix(local, "quaternion")).numpy()

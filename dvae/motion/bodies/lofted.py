@@ -1,12 +1,13 @@
-"""A person made by code: closed parts lofted along the bones of SMPL's 22 joints, and eight parameters of shape.
+"""A person defined by code: closed parts lofted along the bones of SMPL's 22 joints, and eight shape parameters.
 
-A part is a chain of rings of vertices, closed at either end about the ring's middle. Where a ring is, and how wide, is
-linear in the lengths of bones and in girths, and these in the parameters; so are vertices, whose changes are therefore
-blend shapes. About each joint lies a ring, of which the two vertices at its sides have the joint in their middle:
-that is the regressor.
+A part is a chain of rings of vertices, closed at both ends around the centre of the ring. The position and width of a
+ring are linear in bone lengths and girths, which are linear in the parameters. The vertices are therefore linear too,
+and their changes are blend shapes. Around each joint is a ring with two opposite vertices whose midpoint is the joint;
+these vertices define the regressor.
 
-At 1, a parameter makes a person differ about as much as one in six does. These are numbers of ours, for a body that
-looks human, and not fitted to people. With all of them between -3 and 3, no part turns inside out.
+A parameter value of 1 is roughly one standard deviation: about one person in six differs as much. The numbers are our
+own choice for a body that looks human; they are not fitted to people. If all parameters are between -3 and 3, no part
+turns inside out.
 """
 
 from __future__ import annotations
@@ -24,19 +25,22 @@ from .measures import enclosed_volume
 from .skinning import Body
 
 SHAPE = ("size", "girth", "legs", "arms", "torso", "shoulders", "hips", "head")
-"""The parameters of shape, in order. Size is of everything, the head's of the head, girth of all else; legs, arms and
-torso are lengths, shoulders and hips are widths."""
+"""The shape parameters, in order.
+
+Size scales everything, head scales the head, and girth scales the widths and depths of all else. Legs, arms and
+torso are lengths; shoulders and hips are widths."""
 
 MARKERS = {
     **{"forehead": 381, "breastbone": 184, "back": 193, "sacrum": 67},
     **{"L_shoulder": 1057, "L_elbow": 1108, "L_wrist": 1153, "L_knee": 529, "L_heel": 918, "L_toes": 919},
     **{"R_shoulder": 1251, "R_elbow": 1302, "R_wrist": 1347, "R_knee": 713, "R_heel": 1028, "R_toes": 1029},
 }
-"""Vertices of `human()` where markers of motion capture would be: on top of shoulders, behind elbows, on the back of
-wrists, in front of knees."""
+"""Vertices of `human()` at typical marker positions.
+
+They are on top of shoulders, behind elbows, on the back of wrists, and in front of knees."""
 
 _SIZE = 0.04
-_LENGTHS = {  # parameter: share, along which axes, of which bones, named by their ends
+_LENGTHS = {  # parameter: factor, axes, bones (named by their ends)
     "legs": (0.045, "xyz", ("Knee", "Ankle")),
     "arms": (0.045, "xyz", ("Elbow", "Wrist", "Palm", "Fingers", "Thumb")),
     "torso": (0.045, "y", ("Spine1", "Spine2", "Spine3", "Neck", "Collar")),
@@ -44,14 +48,14 @@ _LENGTHS = {  # parameter: share, along which axes, of which bones, named by the
     "hips": (0.06, "x", ("Hip",)),
     "head": (0.05, "xyz", ("Head", "Crown", "Nose")),
 }
-_GIRTHS = {  # parameter: share, of widths and depths, of rings of which parts, about bones that begin at
+_GIRTHS = {  # parameter: factors of width and depth, parts, starts of bones
     "girth": (0.1, 0.1, ("trunk", "leg", "arm"), ()),
     "shoulders": (0.05, 0.0, ("trunk",), ("Spine2", "Spine3")),
     "hips": (0.05, 0.0, ("trunk",), ("Pelvis",)),
     "head": (0.05, 0.05, ("head", "nose"), ()),
 }
 
-_OFFSETS = {  # metres from the parent of a person of 1.7 m; of what there is twice, the left one, towards +x
+_OFFSETS = {  # metres from the parent, for a person of 1.7 m; paired joints: the left one, at +x
     "Hip": (0.088, -0.085, 0.0),
     "Spine1": (0.0, 0.105, -0.01),
     "Knee": (0.008, -0.395, 0.005),
@@ -66,7 +70,7 @@ _OFFSETS = {  # metres from the parent of a person of 1.7 m; of what there is tw
     "Elbow": (0.265, 0.0, -0.005),
     "Wrist": (0.25, 0.0, 0.005),
 }
-_ENDS = {  # of bones beyond the last joint: the joint that they move with, and where they are from it
+_ENDS = {  # ends of bones after the last joint: their joint, and the offset from it
     "Crown": ("Head", (0.0, 0.19, 0.01)),
     "Nose": ("Head", (0.0, 0.045, 0.110)),
     "Heel": ("Ankle", (0.0, -0.04, -0.055)),
@@ -81,17 +85,17 @@ _BONES = {
     for name, parent in zip(JOINTS, PARENTS, strict=True)
     if parent >= 0 and not name.startswith("R_")
 } | _ENDS
-"""In the middle and on the left, by what is at their ends: from where, and by how much."""
+"""Bones in the middle and on the left, by their ends: start and offset."""
 
 
 class _Ring(NamedTuple):
-    """About a point of a bone.
+    """A ring of vertices around a point of a bone.
 
     Attributes:
-        start, end: of the bone.
-        along: where on the bone it is, 0 at its start and 1 at its end.
-        width: half of it, metres.
-        front, back: its depth in the direction of its second axis and against it, metres.
+        start, end: ends of the bone.
+        along: position on the bone, 0 at its start and 1 at its end.
+        width: half width in metres.
+        front, back: depth in the positive and negative direction of the second axis, in metres.
     """
 
     start: str
@@ -106,10 +110,10 @@ class _Part(NamedTuple):
     """A chain of rings.
 
     Attributes:
-        around: vertices of a ring, an even number.
-        axes: of width and depth.
-        paired: whether there is one on the right, too; these numbers are the left one's.
-        rings: from one end to the other.
+        around: number of vertices of a ring, even.
+        axes: axes of width and depth.
+        paired: whether the part also exists on the right; the numbers are for the left.
+        rings: rings from one end to the other.
     """
 
     around: int
@@ -207,14 +211,16 @@ _PARTS = {
 }
 # fmt: on
 _MOST = 4
-"""Joints that a vertex goes with, at most."""
+"""Maximum number of joints that move a vertex."""
 
 _REACH = 0.015
-"""Metres by which a bone is further than the nearest one where a vertex goes with it e times less."""
+"""Additional distance of a bone, in metres, at which its skinning weight is smaller by a factor of e."""
 
 
 def human() -> Body:
-    """The person: SMPL's 22 joints, the parameters `SHAPE`, arms to the sides, and the pelvis at the origin.
+    """Return the bundled person, with SMPL's 22 joints and the parameters `SHAPE`.
+
+    At rest, its arms point to the sides, and its pelvis is at the origin.
 
     Example:
         >>> tall = human().at_rest(torch.tensor([2.0, 0, 0, 0, 0, 0, 0, 0]))[0]
@@ -226,7 +232,7 @@ def human() -> Body:
 
 @cache
 def _made() -> tuple[Tensor, ...]:
-    """Template, shapes, regressor, weights and faces, once."""
+    """Return template, shapes, regressor, weights and faces; computed once."""
     average = _vertices(torch.zeros(len(SHAPE), dtype=torch.float64))
     changes = [_vertices(unit) - average for unit in torch.eye(len(SHAPE), dtype=torch.float64)]
     faces, weights = [], []
@@ -248,17 +254,17 @@ def _made() -> tuple[Tensor, ...]:
 
 
 def _sided() -> list[tuple[str, str]]:
-    """Parts by name and side, in the order of vertices."""
+    """Return the parts by name and side, in the order of vertices."""
     return [(name, side) for name, part in _PARTS.items() for side in (("L_", "R_") if part.paired else ("",))]
 
 
 def _joint(name: str, side: str) -> int | None:
-    """The joint of a name on a side or in the middle; none for an end that is no joint."""
+    """Return the index of a joint by its name, with or without the side; None for an end that is not a joint."""
     return next((JOINTS.index(known) for known in (name, side + name) if known in JOINTS), None)
 
 
 def _places(parameters: Tensor) -> dict[str, Tensor]:
-    """Of joints and ends in the middle and on the left, (3,) each."""
+    """Return positions (3,) of joints and ends in the middle and on the left."""
     shape = dict(zip(SHAPE, parameters, strict=True))
     places = {"Pelvis": parameters.new_zeros(3)}
     for name, (parent, offset) in _BONES.items():
@@ -271,7 +277,7 @@ def _places(parameters: Tensor) -> dict[str, Tensor]:
 
 
 def _vertices(parameters: Tensor) -> Tensor:
-    """Those of a person with parameters (8,), (V, 3): of each part ring after ring, then the middles of both ends."""
+    """Return the vertices (V, 3) of a person with parameters (8,): each part's rings, then the centres of its ends."""
     places = _places(parameters)
     found = []
     for name, side in _sided():
@@ -283,7 +289,7 @@ def _vertices(parameters: Tensor) -> Tensor:
 
 
 def _ring(name: str, ring: _Ring, places: Mapping[str, Tensor], parameters: Tensor) -> Tensor:
-    """The vertices of a ring of a part, (around, 3)."""
+    """Return the vertices of a ring of a part, (around, 3)."""
     around, axes, *_ = _PARTS[name]
     shape = dict(zip(SHAPE, parameters, strict=True))
     grown = (1 + _SIZE * shape["size"]).repeat(2)  # width and depth
@@ -299,7 +305,7 @@ def _ring(name: str, ring: _Ring, places: Mapping[str, Tensor], parameters: Tens
 
 
 def _triangles(rings: int, around: int) -> Tensor:
-    """Of a chain of rings with a middle at either end, (F, 3)."""
+    """Return the triangles (F, 3) of a chain of rings with a centre at both ends."""
     place = torch.arange(rings * around).reshape(rings, around)
     after = place.roll(-1, 1)
     low, low_after, high, high_after = place[:-1], after[:-1], place[1:], after[1:]
@@ -314,15 +320,15 @@ def _triangles(rings: int, around: int) -> Tensor:
 
 
 def _weights(part: _Part, side: str, vertices: Tensor) -> Tensor:
-    """How much vertices (V, 3) of a part go with each joint (V, J), by their distances to what hangs from it.
+    """Return skinning weights (V, J) of the vertices (V, 3) of a part, from their distances to the bones of each joint.
 
-    They go with the joints about whose bones the part's rings lie, and with the one that the first of these hangs from.
+    The joints are those whose bones carry the part's rings, and the parent of the first one.
     """
     places = _places(vertices.new_zeros(len(SHAPE)))
     joints = list(dict.fromkeys(_BONES[ring.start][0] if ring.start in _ENDS else ring.start for ring in part.rings))
     if joints[0] in _BONES:
         joints.insert(0, _BONES[joints[0]][0])
-    mirrored = torch.cat([vertices[:, :1].abs(), vertices[:, 1:]], -1)  # as places are on the left
+    mirrored = torch.cat([vertices[:, :1].abs(), vertices[:, 1:]], -1)  # positions are defined on the left
     distances = []
     for joint in joints:
         bones = [places[end] for end, (start, _) in _BONES.items() if start == joint]
@@ -334,7 +340,7 @@ def _weights(part: _Part, side: str, vertices: Tensor) -> Tensor:
 
 
 def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:
-    """Of points (V, 3) to a segment, (V,)."""
+    """Return the distances (V,) of points (V, 3) from a segment."""
     bone = end - start
     along = ((points - start) @ bone / bone.square().sum()).clamp(0, 1)
     distances: Tensor = (points - start - along[:, None] * bone).norm(dim=-1)

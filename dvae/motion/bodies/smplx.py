@@ -1,8 +1,8 @@
-"""Bodies in files as `smplx` reads them (Pavlakos et al. 2019, arXiv 1904.05866): SMPL, SMPL-H and SMPL-X as npz.
+"""Bodies in files of `smplx` (Pavlakos et al. 2019, arXiv 1904.05866): SMPL, SMPL-H and SMPL-X as npz.
 
-The files are their users', under licences of their own; none comes with this. What is read are six plain arrays: the
-template, its changes by shape, the regressor of joints, weights, the tree and faces. Pickled members are never opened,
-and corrections by pose, expressions and soft tissue are left out.
+Users must obtain the files themselves, under their own licences. Six plain arrays are read: template, changes by shape,
+joint regressor, weights, tree and faces. Pickled members are never opened. Pose corrections, expressions and soft
+tissue are ignored.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from ..files.smpl import JOINTS, PARENTS
 from .skinning import Body
 
 LARGEST = 2**27
-"""Bytes of an array that is read; the largest of SMPL-X has three quarters of it."""
+"""Maximum size of an array in bytes; the largest of SMPL-X has three quarters of it."""
 
 MOST_VERTICES = 2**17
-"""SMPL-X has a twelfth of them."""
+"""Maximum number of vertices; SMPL-X has a twelfth of it."""
 
 FURTHEST = 1e3
-"""Of a body's numbers, none of which is more in metres or shares."""
+"""Maximum absolute value in a body; metres and weights are smaller."""
 
-_MEMBERS: dict[str, tuple[str | int, ...]] = {  # and their axes: vertices, shape parameters, joints, faces
+_MEMBERS: dict[str, tuple[str | int, ...]] = {  # member -> its axes: vertices, shape parameters, joints, faces
     "v_template": ("V", 3),
     "shapedirs": ("V", 3, "S"),
     "J_regressor": ("J", "V"),
@@ -38,16 +38,16 @@ _MEMBERS: dict[str, tuple[str | int, ...]] = {  # and their axes: vertices, shap
 def read_body(path: str | Path, shapes: int = 8) -> Body:
     """Read a model file, npz, of SMPL, SMPL-H or SMPL-X.
 
-    The body has the 22 joints of trunk and limbs that these share. Fingers, jaw and eyes are not turned, and what is
-    not turned moves with the joint that it hangs from: their weights are that one's.
+    The body has the 22 joints of trunk and limbs that these models share. Fingers, jaw and eyes are not rotated: their
+    weights are added to the joint that they descend from.
 
     Args:
-        path: the file.
-        shapes: how many parameters of shape to keep, the first of the file's.
+        path: model file.
+        shapes: number of shape parameters, the first ones of the file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is damaged, larger than any body, or no body.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is damaged, too large, or not a body.
     """
     path = Path(path)
     with archive(path) as members:
@@ -71,7 +71,7 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
 
 
 def _defect(found: dict[str, np.ndarray], shapes: int) -> str:
-    """Why arrays are no body; nothing if they are one."""
+    """Return the reason why arrays are not a body, or an empty string if they are."""
     sizes: dict[str | int, int] = {2: 2, 3: 3}
     for name, axes in _MEMBERS.items():
         array, whole = found[name], name in ("kintree_table", "f")

@@ -212,7 +212,7 @@ class MotionSet:
 
     Raises:
         ValueError: a clip has NaN although `missing` is not set, wrong joints, a wrong shape or implausible units; two
-            clips have the same key; or there are no clips.
+            clips have the same key; or `clips` is empty.
     """
 
     clips: Sequence[Clip]

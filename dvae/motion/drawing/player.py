@@ -1,8 +1,8 @@
-"""Moving skeletons on a page of HTML or in a notebook, small and without a library: to play, to scrub, to turn.
+"""Interactive animations of skeletons in HTML pages and notebooks, small and without a library: play, seek, rotate.
 
-A scene is stored as whole numbers of a millimetre: the observed frames, which all people share, then each one's future,
-as steps from frame to frame; a joint that lacks is at `MISSING`. Of these numbers of 16 bits first all low bytes and
-then all high ones are deflated and written in base64: 50 futures of a window take about 100 kB.
+A scene is stored as integers in millimetres: the observed frames, which all people share, then the future of each, as
+differences between frames. A missing joint is stored as `MISSING`. Of these 16-bit numbers, first all low bytes and
+then all high bytes are deflated and encoded in base64: 50 futures of a window take about 100 kB.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ..geometry.skeleton import Skeleton
 from .plot import FIXED, PAST, Scene, staged
 
 SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
-"""What moves all players of a page."""
+"""Script that animates all players of a page."""
 
 MILLIMETRE = 1e-3
 
 MISSING = -32768
-"""In place of coordinates that nobody knows."""
+"""Replaces unknown coordinates."""
 
 _PLAYER = Markup(
     '<div class="player" data-motion="{motion}">'
@@ -47,14 +47,14 @@ _OPTION = Markup('<option value="{}">{}</option>')
 
 
 def player(scenes: Mapping[str, Scene]) -> Markup:
-    """Scenes by title, one of which is shown at a time; the page needs `SCRIPT` once."""
+    """Return the HTML of scenes by title, shown one at a time; the page must contain `SCRIPT` once."""
     motion = json.dumps(list(map(_scene, scenes.values())), separators=(",", ":"), allow_nan=False)
     windows = Markup().join(_OPTION.format(place, title) for place, title in enumerate(scenes))
     return _PLAYER.format(motion=motion, windows=windows)
 
 
 def _scene(stage: Scene) -> dict[str, Any]:
-    """A scene as the script reads it, its coordinates packed."""
+    """Return a scene in the format of the script, with packed coordinates."""
     motion = stage.motion[:, stage.shown]
     observed = sum(frame <= stage.now for frame in stage.shown)
     low, high = stage.low, stage.high
@@ -87,25 +87,27 @@ def _scene(stage: Scene) -> dict[str, Any]:
 
 
 def _packed(steps: np.ndarray) -> str:
-    """Whole numbers modulo 2^16, in which sums of steps come out right."""
+    """Encode integers modulo 2^16; sums of differences are still correct."""
     planes = steps.astype(np.int64).astype("<u2").view(np.uint8).reshape(-1, 2).T
     return base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()
 
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """Skeletons that move side by side. A notebook shows it; `save` writes a page that any browser plays offline.
+    """Skeletons that move next to each other.
+
+    Notebooks display the animation; `save` writes a page that any browser plays offline.
 
     Args:
-        scene: the people.
-        title: above them.
+        scene: scene with the people.
+        title: title above the scene.
     """
 
     scene: Scene
     title: str = ""
 
     def to_html(self) -> str:
-        """Return the page, which loads nothing and runs no script but the player's."""
+        """Return the page, which loads nothing and runs only the player's script."""
         allowed = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
         moving = player({self.title or "motion": self.scene})
         return str(_PAGE.format(title=self.title, policy=allowed, player=moving, script=Markup(SCRIPT)))
@@ -136,7 +138,7 @@ class Animation:
         return figure
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
-        """Return the player for notebooks, and the last frame where they cannot play it."""
+        """Return the player for notebooks, and the last frame as a fallback."""
         png = io.BytesIO()
         self.still().savefig(png, format="png")
         page = Markup('<iframe srcdoc="{}" style="width:100%;height:30em;border:0"></iframe>').format(self.to_html())
@@ -181,26 +183,26 @@ def animate(
     view: float = pi / 5,
     title: str = "",
 ) -> Animation:
-    """Return skeletons that move side by side, to play, scrub and turn: the true motion, and sampled futures.
+    """Return an animation of skeletons to play, seek and rotate: the true motion, and sampled futures.
 
-    All repeat the observed motion in black and go on in the colours of `plot.futures`, seen from the same side. Time
-    zero is the last observed pose.
+    All people repeat the observed motion in black and continue in the colours of `plot.futures`, seen from the same
+    side. Time zero is the last observed pose.
 
     Args:
-        skeleton: the tree.
+        skeleton: skeleton of the poses.
         observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
-        samples: (K, H, J, 3) in metres; without them the observed motion is played alone, from time zero.
-        truth: (F, J, 3) in metres, where it is known; F is at most H.
-        names: what to call the K samples; by default they are numbered.
-        fixed: joints that move alike in all samples; bones that end in them are drawn dark and thick.
-        every: frames from one that is shown to the next, the last observed always among them; by default so that
-            about 25 a second are shown. The speed is the motion's own.
-        view: radians between the last observed heading and the viewer, before the scene is turned.
-        title: above the figure.
+        samples: (K, H, J, 3) in metres; without them, only the observed motion is shown, from time zero.
+        truth: (F, J, 3) in metres, if known; F is at most H.
+        names: names of the K samples; default: numbers.
+        fixed: joints that move in the same way in all samples; bones that end in them are dark and thick.
+        every: number of frames between shown frames, which include the last observed one; default: about 25 shown
+            frames a second. The speed is not changed.
+        view: angle in radians between the last observed heading and the viewer at the start.
+        title: title above the figure.
 
     Raises:
-        ValueError: the shapes do not fit each other or the skeleton, there is nothing to draw, a position is not
-            finite, or names, fixed or every do not fit the motion.
+        ValueError: the shapes do not match each other or the skeleton, an array is empty, a position is not finite, or
+            names, fixed or every do not match the motion.
     """
     scene = staged(skeleton, observed, samples, truth, names=names, fixed=fixed, every=every, view=view)
     return Animation(scene, title)

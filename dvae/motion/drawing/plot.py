@@ -1,4 +1,4 @@
-"""Figures of skeletons and bodies: poses, observed motion with its possible futures, surfaces."""
+"""Figures of skeletons and bodies: poses, observed motion with possible futures, and surfaces."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..geometry.skeleton import Skeleton, rotate_about_up
 PAST, TRUTH, FIXED, GIVEN, SKIN = "black", "#1a7f37", "#4a4f57", "#cf222e", "#c3b2a1"
 
 SPACING = 1.15
-"""Metres between the skeletons of a figure."""
+"""Distance in metres between the skeletons of a figure."""
 
 LIGHT = np.array([-0.5, -0.6, 0.63])
 """Direction of the light on surfaces: from the left, the front and above."""
@@ -41,12 +41,12 @@ def pose(
     """Draw poses, (J, 3) or several at once (..., J, 3), seen from the front of a person with heading zero.
 
     Args:
-        ax: where to draw; metres on both axes.
+        ax: axes in metres.
         positions: metres, numpy or torch.
-        skeleton: the tree.
-        at: added to the horizontal and vertical coordinates of the drawing.
-        azimuth: radians by which the people are turned about the up axis before they are drawn.
-        **line: passed on to matplotlib's LineCollection, such as colors, linewidths, alpha.
+        skeleton: skeleton of the poses.
+        at: offset of the horizontal and vertical coordinates of the drawing.
+        azimuth: rotation of the people about the up axis in radians.
+        **line: options of matplotlib's LineCollection, such as colors, linewidths, alpha.
     """
     poses = torch.as_tensor(np.asarray(positions), dtype=torch.float64).reshape(-1, skeleton.joints, 3)
     turned = rotate_about_up(poses, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
@@ -56,7 +56,7 @@ def pose(
 
 
 def bare(ax: Axes) -> None:
-    """As wide as it is high, without a frame and marks."""
+    """Set an equal aspect ratio, and remove frame and ticks."""
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_yticks([])
@@ -74,30 +74,28 @@ def futures(
     view: float = pi / 5,
     paths: Mapping[str, Any] | None = None,
 ) -> Axes:
-    """Observed motion and sampled futures, as skeletons from left to right over time.
+    """Draw observed motion and sampled futures, as skeletons from left to right over time.
 
-    (Longer than other functions by what is drawn, one thing after the other.)
-
-    The past is black, the truth green, each sample has a colour of its own through time. Every pose is drawn
-    relative to its pelvis, all from the same side: the last observed pose is seen from the front, turned by
-    `view`. Where joints were given paths, these are crosses, and all of a frame is drawn relative to one place, the
-    mean of the samples' pelvises.
+    The past is black, the truth green, and each sample keeps its own colour over time. Every pose is drawn relative to
+    its pelvis. All poses are seen from the same side: the last observed pose is seen from the front, rotated by `view`.
+    If paths of joints were given, they are drawn as crosses, and all poses of a frame are relative to the mean of the
+    samples' pelvises.
 
     Args:
-        skeleton: the tree.
+        skeleton: skeleton of the poses.
         observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
         samples: (K, H, J, 3) in metres.
-        truth: (F, J, 3) in metres, where it is known; F is at most H.
-        frames: how many future frames are drawn, the last always among them.
-        ax: where to draw; a new figure without it.
-        view: radians between the last observed heading and the viewer.
-        paths: joint to the path (H, 3) that it was given, metres; NaN where that is not known.
+        truth: (F, J, 3) in metres, if known; F is at most H.
+        frames: number of future frames to draw; the last one is always included.
+        ax: axes; default: a new figure.
+        view: angle in radians between the last observed heading and the viewer.
+        paths: mapping from joint to its given path (H, 3) in metres; NaN where unknown.
 
     Returns:
         The axes; `ax.figure.savefig(...)` saves them.
 
     Raises:
-        ValueError: the shapes do not fit each other or the skeleton, or there is nothing to draw.
+        ValueError: the shapes do not match each other or the skeleton, or are empty.
     """
     past, future, real = _checked(skeleton, observed, samples, truth)
     crosses = _given(paths or {}, skeleton, future.shape[1])
@@ -138,17 +136,17 @@ def futures(
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """People who move side by side, in metres as the viewer sees them: x to the right, y away from the viewer, z up.
+    """People who move next to each other, in metres in the viewer's coordinates: x to the right, y away, z up.
 
     Attributes:
-        skeleton: the tree.
-        names: of the P people; a truth is the first of them.
-        colours: of each, from `now` on.
-        motion: (P, O + H, J, 3), each about a place of their own; NaN after the end of a truth that ends early.
-        now: the last observed frame.
-        shown: the frames to show, `now` among them.
-        fixed: joints that move alike in all samples.
-        truth: whether there is one.
+        skeleton: skeleton of all people.
+        names: names of the P people; the truth, if any, is the first.
+        colours: colour of each, from `now` on.
+        motion: (P, O + H, J, 3), each about its own origin; NaN after the end of a truth that ends early.
+        now: index of the last observed frame.
+        shown: indices of the frames to show, including `now`.
+        fixed: joints that move in the same way in all samples.
+        truth: whether the truth is included.
     """
 
     skeleton: Skeleton
@@ -162,30 +160,30 @@ class Scene:
 
     @property
     def low(self) -> np.ndarray:
-        """(3,), the least coordinates of anybody."""
+        """(3,), minimum coordinates of all people."""
         return np.nanmin(self.motion, (0, 1, 2))  # type: ignore[no-any-return]
 
     @property
     def high(self) -> np.ndarray:
-        """(3,), the largest coordinates of anybody."""
+        """(3,), maximum coordinates of all people."""
         return np.nanmax(self.motion, (0, 1, 2))  # type: ignore[no-any-return]
 
     @property
     def places(self) -> np.ndarray:
-        """(P, 3), where to stand so that nobody is in another's way."""
+        """(P, 3), positions of the people, so that they do not overlap."""
         return _places(len(self.motion), np.maximum(self.high - self.low + 0.4, SPACING))
 
     @property
     def milliseconds(self) -> float:
-        """From one shown frame to the next, at the motion's own speed."""
+        """Time between shown frames, at original speed."""
         return 1000 * self.shown.step / self.skeleton.fps
 
     def seconds(self, frame: int) -> float:
-        """From the last observed frame to another."""
+        """Return the time of a frame relative to the last observed frame."""
         return (frame - self.now) / self.skeleton.fps
 
     def shared(self, person: int) -> frozenset[int]:
-        """The joints of a person that move as in all other samples."""
+        """Return the joints of a person that move in the same way in all other samples."""
         return frozenset() if self.truth and person == 0 else self.fixed
 
 
@@ -200,7 +198,7 @@ def staged(
     every: int | None = None,
     view: float = pi / 5,
 ) -> Scene:
-    """Return people for an animation; see `player.animate` for the arguments and the errors."""
+    """Return the scene of an animation; arguments and errors are the same as in `player.animate`."""
     alone = samples is None
     if alone:
         motion = np.asarray(observed)
@@ -229,7 +227,7 @@ def staged(
 
 
 def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
-    """What the colours of `futures` mean, below the times."""
+    """Add a legend of the colours of `futures`, below the times."""
     sampled = tuple(Line2D([], [], color=colour) for colour in _colours(min(samples, 5)))
     key: dict[str, Any] = {"observed": Line2D([], [], color=PAST)}
     if truth:
@@ -243,7 +241,7 @@ def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
         handler_map={tuple: HandlerTuple(ndivide=None, pad=0)},
         loc="upper center",
         bbox_to_anchor=(0.5, 0),
-        borderaxespad=2,  # the height of the times
+        borderaxespad=2,  # the height of the time labels
         ncols=len(key),
         frameon=False,
         fontsize="small",
@@ -251,7 +249,7 @@ def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
 
 
 def _seen(skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], horizon: int, view: float) -> np.ndarray:
-    """Motions (P, O + H, J, 3) as the viewer of an animation sees them, with z up."""
+    """Return motions (P, O + H, J, 3) in the viewer's coordinates, with z up."""
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
     for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which is not drawn
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
@@ -261,7 +259,7 @@ def _seen(skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], h
 
 
 def _places(people: int, step: np.ndarray) -> np.ndarray:
-    """Where to stand (P, 3), `step` apart, so that all are as large as can be in a window of 2:1."""
+    """Return positions (P, 3), `step` apart, in rows that make all people as large as possible in a window of 2:1."""
     wide = step[0] / step[2]
     rows = min(range(1, people + 1), key=lambda rows: max(rows, ceil(people / rows) * wide / 2))
     row, column = np.divmod(np.arange(people), ceil(people / rows))
@@ -269,20 +267,20 @@ def _places(people: int, step: np.ndarray) -> np.ndarray:
 
 
 def _colours(samples: int) -> np.ndarray:
-    """(K, 4): a colour for each sample."""
+    """Return a colour for each sample, (K, 4)."""
     return plt.get_cmap("turbo")(np.linspace(0.05, 0.95, samples))
 
 
 def facing(skeleton: Skeleton, positions: Tensor) -> float:
-    """Where the person of motion (F, J, 3) faces in the end; zero where the skeleton does not tell left from right."""
+    """Return the heading at the end of motion (F, J, 3); zero if the skeleton does not define left and right."""
     return float(skeleton.heading_near(positions, len(positions) - 1)) if skeleton.left and skeleton.right else 0.0
 
 
 def _given(paths: Mapping[str, Any], skeleton: Skeleton, horizon: int) -> np.ndarray:
-    """The paths of some joints (paths, H, 3)."""
+    """Return the paths of some joints (paths, H, 3)."""
     found = {joint: np.asarray(path, np.float64) for joint, path in paths.items()}
     for joint, path in found.items():
-        skeleton.find(joint)  # which refuses an unknown one
+        skeleton.find(joint)  # raises an error for an unknown joint
         if path.shape != (horizon, 3):
             raise ValueError(f"expected a path ({horizon}, 3) of {joint}, as long as the samples; got {path.shape}")
     return np.array([*found.values()]).reshape(-1, horizon, 3)
@@ -291,7 +289,7 @@ def _given(paths: Mapping[str, Any], skeleton: Skeleton, horizon: int) -> np.nda
 def _checked(
     skeleton: Skeleton, observed: Any, samples: Any, truth: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Observed motion, samples and truth as arrays that fit each other."""
+    """Return observed motion, samples and truth as arrays of matching shapes."""
     past, future = np.asarray(observed, np.float64), np.asarray(samples, np.float64)
     real = None if truth is None else np.asarray(truth, np.float64)
     joint = (skeleton.joints, 3)
@@ -306,20 +304,20 @@ def _checked(
 
 
 def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = "y", title: str = "") -> Figure:
-    """Draw bodies that stand side by side, seen from the front of a person with heading zero.
+    """Draw bodies next to each other, seen from the front of a person with heading zero.
 
     Args:
-        faces: triangles, (F, 3).
-        vertices: of one pose (V, 3) or of P bodies or poses (P, V, 3), metres, numpy or torch without gradients.
-        names: what to call them; by default they are not named.
-        up: the vertical axis, "y" or "z".
-        title: above the figure.
+        faces: (F, 3), triangles.
+        vertices: (V, 3) for one pose, or (P, V, 3) for P bodies or poses, in metres, numpy or torch without gradients.
+        names: names of the bodies; default: no names.
+        up: vertical axis, "y" or "z".
+        title: title of the figure.
 
     Returns:
         A figure in metres.
 
     Raises:
-        ValueError: the shapes do not fit each other, a place is not finite, or there are too few names.
+        ValueError: the shapes do not match each other, a position is not finite, or the number of names is wrong.
     """
     corners, people = np.asarray(faces), np.asarray(vertices, np.float64)
     people = people[None] if people.ndim == 2 else people
@@ -351,13 +349,13 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
 
 
 def _shaded(faces: np.ndarray, places: np.ndarray) -> PolyCollection:
-    """The triangles of a mesh (V, 3) that face the viewer, the nearest last, by how the light falls on them."""
+    """Return the triangles of a mesh (V, 3) that face the viewer, shaded by the light, the nearest last."""
     first, second, third = places[faces].swapaxes(0, 1)
     normals = np.cross(second - first, third - first)
     smooth = np.zeros_like(places)
     np.add.at(smooth, faces, normals[:, None])
     smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True).clip(1e-12)
-    seen = np.flatnonzero(normals[:, 1] < 0)  # y goes away from the viewer
+    seen = np.flatnonzero(normals[:, 1] < 0)  # y points away from the viewer
     seen = seen[np.argsort(-places[faces[seen], 1].mean(-1))]
     bright = 0.6 + 0.4 * (smooth[faces[seen]].mean(1) @ LIGHT).clip(0)
     colours = bright.round(2)[:, None] * to_rgb(SKIN)

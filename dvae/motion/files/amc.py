@@ -225,8 +225,8 @@ def read_expmap(path: str | Path) -> Recording:
     """Read exponential maps as in the CMU benchmark: rows of 117 numbers per frame, positions and rotation vectors.
 
     The vectors in the file act on rows; they are negated here. The first row is a rest pose, not a frame, and is left
-    out. The root rotation in the file composes the angles of the AMC file in the wrong order (z x y instead of z y x),
-    which tilts people who face away from +z. The angles are extracted and composed again in the right order.
+    out. The root rotation in the file composes the angles of the AMC file in the wrong order (z x y instead of z y x).
+    This tilts people who face away from +z. The angles are extracted and composed again in the right order.
 
     Raises:
         FileNotFoundError: the file does not exist.

@@ -1,10 +1,10 @@
 """AMASS's layout (Mahmood et al. 2019, arXiv 1904.03278): rotations of SMPL's joints, without its body.
 
 The files contain no bone lengths. These depend on the SMPL body, which has its own licence, and on the shape parameters
-`betas`, which clips have as a label (`bodies.betas`). Without the SMPL body, all people have one average body: a height
-of 1.7 m, and segments by Drillis and Contini (1966), according to figure 4.1 of Winter, Biomechanics and Motor Control
-of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the position of its template to
-`trans`. Files written here also contain `offsets`, which are used when they are read.
+`betas`, which clips have as a label (`bodies.betas`). Without the SMPL body, all people have one average body with a
+height of 1.7 m. Its segments are those of Drillis and Contini (1966) in figure 4.1 of Winter, Biomechanics and Motor
+Control of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the position of its
+template to `trans`. Files written here also contain `offsets`, which are used when they are read.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def read_amass(path: str | Path) -> Recording:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is not from AMASS, or damaged.
+        ValueError: the file has another layout, or is damaged.
     """
     path = Path(path)
     with archive(path) as members:

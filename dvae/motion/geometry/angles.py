@@ -233,7 +233,7 @@ def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0
         The limits; an angle that no pose has is unrestricted, from -1 to 1.
 
     Raises:
-        ValueError: there are no poses, the quantile is not in [0, .5), or `cosines` raises it.
+        ValueError: `poses` is empty, the quantile is not in [0, .5), or `cosines` raises it.
     """
     if not 0 <= quantile < 0.5:
         raise ValueError(f"quantile is {quantile}, expected the part beyond each limit, from 0 to below .5")

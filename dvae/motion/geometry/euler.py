@@ -16,10 +16,10 @@ Martinez, Black and Romero, 2017, arXiv 1705.02445, which later work uses:
   the frames of a forecast. We compute it over all true windows, so that all methods are scored on the same angles.
 * Each time uses the nearest frame, counted from the last observed one.
 
-Aliakbarian et al., 2020, arXiv 1908.00733, score the best of K futures and call it the S-MSE of Yan et al., 2018, arXiv
-1808.04545: "at least one is close to the ground truth" (K = 50, and 1 to 500). They do not say whether the best future
-is the same at all times. Here it is: the best future has the smallest mean error over the times, so the same future is
-scored at 80 ms and at 1000 ms. For smaller K, the first K of all drawn futures are used.
+Aliakbarian et al., 2020, arXiv 1908.00733, score the best of K futures (K = 50, and 1 to 500): "at least one is close
+to the ground truth". They call it the S-MSE of Yan et al., 2018, arXiv 1808.04545. They do not say whether the best
+future is the same at all times. Here it is: the best future has the smallest mean error over the times, so the same
+future is scored at 80 ms and at 1000 ms. For smaller K, the first K of all drawn futures are used.
 
 Rotations come from the data, and from models that output rotations. Positions do not determine how a bone is rotated
 about itself. Models of positions are therefore scored with `inverse`: inverse kinematics estimates the rotations, both

@@ -124,8 +124,8 @@ def _half_turn(axis: Tensor) -> Tensor:
 def rest(skeleton: Skeleton, positions: Tensor, rounds: int = 10) -> Tensor:
     """Return a rest pose for poses of one body: their mean, facing forward, with bones of mean length.
 
-    If a joint has several children, the angles between them are those of the poses, by generalised Procrustes analysis
-    (Gower 1975).
+    If a joint has several children, the angles between them are taken from the poses, by generalised Procrustes
+    analysis (Gower 1975).
 
     Args:
         skeleton: skeleton of the poses.

@@ -2,12 +2,14 @@
 
 All rotations are right-handed, act on column vectors, are batched over leading dimensions and differentiable. The
 conversions use roma (Brégier 2021, arXiv 2103.16317), which is imported only when needed because its import is as slow
-as that of torch.
+as the import of torch.
 
 Derivatives of conversions to matrices are always correct. Derivatives of conversions from matrices are correct except
-where a form is discontinuous: a quaternion changes sign where another of its components becomes the largest; a vector
-changes to the opposite end of its axis at half a turn; Euler angles jump at half a turn, and where the second angle
-aligns the axes of the other two.
+where a form is discontinuous:
+
+* A quaternion changes its sign where another of its components becomes the largest.
+* A vector changes to the opposite end of its axis at half a turn.
+* Euler angles jump at half a turn, and where the second angle aligns the axes of the other two.
 
 | form | numbers | |
 |---|---|---|

@@ -110,7 +110,7 @@ class Skeleton:
         name: name.
         lengths: reference bone lengths in metres in the order of `edges`; empty if people differ.
         rest: flattened offsets (J, 3) of each joint from its parent in the rest pose, in metres, zero for the root;
-            empty if there are no rotations.
+            empty without rotations.
 
     Raises:
         ValueError: the joints do not form one tree, names repeat, or a side contains an unknown joint.

@@ -1,17 +1,17 @@
-"""The action classifier: which action a motion shows, and the features by which sets of motions are compared.
+"""The action classifier: predicts the action of a motion, and provides features to compare sets of motions.
 
     p(c | x_{1:T})
 
-A GRU reads the predicted part of a window, its last state gives the *features*, and these the logits:
+A GRU reads the predicted part of a window. Its last state gives the *features*, and these the logits:
 
     features = tanh(W GRU(x_{O+1:T})_T + b)        p(c | x_{1:T}) = Categorical(logits = V features + a)
 
-It is fitted to real training motion and then judges forecasts (`dvae.motion.scores(..., classifiers=...)`): ACC is the
-share of futures that it gives the true class, FID a distance between the features of real and of generated futures.
+It is fitted to real training motion and then scores forecasts (`dvae.motion.scores(..., classifiers=...)`). ACC is the
+fraction of futures assigned to the true class. FID is a distance between the features of real and of generated futures.
 
-Bie, Guo, Leglaive, Girin, Moreno-Noguer and Alameda-Pineda, 2022, arXiv 2204.01565, say "GRU of 2 layers, 128 units"
-and no more; the features are those of public code of this family (BeLFusion). That code starts the GRU from normal
-noise at every call, so that its scores are random; here the first state is zero and nothing is.
+Bie, Guo, Leglaive, Girin, Moreno-Noguer and Alameda-Pineda, 2022, arXiv 2204.01565, only specify a "GRU of 2 layers,
+128 units". The features follow public code of this family (BeLFusion). That code starts the GRU from normal noise at
+every call, so its scores are random; here the initial state is zero and scores are deterministic.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from ..geometry.skeleton import Skeleton
 
 CLASS = "c"
 IN_CACHE = 512
-"""Sequences that the GRU reads at a time, whose gates stay in a processor's cache."""
+"""Number of sequences that the GRU reads at a time, so that its gates stay in a processor's cache."""
 
 
 @dataclass(frozen=True)
 class ActionClassifier(Trainable):
-    """See the file.
+    """A classifier of actions, for the scores ACC and FID.
 
     Args:
-        label: the label of the clips that is the class.
-        hidden: units of the GRU.
-        layers: of the GRU.
-        features: size of the features.
-        classes: names of the classes in the order of the logits; by default all of the training clips, sorted.
+        label: label of the clips that is the class.
+        hidden: number of units of the GRU.
+        layers: number of layers of the GRU.
+        features: number of features.
+        classes: names of the classes in the order of the logits; default: all classes of the training clips, sorted.
     """
 
     name: ClassVar[str] = "action-classifier"
@@ -61,10 +61,10 @@ class ActionClassifier(Trainable):
     classes: tuple[str, ...] = ()
 
     def suited(self, windows: Windows) -> ActionClassifier:
-        """With the classes, those of the clips that have a window.
+        """Return the method with its classes, by default the classes of clips that have a window.
 
         Raises:
-            ValueError: fewer than two classes.
+            ValueError: there are fewer than two classes.
         """
         if self.classes:
             return self
@@ -80,16 +80,16 @@ class ActionClassifier(Trainable):
         return replace(self, classes=tuple(classes))
 
     def build(self, data: Any) -> ActionClassifierModel:
-        """The model for such windows; a schema alone does not tell the classes."""
+        """Return the model for these windows; a schema alone does not contain the classes."""
         schema = Poses.of(data, "an action classifier")
         method = self if self.classes else self.suited(data)
         return ActionClassifierModel(method, schema.skeleton, schema.sizes["x"], schema.protocol)
 
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Minimises minus the log-likelihood of the windows' classes, in nats per window.
+        """Return the recipe: minimise the negative log-likelihood of the windows' classes, in nats per window.
 
         Raises:
-            ValueError: a clip without the label, or of none of the classes.
+            ValueError: a clip has no such label, or its label is not one of the classes.
         """
         classes = self.suited(train).classes
         held_out = validation and validation.classified(CLASS, self.label, classes)
@@ -97,16 +97,16 @@ class ActionClassifier(Trainable):
 
 
 class ActionClassifierModel(nn.Module):
-    """The classifier.
+    """The classifier network.
 
     Args:
-        method: with its classes.
-        skeleton: of the windows.
-        size: D, numbers of a frame.
-        protocol: of the windows, whose predicted frames are judged.
+        method: method with its classes.
+        skeleton: skeleton of the windows.
+        size: number of values per frame, D.
+        protocol: protocol of the windows, whose predicted frames are classified.
     """
 
-    likelihood, per = True, "window"  # see `dvae.program.protocols.Program`
+    likelihood, per = True, "window"  # required by `dvae.program.protocols.Program`
 
     def __init__(self, method: ActionClassifier, skeleton: Skeleton, size: int, protocol: Protocol):
         super().__init__()
@@ -117,14 +117,13 @@ class ActionClassifierModel(nn.Module):
         self.logits = nn.Linear(method.features, len(method.classes))
 
     def model(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
-        """The Pyro program: one site c, batch (B,), observed at the windows' classes.
+        """Pyro program: one site c, batch (B,), observed at the classes of the windows.
 
         Args:
-            batch: holds x (B, T, D), and c (B,) int64, indices of the classes.
+            batch: batch with x (B, T, D), and c (B,) int64, indices of the classes.
 
         Raises:
-            ValueError: no classes, frames of another size, or padded sequences or missing entries, of which there are
-                none in windows of motion.
+            ValueError: the batch has no classes, frames of another size, padded sequences or missing values.
         """
         if extra := {"lengths", "mask"} & batch.keys():
             raise ValueError(f"a classifier reads whole windows; leave {' and '.join(sorted(extra))} out")
@@ -139,18 +138,18 @@ class ActionClassifierModel(nn.Module):
             return {CLASS: pyro.sample(CLASS, distributions.Categorical(logits=logits), obs=batch[CLASS])}
 
     def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
-        """Nothing is latent."""
+        """Return no latents: the model has none."""
         return {}
 
     def forward(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
-        """The program, which bounds take."""
+        """Run the program, for bounds."""
         return self.model(batch, **options)
 
     def features(self, futures: Tensor) -> Tensor:
-        """Features (..., F), each between -1 and 1, of predicted frames (..., H, D); `logits` takes them.
+        """Return features (..., F) between -1 and 1 of predicted frames (..., H, D), the input of `logits`.
 
         Raises:
-            ValueError: frames of another size.
+            ValueError: the frames have another size.
         """
         if futures.shape[-1] != self.size:
             raise ValueError(

@@ -1,19 +1,22 @@
-"""The pose prior of GSPS: a density of single poses, as the directions of their limbs.
+"""The pose prior of GSPS: a density of single poses, represented by the directions of their limbs.
 
     p(d_t),        d_t = the unit vectors along all limbs, from parent to child
 
-It has no latents and no time: every frame is a pose of its own, and the flow's density is exact, so that the bound is
-the log evidence. Others are trained with it: poses that it finds unlikely cost energy (`energies.pose_prior_energy`).
+It has no latents and no dynamics: each frame is an independent pose, and the density of the flow is exact, so the bound
+equals the log evidence. Other models are trained with it: poses that it finds unlikely cost energy
+(`energies.pose_prior_energy`).
 
-Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code (see `dvae.distributions.flow`). Ours:
+Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the flow of its public code (`dvae.distributions.flow`). Our
+changes:
 
-* Training poses get noise of 2 mm. Where a body part is rigid, as the hips are, its limbs' directions hardly vary, and
-  the density rises without bound as a flow narrows down on them. In bandai2 eight of sixty dimensions have no more than
-  the rounding of the file, 0.1 mm. Fitted without noise, errors of 1 mm raise the energy of a test pose from 117 nats
-  to 4300; with it, from 90 to 92, errors of 2 cm to 2300, and lower legs bent the wrong way to 1000.
-* The flow reads whitened directions, which changes what it learns first and not what it can learn. In nats a training
-  (test) pose of bandai2 it is at 80.7 (67.1) after 1000 steps, and at 73.7 (62.0) from raw directions as in the paper;
-  a normal with full covariance has 76.0 (63.8), and the raw flow comes near to it in 8000 steps.
+* Training poses get noise of 2 mm. Where a body part is rigid, such as the hips, the directions of its limbs hardly
+  vary, and the density grows without bound as the flow concentrates on them. In bandai2, eight of sixty dimensions vary
+  only by the rounding of the file, 0.1 mm. Without noise, errors of 1 mm raise the energy of a test pose from 117 to
+  4300 nats. With noise, they raise it from 90 to 92 nats; errors of 2 cm raise it to 2300 nats, and lower legs bent the
+  wrong way to 1000 nats.
+* The flow receives whitened directions, which affects the speed of learning but not the model class. Energies of
+  training (test) poses of bandai2, in nats, are 80.7 (67.1) after 1000 steps, and 73.7 (62.0) from raw directions as in
+  the paper. A normal distribution with full covariance has 76.0 (63.8), which the raw flow approaches in 8000 steps.
 """
 
 from __future__ import annotations
@@ -46,17 +49,17 @@ from ..geometry.views import Heading
 
 @dataclass(frozen=True)
 class PosePrior(Trainable):
-    """See the file.
+    """The pose prior of GSPS: a density of single poses.
 
     Args:
-        layers: of the flow.
-        noise: standard deviation in metres of the noise that training poses get at each coordinate; the paper has none.
-        turned: turn every training window about the up axis by a uniform angle, for a prior that does not mind
-            which way people face. Where the windows' heading is fixed there is no need.
-        heading: turn every window about the up axis so that its last observed frame has heading zero; a prior for
-            models that see their windows so.
-        whiten: standardise directions with their mean and covariance over training poses before the flow reads them;
-            the paper does not, and needs a learning rate of .01.
+        layers: number of layers of the flow.
+        noise: standard deviation in metres of the noise added to each coordinate of training poses; 0 in the paper.
+        turned: rotate every training window about the up axis by a uniform angle, for a prior that ignores headings.
+            Not needed if the heading of the windows is fixed.
+        heading: rotate every window about the up axis so that its last observed frame has heading zero, for a prior of
+            models that do the same.
+        whiten: standardise directions by their mean and covariance over training poses; the paper does not, and needs a
+            learning rate of .01.
     """
 
     name: ClassVar[str] = "pose-prior"
@@ -79,17 +82,17 @@ class PosePrior(Trainable):
             raise ValueError("heading fixes the direction that turned would draw; choose one")
 
     def build(self, data: Any) -> PosePriorModel:
-        """The model for poses of the data's skeleton."""
+        """Return the model for poses of the data's skeleton."""
         schema = Poses.of(data, "a pose prior")
         return PosePriorModel(schema.skeleton, self.layers, schema.protocol.observed - 1 if self.heading else None)
 
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 1000) -> Recipe:
-        """Minimises minus the log density, in nats per pose, of poses that are turned and have noise."""
+        """Return the recipe: minimise the negative log density, in nats per pose, of rotated and noisy poses."""
         varied = VariedPoses(train, self.noise, self.turned)
         return Recipe(varied, validation, [Stage(steps)], prepare=partial(self._whiten, poses=varied))
 
     def _whiten(self, model: PosePriorModel, poses: VariedPoses) -> None:
-        """Has the flow take mean and covariance of the directions from the poses of 1024 windows."""
+        """Set the mean and covariance of the flow's whitening from the poses of 1024 windows."""
         if self.whiten:
             x = poses.sample(1024, torch.default_generator)["x"]
             model.flow.whiten(model.skeleton.directions(model.facing(x).double()))
@@ -97,12 +100,12 @@ class PosePrior(Trainable):
 
 @dataclass(frozen=True)
 class VariedPoses:
-    """Training windows whose poses are varied.
+    """Training windows with augmented poses.
 
     Args:
-        windows: to draw from.
-        noise: see `PosePrior`.
-        turned: see `PosePrior`.
+        windows: windows to draw from.
+        noise: same as in `PosePrior`.
+        turned: same as in `PosePrior`.
     """
 
     windows: Windows
@@ -111,11 +114,11 @@ class VariedPoses:
 
     @property
     def fingerprint(self) -> str:
-        """That of the windows."""
+        """Fingerprint of the windows."""
         return self.windows.fingerprint
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draws windows as `Windows.sample` does, turned and with noise: {"x": (B, T, D)}, gaps bridged."""
+        """Draw windows, rotated and with noise: {"x": (B, T, D)}; missing values are interpolated."""
         drawn = self.windows.sample(batch_size, generator)
         x = bridged(drawn["x"], drawn.mask())
         if self.turned:
@@ -130,12 +133,12 @@ class PosePriorModel(nn.Module):
     """The density of poses.
 
     Args:
-        skeleton: of J joints.
-        layers: of the flow.
-        forward_at: frame of heading zero in windows, which are turned so; None to take them as they are.
+        skeleton: skeleton with J joints.
+        layers: number of layers of the flow.
+        forward_at: frame whose heading is rotated to zero in each window; None leaves windows unchanged.
     """
 
-    likelihood, per = True, "frame"  # see `dvae.program.protocols.Program`
+    likelihood, per = True, "frame"  # required by `dvae.program.protocols.Program`
 
     def __init__(self, skeleton: Skeleton, layers: int = 3, forward_at: int | None = None):
         super().__init__()
@@ -143,13 +146,13 @@ class PosePriorModel(nn.Module):
         self.flow = QRFlow(layers).build(Shape(3 * (skeleton.joints - 1), local=False))
 
     def model(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
-        """The Pyro program: one site d, batch (B, T), event (3 (J - 1),), observed at the poses' directions.
+        """Pyro program: one site d, batch (B, T), event (3 (J - 1),), observed at the directions of the poses.
 
         Args:
-            batch: holds x (B, T, D), D as in `Skeleton.limbs`.
+            batch: batch with x (B, T, D), D as in `Skeleton.limbs`.
 
         Raises:
-            ValueError: padded sequences or missing entries, of which there are none in windows of motion.
+            ValueError: the batch has padded sequences or missing values.
         """
         if extra := {"lengths", "mask"} & batch.keys():
             raise ValueError(f"a pose prior reads whole poses in every frame; leave {' and '.join(sorted(extra))} out")
@@ -158,45 +161,45 @@ class PosePriorModel(nn.Module):
             return {"d": pyro.sample("d", self.flow.prior(), obs=d)}
 
     def guide(self, batch: Batch, **_: Any) -> dict[str, Tensor]:
-        """Nothing is latent."""
+        """Return no latents: the model has none."""
         return {}
 
     def forward(self, given: Batch | Tensor, **options: Any) -> Any:
-        """On a batch, the program, which bounds take; on directions (..., 3 (J - 1)), see `QRFlowLaw.to_noise`."""
+        """Run the program on a batch; or map directions (..., 3 (J - 1)) to noise, as `QRFlowLaw.to_noise`."""
         return self.model(given, **options) if isinstance(given, Mapping) else self.flow.to_noise(given)
 
     def facing(self, x: Tensor) -> Tensor:
-        """Windows (..., T, D) as the density reads them."""
+        """Return windows (..., T, D), rotated as the density requires."""
         return x if self.forward_at is None else Heading(self.skeleton, self.forward_at + 1).face(x)
 
     def log_prob(self, poses: Tensor) -> Tensor:
-        """Log density (...) of the limb directions of poses (..., D), in nats.
+        """Return the log density (...) of the limb directions of poses (..., D), in nats.
 
         Raises:
-            ValueError: poses of another skeleton.
+            ValueError: the poses have another skeleton.
         """
         return self.flow.prior().log_prob(self.skeleton.directions(poses))
 
     @torch.no_grad()
     def sample(self, count: int) -> Tensor:
-        """Draws limb directions (count, 3 (J - 1)). The density is over all vectors, so their lengths vary about 1."""
+        """Draw limb directions (count, 3 (J - 1)); the density covers all vectors, so their lengths vary about 1."""
         return self.flow.prior().sample((count,))
 
 
 def fit_pose_prior(
     windows: Windows, steps: int = 1000, seed: int = 0, progress: bool = True, **options: Any
 ) -> PosePriorModel:
-    """Fits a pose prior quietly, on the CPU, in about fifteen seconds.
+    """Fit a pose prior on the CPU, without log output, in about fifteen seconds.
 
     Args:
         windows: training windows.
         steps: optimiser steps.
-        seed: of the fit; the caller's random state is left as it was.
-        progress: show a bar.
-        **options: of `PosePrior`.
+        seed: seed of the fit; the global random state is restored.
+        progress: show a progress bar.
+        **options: options of `PosePrior`.
 
     Returns:
-        The model, in evaluation mode, with its last weights.
+        The model in evaluation mode, with its last weights.
     """
     method = PosePrior(**options)
     with seeded(seed):
@@ -216,16 +219,16 @@ def fit_pose_prior(
 
 
 def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> PosePriorModel:
-    """The pose prior of a run, for a model of such poses.
+    """Load the pose prior of a run, for a model of poses.
 
     Args:
-        path: the run directory of a pose prior.
-        skeleton: of the poses.
-        heading: whether the model sees windows turned to one heading.
+        path: run directory of a pose prior.
+        skeleton: skeleton of the poses.
+        heading: whether the model sees windows rotated to heading zero.
 
     Raises:
-        ValueError: a run of something else, of another skeleton, or of other options.
-        CheckpointError: damaged weights, or of another number of joints.
+        ValueError: the run is not a pose prior, or has another skeleton or other options.
+        CheckpointError: the weights are damaged, or have another number of joints.
     """
     config = Run(path).config
     try:

@@ -10,8 +10,8 @@ with the limb lengths of the window x. A candidate is admissible if
 At most `most` admissible candidates, drawn without replacement, follow the observed frames of x.
 
 Candidates are tried in random order until enough of them meet the conditions. Most of the others are excluded in
-advance by matrix products with candidates of average limb lengths. This is valid for two reasons: a mean of distances
-over frames is at most their root mean square, and other limb lengths move a joint by at most the sum of the differences
+advance by matrix products with candidates of average limb lengths. This is valid for two reasons. A mean of distances
+over frames is at most their root mean square. Other limb lengths move a joint by at most the sum of the differences
 along its path to the root.
 """
 

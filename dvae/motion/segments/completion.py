@@ -1,27 +1,29 @@
-"""Prediction and completion: whole segments of motion from whatever was seen of them.
+"""Prediction and completion: infer whole segments of motion from partial observations.
 
     p(z) p(beta) p(seen | z, beta),    z, beta* = argmax log p(z, beta | seen)
 
-A decoder makes a segment of z, timing included, and a body of beta; both are looked for that agree best with what was
-seen (Marsot et al. 2021, arXiv 2106.04387, sections 5.4 and 5.5). What was seen of B segments is one batch, NaN where
-nothing was, any mix of
+A decoder maps z to a segment, including its timing, and beta to a body. The search finds the z and beta that agree best
+with the observations (Marsot et al. 2021, arXiv 2106.04387, sections 5.4 and 5.5). The observations of B segments are
+one batch, NaN where unobserved, with any combination of
 
-    times     (B, K)        seconds from the first frame of the segment to the moments at which something was seen
-    frames    (B, K)        which frames of chi these are, from 0; between two of them, too
-    surfaces  (B, K, V, 3)  all vertices, as in the first quarter of a second that is to be continued
-    points    (B, K, M, 3)  points of the surface of which nobody knows the vertex, as a scanner sees them
+    times     (B, K)        seconds from the first frame of the segment to the observed moments
+    frames    (B, K)        the corresponding frames of chi, from 0; fractions are allowed
+    surfaces  (B, K, V, 3)  all vertices, e.g. in the first quarter of a second, to predict the rest
+    points    (B, K, M, 3)  points on the surface without known vertices, as from a scanner
     markers   (B, K, L, 3)  some vertices
-    beta      (B, S)        the body, where it is known
+    beta      (B, S)        the body, if it is known
 
-in metres, of somebody who starts at the origin, facing heading zero. Moments without a frame are met in the decoded
-time, on straight lines between chi's frames. Moments that have both are met at the frame, and its time counts.
+in metres, for a person who starts at the origin with heading zero. Moments without a frame are located in the decoded
+time, with linear interpolation between the frames of chi. Moments with both are located at the frame, and their time is
+an observation.
 
-The paper adds squared errors, in weights that adapt. Here they are the negative log of normal likelihoods, whose
-`Deviations` are the weights: what is minimised is then a posterior's, and a completion knows how sure it is. Of
-points, what counts is how far each is from the nearest vertex, one way: a vertex far from all points is no error where
-points are few. That is no density of points, so that evidence does not compare bodies by points; and the curvature of
-the posterior is that of nearest vertices held fixed, which points tell of more surely than they do: k-hat says so. A
-frame's surface counts as one vertex, the mean of all, for its vertices err together.
+The paper adds squared errors with adaptive weights. Here they are negative log densities of normal distributions, and
+the `Deviations` act as weights. The minimum is therefore the mode of a posterior, which also gives the uncertainty of a
+completion. For points, the error is the distance of each point to the nearest vertex. It is one-sided: a vertex far
+from all points is not an error, because points may be few. This is not a density of points, so the evidence cannot
+compare bodies by points. The curvature of the posterior treats the nearest vertices as fixed, which overstates the
+information in points; k-hat shows this. The surface of a frame counts as one vertex, the mean of all, because errors of
+its vertices are correlated.
 """
 
 from __future__ import annotations
@@ -48,28 +50,28 @@ from .frames import TimedFrames
 LATENT = "z"
 TIMES, FRAMES, SURFACES, POINTS, SPOTS = "times", "frames", "surfaces", "points", "markers"
 TIME = slice(-1, None)
-"""Coordinates of a frame that say when it is."""
+"""Coordinate of a frame that contains its time increment."""
 NEAREST = "nearest"
-"""Name of the vertices (B, K, M) that are taken for the nearest ones of points."""
+"""Name of the indices (B, K, M) of the vertices nearest to points."""
 AT_ONCE, PAIRS = 32, 2**20
-"""Frames of which all vertices are held to find the nearest ones; and pairs of points and vertices a cache holds."""
+"""Maximum number of frames with all vertices in memory; and of pairs of points and vertices per cache."""
 THIN = 16
-"""Of so many vertices one stands for a surface of which all are known: that tells no less of joints and a shape."""
+"""Stride of the vertices used for a complete surface; a subset determines joints and shape equally well."""
 
 
 @dataclass(frozen=True)
 class Deviations:
-    """How far what was seen is from what a decoder makes: standard deviations of each coordinate.
+    """Standard deviations of observations from the decoded motion, per coordinate.
 
-    What a decoder cannot make is part of it. Frames next to each other err alike, of which a likelihood with
-    independent errors knows nothing: see that intervals hold what they promise on segments that are known. These are
-    those that left the least vertex errors on unseen styles (docs/results/motion_latent_4d.md).
+    They include the error of the decoder. Errors of neighbouring frames are correlated, but the likelihood assumes
+    independent errors: verify the coverage of intervals on known segments. The defaults had the smallest vertex errors
+    on unseen styles (docs/results/motion_latent_4d.md).
 
     Args:
-        surface: metres, of a frame's surface as a whole.
-        point: metres, of a point from the nearest vertex; half the way between vertices is part of it.
+        surface: metres, for the surface of a frame as a whole.
+        point: metres, from a point to the nearest vertex, including half the distance between vertices.
         marker: metres.
-        time: seconds, of a frame from when it was seen, and of a segment's end where it comes too early.
+        time: seconds, between a frame and its observed time, or between the end of a segment and later observations.
     """
 
     surface: Positive = 0.02
@@ -81,22 +83,22 @@ class Deviations:
         check(self)
 
     def of(self, name: str) -> float:
-        """That of "surfaces", "points" or "markers", in metres."""
+        """Return the deviation of "surfaces", "points" or "markers", in metres."""
         return {SURFACES: self.surface, POINTS: self.point, SPOTS: self.marker}[name]
 
 
 @dataclass(frozen=True)
 class SegmentCompletion:
-    """The Pyro program of what was seen, for `dvae.posterior` and for Pyro's own guides (`AutoDelta`, ...).
+    """Pyro program of the observations, for `dvae.posterior` and for Pyro's own guides (`AutoDelta`, ...).
 
     Args:
-        model: of segments, such as `dvae.models.motion.motion_latent.MotionLatentModel`, of which `decode`, `decoder`,
-            `guide`, `timed` and `body` are used.
-        deviations: of what was seen.
-        markers: the vertices of markers (L,); `bodies.MARKERS` by default.
-        known: segments (x and beta), whose latents by the guide are where motion is: starts beside those of the prior.
-        aggregate: where segments are known, the prior of z is a normal of what the guide says of them all, its mean and
-            its covariance, in place of N(0, I), from which a small weight of the KL lets them stray.
+        model: model of segments, such as `dvae.models.motion.motion_latent.MotionLatentModel`, with `decode`,
+            `decoder`, `guide`, `timed` and `body`.
+        deviations: standard deviations of the observations.
+        markers: (L,), vertices of the markers; default: `bodies.MARKERS`.
+        known: known segments (x and beta); the guide's latents for them are additional starting points.
+        aggregate: if segments are known, the prior of z is a normal distribution with the mean and covariance of their
+            aggregate posterior under the guide, instead of N(0, I). A small KL weight allows the two to differ.
     """
 
     model: Any
@@ -106,10 +108,10 @@ class SegmentCompletion:
     aggregate: bool = True
 
     def __call__(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
-        """z from `prior` and beta from N(0, I), and what was seen from what is made of them.
+        """Sample z from `prior` and beta from N(0, I), and score the observations given the decoded motion.
 
         Args:
-            seen: see the module; what `read` gave. Where it says nothing of it, nearest vertices are looked for.
+            seen: result of `read`. Nearest vertices are computed if they are not included.
 
         Returns:
             z (B, Z) and beta (B, S).
@@ -129,34 +131,36 @@ class SegmentCompletion:
 
     @cached_property
     def prior(self) -> Any:
-        """The law of z, of one event (Z,)."""
+        """Prior distribution of z with event shape (Z,)."""
         if self.known is None or not self.aggregate:
             return _standard(self.model.sizes[LATENT], like(self.model))
-        with torch.no_grad(), pyro.poutine.block():  # a program inside another
+        with torch.no_grad(), pyro.poutine.block():  # hides the inner program
             law = self.model.posterior(self.known)
         return dist.MultivariateNormal(law.mean.mean(0), _shrunk(law.mean, law.variance.mean(0)))
 
     @torch.no_grad()
     def away(self, seen: Mapping[str, Any], z: Tensor, shape: Tensor) -> dict[str, Tensor]:
-        """How far what was seen is from what is made of z (B, Z) and beta (B, S): mean distances (B,) in metres.
+        """Return mean distances (B,) in metres between the observations and the motion decoded from z and beta.
 
         Args:
-            seen: what `read` gave.
+            seen: result of `read`.
+            z: (B, Z).
+            shape: (B, S).
 
         Returns:
-            "surfaces", "points" or "markers" to the distances; of points from the nearest vertex.
+            Mapping from "surfaces", "points" or "markers" to the distances; for points, to the nearest vertex.
         """
         made = self._made(z, shape, seen)[1]
         return {name: (each - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, each in made.items()}
 
     def guide(self, seen: Mapping[str, Any]) -> Any:
-        """z of known segments, drawn at random."""
+        """Sample z of random known segments."""
         assert self.known is not None
         chosen = torch.randint(len(self.known["x"]), (len(next(iter(seen.values()))),))
         return self.model.guide({name: value[chosen] for name, value in self.known.items()})
 
     def renewed(self, seen: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-        """What was seen, with the vertices that are nearest to points where latents have these values."""
+        """Return the observations with the vertices nearest to points for these values of the latents."""
         if POINTS not in seen:
             return dict(seen)
         shape = values.get(SHAPE, seen.get(SHAPE))
@@ -165,7 +169,7 @@ class SegmentCompletion:
         return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
 
     def _made(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
-        """When moments (B, K) are, and where all that was seen at them is made, by name."""
+        """Return the times (B, K) of the moments, and the decoded counterparts of all observations by name."""
         body = self.model.body
         met, times = self._met(z, shape, seen)
         rotations, places = self.model.timed.poses(met)
@@ -180,17 +184,19 @@ class SegmentCompletion:
         return times, made
 
     def _met(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """`_met` of what is decoded, of which no more is made than is met."""
+        """Return `_met` of the decoded segments; only the needed frames are decoded."""
         frames, made = seen.get(FRAMES), self.model.decoder(z, shape)
         if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
             return made(frames[0].long()), frames
         return _along(self.model.timed.times(made(None, TIME)), made, seen)
 
     def read(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
-        """What was seen, checked, in the model's precision and on its device; of surfaces one vertex in `THIN`.
+        """Validate observations, and convert them to the model's precision and device.
+
+        Surfaces keep every `THIN`-th vertex.
 
         Raises:
-            ValueError: an unknown name, another shape, nothing seen, or something seen when nobody knows.
+            ValueError: a name is unknown, a shape is wrong, observations are empty, or one has no time.
         """
         found = {name: torch.as_tensor(value).to(like(self.model)) for name, value in seen.items()}
         body, kinds = self.model.body, [name for name in (SURFACES, POINTS, SPOTS) if name in found]
@@ -235,9 +241,9 @@ class Completed:
     """Segments that were completed.
 
     Args:
-        program: of what was seen.
-        seen: what was seen of them, as it was read.
-        posterior: of z, and of beta where that was unknown.
+        program: program of the observations.
+        seen: observations, as returned by `SegmentCompletion.read`.
+        posterior: posterior of z, and of beta if it was unknown.
     """
 
     program: SegmentCompletion
@@ -246,11 +252,11 @@ class Completed:
 
     @property
     def model(self) -> Any:
-        """That made them."""
+        """The model that decodes the segments."""
         return self.program.model
 
     def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> ImportanceBound:
-        """The log evidence of what was seen, and k-hat: see `Posterior.evidence`."""
+        """Return the log evidence of the observations, and k-hat, by `Posterior.evidence`."""
         with evaluating(self.model):
             return self.posterior.evidence(self.program, self.seen, particles, seed=seed, chunk=chunk)
 
@@ -261,11 +267,11 @@ class Completed:
 
     @property
     def shape(self) -> Tensor:
-        """The most probable bodies (B, S), or those that were known."""
+        """The most probable bodies (B, S), or the known ones."""
         return self._made(self.posterior.mode)[1]
 
     def draw(self, n: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-        """Frames (n, B, N, D) and bodies (n, B, S) from the posterior."""
+        """Draw frames (n, B, N, D) and bodies (n, B, S) from the posterior."""
         return self._made(self.posterior.draw(n, seed))
 
     @torch.no_grad()
@@ -288,16 +294,16 @@ def complete(
     chunk: int = 128,
     progress: bool = False,
 ) -> Completed:
-    """The rest of segments of which something was seen; all at once.
+    """Complete partially observed segments, all at once.
 
     Args:
-        model: of segments, see `SegmentCompletion`.
-        seen: see the module.
-        deviations, markers, known, aggregate: see `SegmentCompletion` too.
-        descent, seed, chunk, progress: see `dvae.posterior`.
+        model: model of segments, as in `SegmentCompletion`.
+        seen: observations, in the format of this module.
+        deviations, markers, known, aggregate: same as in `SegmentCompletion`.
+        descent, seed, chunk, progress: same as in `dvae.posterior`.
 
     Raises:
-        ValueError: see `SegmentCompletion.read`.
+        ValueError: same as `SegmentCompletion.read`.
     """
     spots = markers or tuple(MARKERS.values())
     program = SegmentCompletion(model, deviations or Deviations(), spots, known, aggregate)
@@ -322,22 +328,22 @@ def glimpsed(
     markers: Sequence[int] = tuple(MARKERS.values()),
     seed: int = 0,
 ) -> dict[str, Tensor]:
-    """What somebody would have seen of known segments, to see how well the rest is found.
+    """Return simulated observations of known segments, to evaluate their completion.
 
     Args:
-        model: of segments, see `SegmentCompletion`.
+        model: model of segments, as in `SegmentCompletion`.
         x, shape: frames (B, N, D) on bodies (B, S).
         kind: "surfaces", "points" or "markers".
-        fps: moments a second, at known times.
-        seconds: from the start that are seen; all by default.
-        frames: of chi that are seen in place of such moments, at times that nobody knows.
-        points: M, drawn evenly from the surface's triangles.
-        gaps: share of points or markers that are missing.
-        markers: vertices.
-        seed: of points and gaps.
+        fps: observed moments per second, at known times.
+        seconds: observed duration from the start; default: all.
+        frames: observed frames of chi, at unknown times; replaces `fps` and `seconds`.
+        points: number of points M, drawn uniformly from the surface.
+        gaps: fraction of points or markers that are missing.
+        markers: vertices of the markers.
+        seed: seed of points and gaps.
 
     Raises:
-        ValueError: another kind.
+        ValueError: the kind is unknown.
     """
     if kind not in (SURFACES, POINTS, SPOTS):
         raise ValueError(f"kind is {kind!r}; expected {SURFACES!r}, {POINTS!r} or {SPOTS!r}")
@@ -361,29 +367,29 @@ def glimpsed(
 
 
 def scanned(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:
-    """So many points of surfaces (..., V, 3), (..., M, 3): each anywhere on it as probable as anywhere else."""
+    """Draw points (..., M, 3) uniformly from surfaces (..., V, 3)."""
     first, second, third = (vertices[..., corner, :] for corner in faces.unbind(-1))
     area = (second - first).cross(third - first, dim=-1).norm(dim=-1)
     drawn = torch.multinomial(area.flatten(0, -2), points, replacement=True, generator=generator)
     which = drawn.unflatten(0, area.shape[:-1])[..., None].expand(*area.shape[:-1], points, 3)
     corners = [corner.gather(-2, which) for corner in (first, second, third)]
     across, along = torch.rand(2, *which.shape[:-1], 1, generator=generator).to(vertices)
-    across = across.sqrt()  # of a triangle, more lies towards the side than towards the corner
+    across = across.sqrt()  # a triangle is wider near its side than near its corner
     shares = 1 - across, across * (1 - along), across * along
     return torch.stack([share * corner for share, corner in zip(shares, corners, strict=True)]).sum(0)
 
 
 def chamfer(points: Tensor, vertices: Tensor) -> Tensor:
-    """Mean distance (...,) of points (..., M, 3) from the nearest of the vertices (..., V, 3), metres.
+    """Return the mean distance (...,) of points (..., M, 3) to the nearest of the vertices (..., V, 3), in metres.
 
-    One way, as few points say nothing of the rest of a surface. Points that are NaN do not count.
+    The distance is one-sided, because few points do not cover the whole surface. NaN points are ignored.
     """
     away = torch.cdist(points.nan_to_num(0.0), vertices).amin(-1)
     return torch.where(points.isfinite().all(-1), away, torch.nan).nanmean(-1)
 
 
 def surfaces_at(model: Any, x: Tensor, shape: Tensor, times: Tensor) -> Tensor:
-    """Surfaces (B, K, V, 3) of frames (B, N, D) on bodies (B, S) at times (B, K) in seconds; NaN behind the end."""
+    """Return surfaces (B, K, V, 3) of frames (B, N, D) on bodies (B, S) at times (B, K); NaN after the end."""
     met, reached = _met(model.timed, x, {TIMES: times})
     found: Tensor = model.body(shape, *model.timed.poses(met))[0]
     return torch.where((times <= reached + 1e-4)[..., None, None], found, torch.nan)
@@ -392,17 +398,17 @@ def surfaces_at(model: Any, x: Tensor, shape: Tensor, times: Tensor) -> Tensor:
 def error_by_time(
     model: Any, made: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor], times: Sequence[float]
 ) -> tuple[Tensor, Tensor]:
-    """How far predictions are from the truth at times, over all segments that are at least so long.
+    """Return the error of predictions at given times, over all segments that are long enough.
 
-    Where a prediction ends earlier it stays as it ends.
+    A prediction that ends earlier keeps its last pose.
 
     Args:
-        model: of segments.
+        model: model of segments.
         made, truth: frames (B, N, D) and bodies (B, S) of each.
-        times: K, seconds.
+        times: K times in seconds.
 
     Returns:
-        mean vertex error (K,) in metres, NaN where no segment is so long, and how many are (K,).
+        mean vertex error (K,) in metres, NaN if no segment is long enough, and the number of segments (K,).
     """
     at = torch.tensor(times).to(truth[0]).expand(len(truth[0]), -1)
     theirs = surfaces_at(model, *truth, at)
@@ -413,7 +419,7 @@ def error_by_time(
 
 
 def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tensor, points: Tensor) -> Tensor:
-    """Which vertices of moving bodies, see `Body.forward`, points (B, K, M, 3) are nearest to, (B, K, M)."""
+    """Return indices (B, K, M) of the vertices nearest to points (B, K, M, 3); other arguments as in `Body`."""
     found = []
     with torch.no_grad():
         at_once = max(1, AT_ONCE // points.shape[1])
@@ -422,17 +428,17 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
             vertices = body(*some[:3])[0]
             pairs = max(1, PAIRS // (points.shape[2] * vertices.shape[2]))
             each = zip(vertices.flatten(0, 1).split(pairs), some[3].flatten(0, 1).split(pairs), strict=True)
-            for flat, near in each:  # |p - v|^2 less |p|^2, which is the same for all of them
+            for flat, near in each:  # |p - v|^2 - |p|^2; the second term is constant
                 found.append(torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2).argmin(-1))
     return torch.cat(found).unflatten(0, points.shape[:2])  # type: ignore[no-any-return]
 
 
 def _shrunk(means: Tensor, variance: Tensor) -> Tensor:
-    """Covariance (Z, Z) of a mixture of N normals with these means (N, Z) and, on average, these variances (Z,).
+    """Return the covariance (Z, Z) of a mixture of N normals with these means (N, Z) and mean variances (Z,).
 
-    Shrunk towards its mean variance in all directions by the oracle's approximation (Chen, Wiesel, Eldar and Hero 2010,
-    IEEE Transactions on Signal Processing 58:10), so that a few segments do not forbid all that differs from them. It
-    takes means for independent, so that many segments of one take are shrunk less than they should be.
+    It is shrunk towards its mean variance in all directions, by oracle approximating shrinkage (Chen, Wiesel, Eldar and
+    Hero 2010, IEEE Transactions on Signal Processing 58:10), so that a few segments do not exclude everything else. The
+    estimator assumes independent means, so many segments of one take are shrunk too little.
     """
     (n, p), away = means.shape, means - means.mean(0)
     found = (away.mT @ away) / n + variance.diag()
@@ -447,22 +453,22 @@ def _standard(dimensions: int, kind: Tensor) -> Any:
 
 
 def _observe(name: str, made: Tensor, seen: Tensor, deviation: float) -> None:
-    """The log-density of what was seen: as a factor, for a law has a scale for each number and takes its logarithm."""
+    """Add the log density of observations as a factor, which avoids a scale per value and its logarithm."""
     known = seen.isfinite()
     away = torch.where(known, seen.nan_to_num(0.0) - made, 0.0).flatten(1).square().sum(-1)
     pyro.factor(name, -away / (2 * deviation**2) - known.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
 
 
 def _met(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-    """Frames (B, K, D) at the moments that were seen, of frames (B, N, D), and when these are, (B, K) in seconds.
+    """Return the frames (B, K, D) at the observed moments, from frames (B, N, D), and their times (B, K) in seconds.
 
-    Moments behind the end are at the end, whose time says by how much too early it comes.
+    Moments after the end use the last frame; its time then shows how much too early the segment ends.
     """
     return _along(timed.times(x), lambda frames: x if frames is None else x[:, frames], seen)
 
 
 def _along(decoded: Tensor, made: Callable[[Tensor | None], Tensor], seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-    """`_met` of frames at these times (B, N), of which those that lie at moments are made, or all (None)."""
+    """Return `_met` for frames at times `decoded` (B, N); `made` decodes the given frames, or all of them (None)."""
     many = decoded.shape[1]
     times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)
     at = times.nan_to_num(0.0)
@@ -477,10 +483,10 @@ def _along(decoded: Tensor, made: Callable[[Tensor | None], Tensor], seen: Mappi
         share = torch.where(located, frames - around[..., 0], share)
         start, end = (decoded.gather(1, each) for each in ends.unbind(-1))
     needed = torch.zeros(many, dtype=torch.bool, device=ends.device).index_fill(0, ends.flatten(), True)
-    if few := 2 * int(needed.sum()) <= many:  # of more, choosing takes longer than making all
+    if few := 2 * int(needed.sum()) <= many:  # for more frames, selection takes longer than decoding all
         ends = (needed.cumsum(0) - 1)[ends]
     x = made(needed.nonzero().squeeze(1) if few else None)
     weights = torch.stack([1 - share, share], -1)
-    # by a product of matrices, whose gradient is one too: that of an index is as large as x, once for each
+    # a matrix product has a cheap gradient; the gradient of indexing is as large as x for each index
     lines = torch.zeros(*share.shape, x.shape[1]).to(x).scatter_add(2, ends, weights)
     return lines @ x, torch.lerp(start, end, share)

@@ -1,4 +1,4 @@
-"""Segments of motion files, as runs keep and reopen them: put onto the body that ships, cut, and seen as frames."""
+"""Segments of motion files on the bundled body, in a form that runs can record and reopen."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from .frames import TimedFrames
 from .gait import Cycles, gait_cycles, reference_cycles
 
 Segmentation = Literal["gait", "clips"]
-"""How motion becomes segments: gait cycles, or clips as they are, where they last as long as a cycle may."""
+"""How motion is cut into segments: gait cycles, or whole clips whose duration is plausible for a cycle."""
 
 VALIDATION = 0.1
-"""Part of the takes for training that is held out."""
+"""Fraction of the training takes held out for validation."""
 
 
 def thinned(clips: Sequence[Clip], many: int) -> list[Clip]:
-    """So many of them, evenly, or all where there are no more."""
+    """Return at most `many` evenly spaced clips."""
     return [clips[n] for n in np.linspace(0, len(clips) - 1, min(many, len(clips))).round().astype(int)]
 
 
 @dataclass(frozen=True)
 class Takes:
-    """Where segments are from, as a run keeps it.
+    """Record of where segments were read.
 
     Args:
-        path: the file as it was given, or "simulated".
-        fingerprint: SHA-256 of the clips, and of how they are cut.
-        cut: how they are.
+        path: file as it was given, or "simulated".
+        fingerprint: SHA-256 of the clips and of `cut`.
+        cut: how clips were cut into segments.
         skip_bad: whether unusable clips were left out.
-        bodies: those on which training segments were learned, see `Segments`.
+        bodies: deviation of the training bodies, as in `Segments`.
     """
 
     path: str
@@ -58,27 +58,27 @@ class Takes:
 
 @dataclass(frozen=True, eq=False)
 class SegmentData:
-    """Segments of motion data on the body that ships.
+    """Segments of motion data on the bundled body.
 
-    Splits are by take: all segments of a clip are in its split, and the takes for validation are some of those for
-    training. Nothing is put onto the body before it is asked for.
+    Splits are by take: all segments of a clip are in its split, and the validation takes are chosen from the training
+    takes. Motion is fitted to the body only when it is needed.
 
     Args:
-        path: the file as it was given, or "simulated".
-        motion: its clips, as they were read.
-        cut: how they become segments.
+        path: file as it was given, or "simulated".
+        motion: clips as they were read.
+        cut: how clips are cut into segments.
         skip_bad: whether unusable clips were left out.
-        scaling: of turns, see `TimedFrames.of`.
-        warped: time goes along the gait cycles that are most typical of these data, see `TimedFrames`.
-        bodies: deviation of the shapes on which training segments are drawn, see `Segments`; 0 for their own.
-        seen: as which frames, those of a run; else those that training segments give.
+        scaling: scaling of rotations, as in `TimedFrames.of`.
+        warped: align the frames with the most typical gait cycles of these data, as in `TimedFrames`.
+        bodies: deviation of the shapes drawn for training segments, as in `Segments`; 0 keeps their own shapes.
+        seen: representation of a run; default: estimated from the training segments.
     """
 
     kind: ClassVar[str] = "segments"
     described: ClassVar[str] = SegmentSchema.kind
     source: ClassVar[type[Takes]] = Takes
     onto: ClassVar[bool] = False
-    """Of all motion alike: it is put onto the body, and never onto the skeleton of a run."""
+    """Always False: all motion is fitted to the body, never mapped to the skeleton of a run."""
 
     path: str
     motion: MotionSet
@@ -94,17 +94,17 @@ class SegmentData:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str] = SIMULATED, skip_bad: bool = False, **options: Any) -> Self:
-        """Reads a motion file, or simulates.
+        """Read a motion file, or simulate motion.
 
         Args:
-            path: of a file or folder that `read_motion` reads, or "simulated" for `simulate()`. Takes that are in
-                neither split "train" nor "test" are divided, the last fifth of them for test; of one alone, its end.
-            skip_bad: leave out unusable clips instead of refusing the file.
-            **options: cut, scaling, warped, bodies and seen, see the class.
+            path: file or folder that `read_motion` reads, or "simulated" for `simulate()`. Takes whose split is neither
+                "train" nor "test" are divided: the last fifth is for testing. A single take is divided in time.
+            skip_bad: leave out unusable clips instead of raising an error.
+            **options: cut, scaling, warped, bodies and seen, as in the class.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: a file that cannot be read, or an unknown option.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file cannot be read, or an option is invalid.
         """
         name = os.fspath(path)
         motion = simulate() if name == SIMULATED else read_motion(name, skip_bad=skip_bad)
@@ -115,25 +115,25 @@ class SegmentData:
 
     @property
     def location(self) -> str:
-        """Where the clips are, as any process finds them."""
+        """Absolute path of the clips, or "simulated"."""
         return self.path if self.path == SIMULATED else os.path.abspath(self.path)
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the clips as they were read, and of how they are cut."""
+        """SHA-256 of the clips as they were read, and of `cut`."""
         return hashlib.sha256(f"{self.motion.fingerprint()} {self.cut}".encode()).hexdigest()
 
     @property
     def schema(self) -> SegmentSchema:
-        """What a model must know of the segments."""
+        """Schema of the segments for models."""
         return SegmentSchema.under(self.timed, human())
 
     @cached_property
     def segments(self) -> MotionSet:
-        """All of them, each a clip on the joints of the body, with the label `source` that names its take.
+        """All segments, each a clip on the joints of the body; the label `source` names its take.
 
         Raises:
-            ValueError: there is none.
+            ValueError: no segments were found.
         """
         if self.cut == "gait":
             return gait_cycles(self._embodied)
@@ -149,29 +149,29 @@ class SegmentData:
 
     @cached_property
     def timed(self) -> TimedFrames:
-        """As which frames they are seen."""
+        """Representation of the segments as frames."""
         return self.seen or self._training.timed
 
     def windows(self, split: str) -> Segments:
-        """The segments of "train", "validation" or "test".
+        """Return the segments of "train", "validation" or "test".
 
         Raises:
-            ValueError: there is none, or no such split.
+            ValueError: the split is unknown or empty.
         """
         return self._training if split == "train" else Segments(self._of(split), self.timed)
 
     def found(self, name: str) -> Segments:
-        """One segment, by its name; or the first one of a take.
+        """Return one segment by its name, or the first segment of a take.
 
         Args:
-            name: of either, or split/name where it is not unique.
+            name: name of a segment or take, or split/name if the name is not unique.
 
         Raises:
-            ValueError: there is none, or more than one.
+            ValueError: no segment or several segments match.
         """
 
         def among(names: Mapping[str, Clip]) -> list[Clip]:
-            """Those called so, with or without their split."""
+            """Return the clips with this name, with or without their split."""
             return [clip for key, clip in names.items() if name in (key, key.partition("/")[2])]
 
         segments = {f"{clip.split}/{clip.name}": clip for clip in self.segments}
@@ -187,27 +187,29 @@ class SegmentData:
         return Segments(replace(self.segments, clips=clips), self.timed)
 
     def recorded(self) -> Takes:
-        """Where the clips are; `reopened` reads it."""
+        """Return the record of these data that `reopened` reads."""
         return Takes(self.path, self.fingerprint, self.cut, self.skip_bad, self.bodies)
 
     @classmethod
     def reopened(cls, source: Takes, schema: SegmentSchema, path: str | os.PathLike[str] | None = None) -> Self:
-        """The data that were recorded, from there or from another path, whatever they are now, as frames of a run.
+        """Open recorded data again, from the recorded path or from another one, in the representation of a run.
+
+        The content may have changed.
 
         Args:
-            source: as `recorded` gave it.
-            schema: of the run.
-            path: where they lie now, or of others.
+            source: result of `recorded`.
+            schema: schema of the run.
+            path: current path, or path of other data.
 
         Raises:
-            FileNotFoundError, ValueError: see `open`.
+            FileNotFoundError, ValueError: same as `open`.
         """
         kept = {"cut": source.cut, "bodies": source.bodies}
         return cls.open(path or source.path, source.skip_bad, **kept, seen=schema.timed)
 
     @cached_property
     def _training(self) -> Segments:
-        """Those from which frames have their units, unless these are those of a run."""
+        """The training segments, which define the units of frames unless a run defines them."""
         motion = self._of("train")
         if self.seen is not None:
             return Segments(motion, self.seen, bodies=self.bodies)

@@ -1,7 +1,7 @@
-"""Segments of motion on a body with a surface: what a latent space of 4D motion learns from.
+"""Segments of motion on a body with a surface: the training data of a latent space of 4D motion.
 
-Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387: a segment is chi, time-stamped frames
-(`segments.TimedFrames`), beside beta, the shape of the body that moves.
+Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387: a segment consists of chi, time-stamped frames
+(`segments.TimedFrames`), and beta, the shape of the moving body.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from .frames import OFFSETS, ORIGIN, TimedFrames
 from .gait import Reference
 
 SHAPE = "beta"
-"""Name in batches of parameters of shape, (B, S)."""
+"""Name in batches of the shape parameters, (B, S)."""
 
 
 @dataclass(frozen=True)
 class SegmentSchema(Schema):
-    """The schema of segments on the body that ships, x (B, N, D) beside beta (B, S).
+    """The schema of segments on the bundled body: x (B, N, D) and beta (B, S).
 
     Args:
-        timed: how segments become frames and back.
+        timed: conversion between segments and frames.
     """
 
     kind: ClassVar[str] = "segments"
@@ -46,7 +46,7 @@ class SegmentSchema(Schema):
 
     @classmethod
     def under(cls, timed: TimedFrames, body: Body) -> Self:
-        """Of frames, and bodies with these parameters."""
+        """Return the schema for these frames and for the shape parameters of a body."""
         sizes = {name: len(places) for name, places in timed.parts.items()}
         return cls({**sizes, SHAPE: body.parameters_of_shape}, timed.frames, timed=timed)
 
@@ -58,7 +58,7 @@ class SegmentSchema(Schema):
     @property
     @override
     def windows(self) -> Schema:
-        """Whatever frames models see of them, what they make are surfaces of the same bodies."""
+        """Schema of the results, which are surfaces of the same bodies whatever the representation of frames."""
         return Schema({SHAPE: self.size(SHAPE)})
 
     @override
@@ -82,7 +82,7 @@ class SegmentSchema(Schema):
 
 
 def _reference(config: Mapping[str, Any]) -> Reference:
-    """One that a config says."""
+    """Return the reference of a config."""
     hips = np.array(config["hips"], dtype=np.float64)
     if hips.ndim != 3 or hips.shape[1:] != (2, 4) or len(hips) < 2 or not np.isfinite(hips).all():
         raise ValueError(f"hips of a reference are {hips.shape}, expected finite quaternions (at least 2, 2, 4)")
@@ -90,18 +90,19 @@ def _reference(config: Mapping[str, Any]) -> Reference:
 
 
 class Segments:
-    """Segments as a model sees them: training data that draws batches, or held-out ones.
+    """Segments in the representation of a model: training data that draw batches, or test data.
 
     Args:
-        motion: segments on the joints of the body, each a clip (see `bodies.fitted`, `gait_cycles`).
-        timed: how they become frames; that of the training data, for held-out ones.
-        body: whose joints these are; the person that ships by default.
-        seen: what `timed` makes of them, where that is known.
-        bodies: deviation of the parameters of bodies that `sample` draws for segments in place of their own, places in
-            lengths of legs (see `bodies.retargeted`); 0 for their own. Who has learned from few bodies knows no others.
+        motion: segments on the joints of the body, each a clip, e.g. from `bodies.fitted` and `gait_cycles`.
+        timed: conversion to frames; for test data, the one of the training data.
+        body: body with these joints; default: the bundled person.
+        seen: result of `timed` for these segments, if known.
+        bodies: standard deviation of the shape parameters that `sample` draws in place of the segments' own; 0 keeps
+            their own. Root positions scale with the length of the legs, as in `bodies.retargeted`. A model trained on
+            few bodies does not generalise to others.
 
     Raises:
-        ValueError: motion on other joints.
+        ValueError: the motion has other joints.
     """
 
     def __init__(
@@ -123,11 +124,11 @@ class Segments:
         return len(self.motion)
 
     def all(self) -> Mapping[str, Any]:
-        """All of them: x (B, N, D) and beta (B, S)."""
+        """Return all segments: x (B, N, D) and beta (B, S)."""
         return self._batch
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Mapping[str, Any]:
-        """So many different ones in random order; all of them if there are no more."""
+        """Return `batch_size` distinct segments in random order, or all if there are fewer."""
         chosen = torch.randperm(len(self), generator=generator)[:batch_size]
         batch = Batch(self._batch).rows(chosen)
         if not self.bodies:
@@ -136,7 +137,7 @@ class Segments:
         return self.on(batch, drawn.clamp(-MOST, MOST))
 
     def on(self, batch: Mapping[str, Any], shape: Tensor) -> Mapping[str, Any]:
-        """The same turns and times on bodies (B, S), places in lengths of legs."""
+        """Return the same rotations and times on bodies (B, S); root positions scale with the length of the legs."""
         legs = [standing(self.body, shapes).to(shape) for shapes in (batch[SHAPE], shape)]
         x = batch[WHOLE].clone()
         x[..., self.timed.parts["place"]] *= (legs[1] / legs[0])[:, None, None]
@@ -144,30 +145,30 @@ class Segments:
 
     @property
     def labels(self) -> Sequence[Mapping[str, str]]:
-        """Of each."""
+        """Labels of each segment."""
         return [clip.labels for clip in self.motion]
 
     @property
     def schema(self) -> SegmentSchema:
-        """What a model must know of them."""
+        """Schema of the segments for models."""
         return SegmentSchema.under(self.timed, self.body)
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of what models see."""
+        """SHA-256 of the model's input."""
         content = b"".join(self._batch[name].numpy().tobytes() for name in (WHOLE, SHAPE))
         return hashlib.sha256(content).hexdigest()
 
     def back(self, x: Tensor, shape: Tensor | None = None, fps: float | None = None) -> MotionSet:
-        """Motion of frames (B, N, D), from where these segments start; on bodies (B, S), theirs by default."""
+        """Convert frames (B, N, D) to motion from the start of these segments, on bodies (B, S) or their own."""
         offsets = self.body.offsets(self._batch[SHAPE] if shape is None else shape)
         return self.timed.back({**self._start, OFFSETS: offsets, WHOLE: x}, fps)
 
 
 def surfaces_of(timed: TimedFrames, body: Body, x: Tensor, shape: Tensor) -> Tensor:
-    """Surfaces (..., N, V, 3) in metres of frames (..., N, D) on bodies (..., S), with gradients.
+    """Return surfaces (..., N, V, 3) in metres of frames (..., N, D) on bodies (..., S), with gradients.
 
-    Everybody starts at the origin, facing heading zero.
+    Every segment starts at the origin with heading zero.
     """
     rotations, place, _ = timed.unpack(x)
     found: Tensor = body(shape, rotations, place)[0]

@@ -1,17 +1,17 @@
-"""Segments of motion as time-stamped frames, chi of a latent space of 4D motion.
+"""Segments of motion as time-stamped frames, the chi of a latent space of 4D motion.
 
 Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387, section 3:
 
-    chi = [Theta, Gamma, Phi]     N frames of turns of joints, place of the root, and time
+    chi = [Theta, Gamma, Phi]     N frames of joint rotations, root position, and time
 
-* Theta: the turn of every joint from which others hang as six numbers, less those of no turn, 1 0 0 0 1 0. Ends, whose
-  turns move nothing, are left out, and come back unturned.
-* Gamma: where the root is from where it was in the first frame, in units that leave it between -1 and 1.
-* Phi: how long after the frame before a frame is; 0 in the first. So all of them add up to how long a segment lasts,
-  from its first frame to its last: (F - 1) / fps of F frames.
+* Theta: the rotation of every joint with children as six numbers, minus the identity, 1 0 0 0 1 0. Joints without
+  children are left out, because their rotations move nothing; they return as the identity.
+* Gamma: the position of the root relative to the first frame, scaled to lie between -1 and 1.
+* Phi: the time since the previous frame; 0 in the first frame. The sum of Phi is the duration of a segment from its
+  first to its last frame: (F - 1) / fps for F frames.
 
-A segment starts facing one way: the heading of its first frame is taken from it, and nothing else of how its root is
-turned, so that down stays down.
+Segments are rotated to heading zero in their first frame. Only the heading of the root rotation is removed, so the
+vertical direction is preserved.
 """
 
 from __future__ import annotations
@@ -37,40 +37,42 @@ from ..geometry.views import HEADING
 from .gait import Reference, stamps
 
 OFFSETS = "offsets"
-"""Name in batches of rest poses (B, J, 3) in metres: where joints are, on average, from their parents as these turn."""
+"""Name in batches of rest poses (B, J, 3) in metres: mean offsets of joints in the coordinates of their parents."""
 
 ORIGIN = "origin"
-"""Name in batches of where roots are in first frames, (B, 3) in metres."""
+"""Name in batches of the root positions in first frames, (B, 3) in metres."""
 
 ROUNDS = 4
-"""Of correcting what interpolation there and back loses, each of which leaves half of it or less: of 91 frames of
-bandai2 and cmu8 at 30 a second, of the largest errors of 4 and 13 mm, .2 and .7."""
+"""Iterations that correct the loss of interpolation to N frames and back; each halves the loss at least.
+
+For segments of 91 frames of bandai2 and cmu8 at 30 frames a second, the largest errors fall from 4 and 13 mm to .2
+and .7 mm."""
 
 STEADY = 1e-3
-"""Deviation, of numbers of turns, below which one is taken for so much."""
+"""Smallest standard deviation of a rotation component; smaller values are replaced by it."""
 
 BRIEFEST = 0.01
-"""Share of an even increment of the longest segment that an increment has at least, whatever a decoder makes of it."""
+"""Minimum time increment of a decoded frame, relative to the even increment of the longest segment."""
 
 AT_ONCE = 4096
-"""Frames of clips of one length that are read at once, for which there is room in a processor's cache."""
+"""Number of frames of equally long clips that are processed at once, so that they fit into a processor's cache."""
 
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Segments of motion, and back to motion.
+    """Conversion of segments of motion to time-stamped frames and back.
 
     Args:
-        skeleton: of the segments, with a rest pose, left and right.
-        frames: N.
-        metres: by which places are divided.
-        seconds: how long the segment lasts whose even increments are 1.
-        mean, deviation: of the six numbers of each turning joint; empty for those of no turn, and 1.
-        references: cycles along which time is warped: a frame of chi is where the same frame of the nearest of them,
-            brought to N frames, is found in the segment (`gait.stamps`). None: N frames evenly in time.
+        skeleton: skeleton of the segments, with a rest pose, left and right.
+        frames: number of frames N.
+        metres: unit of positions in metres.
+        seconds: duration of the segment whose even increments are 1.
+        mean, deviation: of the six numbers of each joint with children; default: the identity rotation, and 1.
+        references: reference cycles for time warping. Frame n of chi is the point in the segment that is aligned with
+            frame n of the nearest reference, resampled to N frames (`gait.stamps`). Default: N frames evenly in time.
 
     Raises:
-        ValueError: a skeleton without rest pose or sides, or as many numbers as no turns have.
+        ValueError: the skeleton has no rest pose or sides, or `mean` or `deviation` have a wrong number of values.
 
     Example:
         >>> people = dvae.motion.simulate(clips=2, frames=60).with_rotations()
@@ -90,7 +92,7 @@ class TimedFrames:
     def __post_init__(self) -> None:
         check(self)
         for needed in ("offsets", "sides"):
-            getattr(self.skeleton, needed)  # which say what to do where there are none
+            getattr(self.skeleton, needed)  # these properties raise errors that explain what to do
         if self.frames < 2:
             raise ValueError(f"{self.frames} frame has no time between frames; expected at least 2")
         for name in ("mean", "deviation"):
@@ -111,17 +113,17 @@ class TimedFrames:
         scaling: Literal["identity", "deviation"] = "identity",
         references: Sequence[Reference] = (),
     ) -> Self:
-        """In units of these segments, which are those for training.
+        """Return the conversion with units estimated from training segments.
 
         Args:
-            motion: segments, with rotations.
-            frames: N.
-            scaling: of turns: "identity" takes no turn from them, "deviation" their mean, and divides by their
-                deviation, which the paper found unstable.
-            references: see the class.
+            motion: segments with rotations.
+            frames: number of frames N.
+            scaling: scaling of rotations: "identity" subtracts the identity rotation, "deviation" standardises by mean
+                and standard deviation, which the paper found unstable.
+            references: reference cycles for time warping, as in the class.
 
         Raises:
-            ValueError: another scaling; or see `to`.
+            ValueError: the scaling is unknown, or `to` raises it.
         """
         return cls.seeing(motion, frames, scaling, references)[0]
 
@@ -133,12 +135,13 @@ class TimedFrames:
         scaling: Literal["identity", "deviation"] = "identity",
         references: Sequence[Reference] = (),
     ) -> tuple[Self, dict[str, Any]]:
-        """`of` segments, and these segments so (`to`), where both are needed: frames are made once."""
+        """Return the results of `of` and of `to` for these segments; their frames are computed only once."""
         if scaling not in ("identity", "deviation"):
             raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
         made = cls(motion.skeleton, frames, references=references)
         found = made._found(motion)
-        x = made._scaled(found)[WHOLE]  # of single precision, as units do not hang on a double's last digits
+        # in single precision, so that units do not depend on the last digits of a double
+        x = made._scaled(found)[WHOLE]
         metres = max(float(x[..., made.parts["place"]].abs().max()), 1e-3)
         made = replace(made, metres=metres, seconds=float(made.lasts(x[..., -1:].double()).max()))
         if scaling == "deviation":
@@ -149,48 +152,48 @@ class TimedFrames:
 
     @property
     def turning(self) -> list[int]:
-        """The K joints from which others hang."""
+        """The K joints with children."""
         return sorted({parent for parent, _ in self.skeleton.edges})
 
     @property
     def size(self) -> int:
-        """Numbers of a frame, 6 K + 4."""
+        """Number of values per frame, 6 K + 4."""
         return 6 * len(self.turning) + 4
 
     @property
     def parts(self) -> Mapping[str, list[int]]:
-        """Coordinates of a frame by what they are of: turns (Theta), place (Gamma), time (Phi)."""
+        """Coordinates of a frame by part: turns (rotations, Theta), place (root position, Gamma), time (Phi)."""
         turns = 6 * len(self.turning)
         return {"turns": [*range(turns)], "place": [*range(turns, turns + 3)], "time": [turns + 3]}
 
     def to(self, motion: MotionSet) -> dict[str, Any]:
-        """Segments, each a clip, as time-stamped frames.
+        """Convert segments, each a clip, to time-stamped frames.
 
         Args:
-            motion: at any rate, with rotations.
+            motion: clips with rotations, at any frame rate.
 
         Returns:
-            A batch: x (B, N, D), and what the way back needs: the heading (B,) in radians and the origin (B, 3) in
-            metres of first frames, and the body, as offsets (B, J, 3) of its rest pose.
+            A batch of x (B, N, D) and the information that `back` needs: the heading (B,) in radians and the origin
+            (B, 3) in metres of first frames, and the body as offsets (B, J, 3) of its rest pose.
 
         Raises:
-            ValueError: clips without rotations, of one frame, or of another skeleton.
+            ValueError: a clip has no rotations, only one frame, or another skeleton.
         """
         return self._scaled(self._found(motion))
 
     def back(self, seen: Mapping[str, Any], fps: float | None = None) -> MotionSet:
-        """Motion of time-stamped frames: what `to` made, or a decoder.
+        """Convert time-stamped frames, from `to` or from a decoder, to motion.
 
         Args:
-            seen: x (B, N, D). Without a heading, everybody starts facing heading zero; without an origin, at 0; without
-                offsets, with the body of the skeleton's rest pose.
-            fps: of the motion; that of the skeleton by default.
+            seen: x (B, N, D), and optional entries. Defaults: heading zero, origin 0, and the body of the skeleton's
+                rest pose as offsets.
+            fps: frames per second; default: the rate of the skeleton.
 
         Returns:
-            A clip for each, with positions and rotations, from time 0 to the last that is not after its end.
+            One clip per segment with positions and rotations, from time 0 to its last full frame.
 
         Raises:
-            ValueError: x of another shape, or with what is no number.
+            ValueError: x has another shape, or values that are NaN or infinite.
         """
         skeleton, x = replace(self.skeleton, fps=fps or self.skeleton.fps), seen[WHOLE].detach().cpu().double()
         if not x.isfinite().all():
@@ -216,14 +219,14 @@ class TimedFrames:
         return MotionSet(clips, skeleton, "segments")
 
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What frames (..., N, D) say, with gradients.
+        """Return rotations, root positions and times of frames (..., N, D), with gradients.
 
         Returns:
-            local rotations of all joints (..., N, J, 3, 3), of ends none; places of the root from where it was at
-            first (..., N, 3) in metres; and times from the first frame (..., N) in seconds.
+            local rotations of all joints (..., N, J, 3, 3), the identity without children; root positions relative to
+            the first frame (..., N, 3) in metres; and times since the first frame (..., N) in seconds.
 
         Raises:
-            ValueError: another shape.
+            ValueError: x has another shape.
         """
         if x.shape[-2:] != (self.frames, self.size):
             raise ValueError(
@@ -233,7 +236,7 @@ class TimedFrames:
         return *self.poses(x), self.times(x)
 
     def poses(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """What any frames (..., D) say of poses, with gradients: rotations (..., J, 3, 3) and places (..., 3)."""
+        """Return rotations (..., J, 3, 3) and root positions (..., 3) of any frames (..., D), with gradients."""
         turning = self.turning
         ends = [joint for joint in range(self.skeleton.joints) if joint not in turning]
         unturned = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], len(ends), 3, 3)
@@ -242,23 +245,23 @@ class TimedFrames:
         return rotations, x[..., -4:-1] * self.metres
 
     def times(self, x: Tensor) -> Tensor:
-        """When frames (..., N, D) are, from the first on, (..., N) in seconds, with gradients."""
+        """Return the times of frames (..., N, D) since the first frame, (..., N) in seconds, with gradients."""
         even = self.seconds / (self.frames - 1)
         later = x[..., -1][..., 1:].clamp(BRIEFEST) * even
         return pad(later.cumsum(-1), (1, 0))
 
     def lasts(self, x: Tensor) -> Tensor:
-        """How long segments (..., N, D) last, (...,) in seconds: the sum of their increments."""
+        """Return the durations of segments (..., N, D), (...,) in seconds: the sum of their increments."""
         return self.times(x)[..., -1]
 
     def travels(self, x: Tensor) -> Tensor:
-        """How far roots get from the first of frames (..., N, D) to the last, (...,) in metres."""
+        """Return the distance of the root between first and last frame of (..., N, D), (...,) in metres."""
         first, last = self.poses(x[..., [0, -1], :])[1].unbind(-2)
         found: Tensor = (last - first).norm(dim=-1)
         return found
 
     def _found(self, motion: MotionSet) -> dict[str, Tensor]:
-        """What `to` gives, with x as it is: six numbers of each turn, metres, seconds."""
+        """Return the result of `to` with x before scaling: six numbers per rotation, metres, seconds."""
         skeleton = motion.skeleton
         if (skeleton.names, skeleton.parents, skeleton.up) != tuple(
             getattr(self.skeleton, name) for name in ("names", "parents", "up")
@@ -286,9 +289,9 @@ class TimedFrames:
         return {WHOLE: x, HEADING: heading, ORIGIN: origin, OFFSETS: offsets}
 
     def _seen(self, turns: Tensor, place: Tensor, at: np.ndarray, fps: float, angle: Tensor) -> Tensor:
-        """x as it is (B, N, D) of quaternions (B, F, J, 4) and places (B, F, 3), turned by angles (B, 1).
+        """Return unscaled x (B, N, D) of quaternions (B, F, J, 4) and positions (B, F, 3), rotated by angles (B, 1).
 
-        Its frames are at frames (B, N) of the clips, or (1, N) of all of them.
+        Its frames are at frames `at` (B, N) of the clips, or (1, N) for all clips.
         """
         root, times = self.skeleton.root, np.arange(turns.shape[1])
         first, place = self._faced(to_matrix(turns[:, :, root], "quaternion"), place - place[:, :1], angle)
@@ -297,7 +300,7 @@ class TimedFrames:
         there = torch.stack([_cubic(times, each) for each in at])
         again = torch.stack([_cubic(each, times) for each in at])
         values = _normed(there @ given)
-        for _ in range(ROUNDS):  # what comes back less or more than it was, goes in more or less
+        for _ in range(ROUNDS):  # add the error of the round trip to the values
             values = _normed(values + there @ (given - _normed(again @ values)))
         turns, place = _parted(values)
         six = from_matrix(to_matrix(turns, "quaternion"), "6d").flatten(-2)
@@ -305,19 +308,19 @@ class TimedFrames:
         return torch.cat([six, place, increments[..., None]], -1)
 
     def _scaled(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """What was found in these units, single precision."""
+        """Return scaled values in single precision."""
         mean, deviation = self._scaling(found[WHOLE])
         others = mean.new_tensor([self.metres] * 3 + [self.seconds / (self.frames - 1)])
         x = (found[WHOLE] - pad(mean, (0, 4))).div_(torch.cat([deviation, others]))
         return {name: value.float() for name, value in {**found, WHOLE: x}.items()}
 
     def _faced(self, turn: Tensor, place: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-        """The root's rotations (..., 3, 3) and places (..., 3), turned about the up axis by angles (...)."""
+        """Rotate the root's rotations (..., 3, 3) and positions (..., 3) about the up axis by angles (...)."""
         up = self.skeleton.up
         return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(place, angle, up)
 
     def _turns(self, x: Tensor) -> Tensor:
-        """Six numbers of each turning joint (..., K, 6)."""
+        """Return six numbers of each joint with children (..., K, 6)."""
         mean, deviation = self._scaling(x)
         found: Tensor = (x[..., :-4] * deviation + mean).unflatten(-1, (-1, 6))
         return found
@@ -328,20 +331,21 @@ class TimedFrames:
 
 
 def resting_offsets(motion: MotionSet) -> Tensor:
-    """Where joints of clips with rotations are, on average, from their parents as these turn, (B, J, 3) in metres."""
+    """Return mean offsets of joints from their parents, in the coordinates of the parents, (B, J, 3) in metres."""
     skeleton = motion.skeleton
     parents, children = (list(ends) for ends in zip(*skeleton.edges, strict=True))
     found = torch.zeros(len(motion), skeleton.joints, 3, dtype=torch.float64)
     for some, turns, places in _of_one_length(motion):
         local = to_matrix(turns, "quaternion")
-        _, world = kinematics.forward(skeleton.parents, local, places, places[..., 0, :])  # turns, whatever hangs there
+        # rotations only; the offsets do not matter here
+        _, world = kinematics.forward(skeleton.parents, local, places, places[..., 0, :])
         limbs = (places[..., children, :] - places[..., parents, :])[..., None]
         found[some[:, None], children] = (world[..., parents, :, :].mT @ limbs).squeeze(-1).mean(1)
     return found
 
 
 def _of_one_length(motion: MotionSet) -> Iterator[tuple[np.ndarray, Tensor, Tensor]]:
-    """Places of some clips in a set, and their quaternions (B, F, J, 4) and positions (B, F, J, 3)."""
+    """Yield batches of equally long clips: indices in the set, quaternions (B, F, J, 4) and positions (B, F, J, 3)."""
     lengths = np.array([clip.frames for clip in motion])
     for frames in np.unique(lengths):
         alike = np.flatnonzero(lengths == frames)
@@ -352,24 +356,24 @@ def _of_one_length(motion: MotionSet) -> Iterator[tuple[np.ndarray, Tensor, Tens
 
 
 def _joined(quaternions: Tensor, place: Tensor) -> Tensor:
-    """(..., 4 K + 3) of (..., K, 4) and (..., 3)."""
+    """Concatenate (..., K, 4) and (..., 3) to (..., 4 K + 3)."""
     return torch.cat([quaternions.flatten(-2), place], -1)
 
 
 def _parted(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Quaternions (..., K, 4) and places (..., 3) of joined ones."""
+    """Split joined values into quaternions (..., K, 4) and positions (..., 3)."""
     return values[..., :-3].unflatten(-1, (-1, 4)), values[..., -3:]
 
 
 def _normed(values: Tensor) -> Tensor:
-    """Joined ones, whose quaternions are brought to unit length in place."""
+    """Normalise the quaternions of joined values in place."""
     turns, _ = _parted(values)
     turns /= turns.norm(dim=-1, keepdim=True)
     return values
 
 
 def _cubic(times: np.ndarray, at: np.ndarray) -> Tensor:
-    """What takes values at F times to those at N others on a cubic through them, the not-a-knot spline: (N, F)."""
+    """Return the matrix (N, F) that interpolates values at F times to N others by the not-a-knot cubic spline."""
     degree = min(3, len(times) - 1)
     knots = np.concatenate([times[:1].repeat(degree + 1), times[2:-2], times[-1:].repeat(degree + 1)])
     splines = scipy.interpolate.BSpline

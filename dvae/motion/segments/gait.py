@@ -1,18 +1,20 @@
-"""Gait cycles: motion cut where legs swing as in one of two references, one for either foot that starts.
+"""Gait cycles: cut motion where the legs swing as in one of two references, one per starting foot.
 
-Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387, section 5: the turns of the hips of every subsequence are
-compared by dynamic time warping with two reference cycles, and those that cost less than a threshold are kept, if they
-last between .3 and 3 seconds. Which cycles, which threshold, and what of subsequences that overlap, it leaves open:
+Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387, section 5: the hip rotations of every subsequence are
+compared with two reference cycles by dynamic time warping. Subsequences that cost less than a threshold are kept, if
+they last between .3 and 3 seconds. The paper does not specify the references, the threshold, or the treatment of
+overlapping subsequences. Our choices:
 
-* **References are the most typical cycles of regular walks.** How far the left thigh is bent forward, less the right
-  one, repeats itself after a cycle and is its own opposite after half of one: its correlation with itself a cycle
-  later, less that half a cycle later, is 2 where all steps are alike. Clips where it comes near are cut from where a
-  thigh is furthest forward (just before that foot is put down) to where it is so again; of these cycles the reference
-  is the one from which the others are least far. No label is read.
-* **A hip's turn is the thigh's against the pelvis**, and how far poses are from each other the root mean square of the
-  angles between both of their hips' turns; a subsequence's cost is the mean of it along the path, in radians.
-* **Of subsequences that overlap the cheapest is kept**, of either reference for itself: a walk gives cycles of the left
-  foot end to end, and those of the right half a cycle later.
+* **References are the most typical cycles of regular walks.** The signal is the forward angle of the left thigh minus
+  the angle of the right one. It repeats after a cycle and changes its sign after half a cycle. Its autocorrelation at a
+  cycle minus its autocorrelation at half a cycle is therefore 2 if all steps are equal. Clips near this value are cut
+  between the times where a thigh is furthest forward (just before the foot is put down). The reference is the cycle
+  with the smallest mean distance from the others. Labels are not used.
+* **The rotation of a hip is the rotation of the thigh relative to the pelvis.** The distance of two poses is the root
+  mean square angle between the rotations of both hips. The cost of a subsequence is the mean distance along the path,
+  in radians.
+* **Of overlapping subsequences, the cheapest is kept**, separately for each reference: a walk is cut into consecutive
+  cycles of the left foot, and into cycles of the right foot half a cycle later.
 """
 
 from __future__ import annotations
@@ -35,21 +37,21 @@ from ..geometry.skeleton import Skeleton, rotate_about_up
 from .warping import alignment, subsequence_costs
 
 MOST_CYCLES = 400
-"""Of which the most typical is found."""
+"""Maximum number of cycles among which the most typical one is chosen."""
 
 
 @dataclass(frozen=True)
 class Cycles:
-    """What is a gait cycle.
+    """Definition of a gait cycle.
 
     Args:
-        threshold: most that its hips cost, in radians: the mean angle along the path to a reference; and most that its
-            last pose is from its first, as half a cycle ends with the other foot in front.
-        shortest, longest: seconds that it lasts.
-        overlap: share of the shorter of two cycles that start with one foot, that they may share.
-        rate: frames a second at which motion is compared.
-        swing: least deviation of the angle between the thighs in it, in radians; less is no step, whatever it costs.
-        regular: least that a clip for references repeats itself, of 2.
+        threshold: maximum cost of the hips in radians: the mean angle along the path to a reference. It also bounds the
+            distance between first and last pose, since half a cycle ends with the other foot in front.
+        shortest, longest: minimum and maximum duration in seconds.
+        overlap: maximum overlap of two cycles with the same starting foot, as a fraction of the shorter one.
+        rate: frames per second of the comparison.
+        swing: minimum standard deviation of the angle between the thighs, in radians; motion with less is not a step.
+        regular: minimum regularity of a clip that provides references, at most 2.
     """
 
     threshold: Amount = 0.25
@@ -68,13 +70,13 @@ class Cycles:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A cycle with which motion is compared.
+    """A reference cycle for comparison with motion.
 
     Args:
-        side: of the foot that starts.
-        hips: turns against the pelvis, quaternions (M, 2, 4) of the left and the right hip.
-        rate: frames a second.
-        source: split and name of the clip that it is from.
+        side: side of the starting foot.
+        hips: (M, 2, 4), rotations of the left and the right hip relative to the pelvis, as quaternions.
+        rate: frames per second.
+        source: split and name of the clip it was taken from.
     """
 
     side: Literal["left", "right"]
@@ -84,12 +86,12 @@ class Reference:
 
     @property
     def seconds(self) -> float:
-        """That it lasts."""
+        """Duration in seconds."""
         return (len(self.hips) - 1) / self.rate
 
 
 class Found(NamedTuple):
-    """A cycle in a clip: of which foot, its first and last frame, and what it costs, in radians."""
+    """A cycle in a clip: its starting foot, its first and last frame, and its cost in radians."""
 
     side: str
     first: int
@@ -100,19 +102,19 @@ class Found(NamedTuple):
 def gait_cycles(
     motion: MotionSet, references: Sequence[Reference] | None = None, cycles: Cycles | None = None
 ) -> MotionSet:
-    """The gait cycles of motion, a clip each.
+    """Return the gait cycles of motion, each as a clip.
 
     Args:
-        motion: with rotations (`MotionSet.with_rotations`).
-        references: with which it is compared; those of `reference_cycles` by default.
-        cycles: what is one.
+        motion: clips with rotations (`MotionSet.with_rotations`).
+        references: reference cycles; default: the result of `reference_cycles`.
+        cycles: definition of a cycle.
 
     Returns:
-        Clips in the splits of those that they are from, with their labels and `cycle` (left or right, the foot that
-        starts), `source` (the name of the clip), `start` (its frame) and `cost` (radians).
+        Clips in the splits of their sources, with the labels of their sources and `cycle` (left or right, the starting
+        foot), `source` (name of the clip), `start` (its frame) and `cost` (radians).
 
     Raises:
-        ValueError: there is none, or see `reference_cycles`.
+        ValueError: no cycles were found, or `reference_cycles` raises it.
     """
     cycles = cycles or Cycles()
     references = reference_cycles(motion, cycles) if references is None else references
@@ -131,13 +133,14 @@ def gait_cycles(
 
 
 def alike(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
-    """Motion of two sources on the joints that both have, so that who learns from the one can be tested on the other.
+    """Return the motion of two sources on their common joints, to train on one and test on the other.
 
-    Both get one tree, that of the first without the joints that the second lacks, loosened where bones move against
-    each other in either (`MotionSet.loosened`). Each has rotations, found for a rest pose of its own.
+    Both get the same tree: the tree of the first without the joints that the second does not have. `MotionSet.loosened`
+    adds joints where bones move relative to each other in either source. Each source has rotations, estimated for its
+    own rest pose.
 
     Raises:
-        ValueError: what they share is no tree.
+        ValueError: the common joints do not form a tree.
     """
     from ..files.reading import chosen
 
@@ -157,10 +160,10 @@ def alike(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
 
 
 def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference], cycles: Cycles) -> list[Found]:
-    """The gait cycles of a clip, in the order of their first frames.
+    """Return the gait cycles of a clip, ordered by their first frames.
 
     Raises:
-        ValueError: a clip without rotations, or references of another rate than that of `cycles`.
+        ValueError: the clip has no rotations, or the rate of a reference differs from `cycles.rate`.
     """
     compared, ratio = _at_rate(clip, skeleton.fps, cycles.rate)
     turned = _turned(compared, skeleton)
@@ -175,7 +178,7 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
         if reference.rate != cycles.rate:
             raise ValueError(f"a reference has {reference.rate:g} frames a second, and cycles {cycles.rate:g}")
         if not possible.any():
-            continue  # as in most clips, and costs are what takes long
+            continue  # true for most clips; skips the expensive costs
         costs = subsequence_costs(_apart(reference.hips, hips), longest)
         costs[~possible] = np.inf
         for first, frames in _cheapest(costs, cycles.threshold, cycles.overlap):
@@ -185,14 +188,14 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
 
 
 def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[Reference, Reference]:
-    """A cycle that starts with the left foot and one that starts with the right, the most typical of regular walks.
+    """Return the most typical cycles of regular walks, one that starts with the left foot and one with the right.
 
     Args:
-        motion: with rotations. Clips of the split "train" alone, if there are any.
-        cycles: what is one.
+        motion: clips with rotations. If there is a split "train", only its clips are used.
+        cycles: definition of a cycle.
 
     Raises:
-        ValueError: nobody walks regularly enough for two cycles.
+        ValueError: no walk is regular enough for two cycles.
     """
     cycles = cycles or Cycles()
     walked: tuple[list[tuple[np.ndarray, Clip]], ...] = ([], [])
@@ -221,9 +224,9 @@ def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[R
 
 
 def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], frames: int) -> np.ndarray:
-    """Where a clip is as the nearest of some cycles is in so many even frames: (frames,) frames of the clip, rising.
+    """Align a clip with evenly spaced frames of the nearest reference: (frames,) increasing frames of the clip.
 
-    The pace is from half to twice that of the reference brought to the length of the clip.
+    The pace is from half to twice the pace of the reference, after it is resampled to the length of the clip.
     """
 
     def even(hips: np.ndarray) -> np.ndarray:
@@ -242,7 +245,7 @@ def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], fram
 
 
 def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
-    """A clip at another rate, and how many of its frames one of these is."""
+    """Return a clip at another frame rate, and the number of original frames per new frame."""
     if clip.rotations is None:
         raise ValueError(f"clip {'/'.join(clip.key)} has no turns of joints; MotionSet.with_rotations() finds them")
     return (clip, 1.0) if fps == rate else (clip.resampled(fps / rate), fps / rate)
@@ -250,14 +253,16 @@ def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
 
 @lru_cache(maxsize=8)
 def _resting(skeleton: Skeleton) -> torch.Tensor:
-    """Joints (J, 3) with nothing turned, and the root at 0."""
+    """Return joints (J, 3) of the rest pose, with the root at 0."""
     return resting(skeleton.parents, skeleton.offsets)
 
 
 @lru_cache(maxsize=8)
 def _legs(skeleton: Skeleton) -> list[list[int]]:
-    """For either side the joints from below the root down to the hip, and to the knee: of those where left and right
-    leave the trunk, the lowest at rest."""
+    """Return for each side the joints from below the root down to the hip, and then the knee.
+
+    The hip is the lowest joint at rest where left and right leave the trunk.
+    """
     rest, legs = _resting(skeleton), []
     for leaving in skeleton.sides:
         hip = min(leaving, key=lambda joint: float(rest[joint, skeleton.vertical]))
@@ -276,7 +281,7 @@ def _legs(skeleton: Skeleton) -> list[list[int]]:
 
 
 def _turned(clip: Clip, skeleton: Skeleton) -> torch.Tensor:
-    """Of both thighs against the pelvis, (F, 2, 3, 3)."""
+    """Return the rotations of both thighs relative to the pelvis, (F, 2, 3, 3)."""
     found = []
     for *hips, _ in _legs(skeleton):
         turns = to_matrix(tensor_of(clip.rotations)[:, hips].double(), "quaternion")
@@ -285,13 +290,13 @@ def _turned(clip: Clip, skeleton: Skeleton) -> torch.Tensor:
 
 
 def _hips(turned: torch.Tensor) -> np.ndarray:
-    """The same as quaternions (F, 2, 4)."""
+    """Return the same rotations as quaternions (F, 2, 4)."""
     found: np.ndarray = from_matrix(turned, "quaternion").numpy()
     return found
 
 
 def _bent(turned: torch.Tensor, skeleton: Skeleton) -> np.ndarray:
-    """How far the left and the right thigh are bent forward in the pelvis, (F, 2) in radians."""
+    """Return the forward angles of the left and the right thigh relative to the pelvis, (F, 2) in radians."""
     up = torch.eye(3, dtype=torch.float64)[skeleton.vertical]
     ahead = torch.tensor([0.0, 0.0, 1.0] if skeleton.up == "y" else [0.0, -1.0, 0.0], dtype=torch.float64)
     ahead = rotate_about_up(ahead, skeleton.heading(_resting(skeleton)), skeleton.up)
@@ -302,14 +307,16 @@ def _bent(turned: torch.Tensor, skeleton: Skeleton) -> np.ndarray:
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(M, F) root mean square over both hips of the angles between quaternions (M, 2, 4) and (F, 2, 4), in radians."""
+    """Return (M, F) root mean square angles over both hips between quaternions (M, 2, 4) and (F, 2, 4), in radians."""
     cosine = np.abs(np.einsum("mhq,fhq->hmf", first, second)).clip(max=1)
     found: np.ndarray = np.sqrt(np.square(2 * np.arccos(cosine)).mean(0))
     return found
 
 
 def _regularity(swing: np.ndarray, cycles: Cycles) -> tuple[float, int]:
-    """How much an angle (F,) repeats itself after some frames and is its opposite after half of them, and how many."""
+    """Return the maximum regularity of an angle (F,), and its period.
+
+    A regular angle repeats after a period, and changes its sign after half of it."""
     swing = swing - swing.mean()
     least = max(2, round(cycles.shortest * cycles.rate))
     lags = np.arange(least, min(int(cycles.longest * cycles.rate), (len(swing) - 1) // 2) + 1)
@@ -323,7 +330,7 @@ def _regularity(swing: np.ndarray, cycles: Cycles) -> tuple[float, int]:
 
 
 def _between_peaks(angle: np.ndarray, period: int) -> list[tuple[int, int]]:
-    """First and last frames of the cycles of a leg, from where it (F,) is furthest forward to where it is so again."""
+    """Return first and last frames of the cycles of a leg, between successive maxima of its forward angle (F,)."""
     window = np.hanning(max(period // 4, 1) + 2)
     padded = np.pad(angle, (len(window) // 2, (len(window) - 1) // 2), mode="edge")
     smooth, half = np.convolve(padded, window / window.sum(), mode="valid"), period // 2
@@ -332,7 +339,7 @@ def _between_peaks(angle: np.ndarray, period: int) -> list[tuple[int, int]]:
 
 
 def _typical(cycles: Sequence[tuple[np.ndarray, Clip]]) -> tuple[np.ndarray, Clip]:
-    """Of cycles the one from which the others are least far on average, each at the same share of itself."""
+    """Return the cycle with the smallest mean distance from the others, at equal fractions of their durations."""
     some = cycles[:: -(-len(cycles) // MOST_CYCLES)]
     share = np.linspace(0, 1, 25)
     seen = np.stack([hips[np.rint(share * (len(hips) - 1)).astype(int)] for hips, _ in some])
@@ -342,7 +349,7 @@ def _typical(cycles: Sequence[tuple[np.ndarray, Clip]]) -> tuple[np.ndarray, Cli
 
 
 def _deviations(angle: np.ndarray, longest: int) -> np.ndarray:
-    """(F, K) standard deviations of an angle (F,) over k + 1 frames from s on; 0 where it ends before."""
+    """Return (F, K) standard deviations of an angle (F,) over k + 1 frames from s on; 0 if the clip ends earlier."""
     frames = np.arange(len(angle))[:, None] + np.arange(longest + 1)
     sums, squares = (np.pad(np.cumsum(values), (1, longest), mode="edge") for values in (angle, angle**2))
     many = np.arange(1, longest + 1)
@@ -352,7 +359,7 @@ def _deviations(angle: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _open(hips: np.ndarray, longest: int) -> np.ndarray:
-    """(F, K) how far the last pose of k + 1 from frame s on is from the first; of those that end before, anything."""
+    """Return (F, K) distances between the first and last of k + 1 poses from frame s on; arbitrary after the end."""
     padded = np.concatenate([hips, np.repeat(hips[-1:], longest - 1, axis=0)])
     later = np.lib.stride_tricks.sliding_window_view(padded, longest, axis=0)  # (F, 2, 4, K)
     cosine = np.abs(np.einsum("fhq,fhqk->hfk", hips, later)).clip(max=1)
@@ -361,7 +368,7 @@ def _open(hips: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _cheapest(costs: np.ndarray, threshold: float, overlap: float) -> list[tuple[int, int]]:
-    """Starts and lengths of subsequences [s, k] below a threshold, the cheapest first, that overlap no more than so."""
+    """Return starts and lengths of subsequences [s, k] below a threshold, the cheapest first, with limited overlap."""
     starts, lengths = np.nonzero(costs <= threshold)
     order = np.argsort(costs[starts, lengths], kind="stable")
     starts, lengths = starts[order], lengths[order]

@@ -1,8 +1,8 @@
-"""Between segments of a latent space: interpolation, transfer to another body, and a map of the space.
+"""Operations in a latent space of segments: interpolation, transfer to another body, and a map of the space.
 
-As in Marsot et al. (2021), arXiv 2106.04387, segments are interpolated on the straight line in z and beta together, and
-their motion is transferred by another beta. Along an interpolation from a walk to a run a segment should last less and
-less, as cycles of running are the shorter ones.
+As in Marsot et al. (2021), arXiv 2106.04387, segments are interpolated linearly in z and beta together, and their
+motion is transferred by exchanging beta. From a walk to a run, durations should decrease along the interpolation,
+because cycles of running are shorter.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARKERS = "osD^v<>"
-"""Of labels, ten colours each."""
+"""Markers of labels; each is used for ten colours."""
 
 
 @dataclass(frozen=True, eq=False)
 class Interpolation:
-    """Segments on the way from one to another, of B pairs in M steps; the first and the last are their own ends.
+    """Interpolated segments of B pairs in M steps, including the ends, which are reconstructions.
 
     Attributes:
-        timed: how frames become motion.
-        body: which moves.
-        shares: (M,), how far a step has come, from 0 to 1.
+        timed: conversion of frames to motion.
+        body: moving body.
+        shares: (M,), interpolation weights from 0 to 1.
         latent: (B, M, Z).
         shape: beta, (B, M, S).
         x: frames (B, M, N, D).
@@ -53,28 +53,28 @@ class Interpolation:
 
     @property
     def durations(self) -> Tensor:
-        """How long each lasts, (B, M) in seconds."""
+        """Durations (B, M) in seconds."""
         return self.timed.lasts(self.x)
 
     @property
     def displacements(self) -> Tensor:
-        """How far the root gets from its first frame to its last, (B, M) in metres."""
+        """Distance of the root between first and last frame, (B, M) in metres."""
         return self.timed.travels(self.x)
 
     @property
     def global_pose(self) -> Tensor:
-        """How far the root is turned from the first step's, (B, M) in degrees, the mean over frames."""
+        """Angle of the root rotation relative to the first step, (B, M) in degrees, averaged over frames."""
         return self._away(self._unpacked[0][..., [self.timed.skeleton.root], :, :])
 
     @property
     def local_pose(self) -> Tensor:
-        """The same of all other joints that turn, against their parents, the mean over them too."""
+        """The same for all other joints with children, relative to their parents, averaged over these joints too."""
         others = [joint for joint in self.timed.turning if joint != self.timed.skeleton.root]
         return self._away(self._unpacked[0][..., others, :, :])
 
     @property
     def measures(self) -> Mapping[str, Tensor]:
-        """All four by name and unit, (B, M) each."""
+        """All four measures by name and unit, (B, M) each."""
         return {
             "duration (s)": self.durations,
             "displacement (m)": self.displacements,
@@ -83,7 +83,7 @@ class Interpolation:
         }
 
     def table(self, pair: int = 0) -> Table:
-        """The measures of a pair, step by step."""
+        """Return the measures of a pair, step by step."""
         table = Table(caption="poses: mean angle from those of the first step")
         for column in ("step", *self.measures):
             table.add_column(column, justify="right")
@@ -92,11 +92,11 @@ class Interpolation:
         return table
 
     def motion(self, pair: int = 0, fps: float | None = None) -> MotionSet:
-        """The steps of a pair as clips, each on its body, from the origin, facing heading zero.
+        """Return the steps of a pair as clips, each on its body, starting at the origin with heading zero.
 
         Args:
-            pair: which.
-            fps: of the motion; that of the training data by default.
+            pair: index of the pair.
+            fps: frames per second; default: the rate of the training data.
         """
         made = self.timed.back({WHOLE: self.x[pair], OFFSETS: self.body.offsets(self.shape[pair])}, fps)
         names = [f"step-{n:02d}" for n in range(len(made))]
@@ -104,7 +104,7 @@ class Interpolation:
         return replace(made, clips=clips, name="interpolation")
 
     def vertices(self, pair: int = 0) -> Tensor:
-        """Surfaces (M, N, V, 3) of a pair in metres."""
+        """Return surfaces (M, N, V, 3) of a pair in metres."""
         return surfaces_of(self.timed, self.body, self.x[pair], self.shape[pair])
 
     @cached_property
@@ -112,20 +112,20 @@ class Interpolation:
         return self.timed.unpack(self.x)
 
     def _away(self, turns: Tensor) -> Tensor:
-        """Mean angle (B, M) in degrees of turns (B, M, N, K, 3, 3) from those of the first step."""
-        apart = (turns - turns[:, :1]).flatten(-2).norm(dim=-1)  # 2 sqrt(2) sin(angle / 2), exact where small
+        """Return the mean angle (B, M) in degrees of rotations (B, M, N, K, 3, 3) relative to the first step."""
+        apart = (turns - turns[:, :1]).flatten(-2).norm(dim=-1)  # 2 sqrt(2) sin(angle / 2), accurate for small angles
         angle = 2 * torch.asin((apart / 8**0.5).clamp(max=1))
         return angle.mean((-2, -1)).rad2deg()
 
 
 @torch.no_grad()
 def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any], steps: int = 9) -> Interpolation:
-    """Segments on the straight line in z and beta from some to others, all pairs and steps at once.
+    """Interpolate linearly in z and beta between pairs of segments, all pairs and steps at once.
 
     Args:
-        model: of segments, such as that of `motion-latent`.
-        first, second: batches with x (B, N, D) and beta (B, S) as the model sees them, B alike.
-        steps: M, ends included.
+        model: model of segments, such as a `motion-latent` model.
+        first, second: batches of the same size with x (B, N, D) and beta (B, S) in the model's representation.
+        steps: number of steps M, including the ends.
 
     Raises:
         ValueError: fewer than 2 steps, or batches of different sizes.
@@ -148,12 +148,12 @@ def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any],
 
 @torch.no_grad()
 def transferred(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
-    """The motion of segments on other bodies: their z, with another beta.
+    """Return the motion of segments on other bodies: their z with another beta.
 
     Args:
-        model: of segments.
+        model: model of segments.
         batch: x (B, N, D) and beta (B, S).
-        shape: of the other bodies, (B, S).
+        shape: (B, S), beta of the other bodies.
 
     Returns:
         x (B, N, D).
@@ -165,21 +165,24 @@ def transferred(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
 
 
 def falls(values: Tensor) -> Tensor:
-    """Which of (..., M) fall from each step to the next, (...,): of durations, walks that become runs should."""
+    """Return (...,), whether values (..., M) decrease in every step.
+
+    Durations between walks and runs should.
+    """
     return (values.diff(dim=-1) < 0).all(-1)
 
 
 @torch.no_grad()
 def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> Figure:
-    """A map of the latent space: means of the guide on their first two principal axes, coloured by a label.
+    """Draw a map of the latent space: means of the guide on their first two principal axes, coloured by a label.
 
     Args:
-        model: of segments.
-        batch: x (B, N, D) and beta (B, S), at least three.
-        labels: of each.
+        model: model of segments.
+        batch: x (B, N, D) and beta (B, S), at least three segments.
+        labels: label of each segment.
 
     Raises:
-        ValueError: too few segments, labels of others, or too many different ones.
+        ValueError: there are too few segments, another number of labels, or too many distinct labels.
     """
     with reproducibly(model, 0):
         means = model.encode(on_device_of(model, batch)).double().cpu()

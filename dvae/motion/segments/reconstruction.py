@@ -1,8 +1,8 @@
-"""How near segments come back from a latent space: errors of surfaces and of time, beside principal components.
+"""Reconstruction errors of a latent space of segments, for surfaces and time, compared with principal components.
 
-As in Marsot et al. (2021), arXiv 2106.04387: the guide's mean is decoded on the segment's own body, and a segment's
-error is the mean distance over frames and vertices. Principal components of [chi, beta], as many as the latent and
-beta have numbers, are what any latent space should beat; they are decoded on the segment's own body too.
+As in Marsot et al. (2021), arXiv 2106.04387, the mean of the guide is decoded on the segment's own body. The error of a
+segment is the mean distance over frames and vertices. The baseline are principal components of [chi, beta], as many as
+the latent and beta have dimensions, also decoded on the segment's own body.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ METRICS = {ERROR: Metric("mm"), DURATION: Metric("ms"), **TEACHER_FORCED}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction(Result):
-    """How near segments come back, each alone, in rows of models and references.
+    """Reconstruction errors of single segments, in rows of models and references.
 
     Indexing gives the scores of a row: `found["motion-latent"]["vertex error"].mean`.
 
     Attributes:
-        rows: row to score to the values (N,) of segments.
+        rows: row -> score -> values (N,) of the segments.
         segments: (split, segment, take) of each.
         fingerprint: SHA-256 of the data.
         notes: lines below the table.
-        configs: row to what was run.
+        configs: row -> configuration of its run.
     """
 
     rows: Annotated[Mapping[str, Annotated[Mapping[str, np.ndarray], Dims("sequence", name="{}")]], MODELS]
@@ -63,13 +63,13 @@ class Reconstruction(Result):
         return {name: self._score(values) for name, values in self._row(row).items()}
 
     def difference(self, first: str, second: str, score: str = ERROR) -> Score:
-        """Paired difference of two rows, first minus second, with its standard error, clustered by take."""
+        """Return the paired difference of two rows, first minus second, with its standard error, clustered by take."""
         ours, theirs = (self._row(row)[score] for row in (first, second))
         return self._score(ours - theirs)
 
     @override
     def table(self) -> Table:
-        """Rows down, scores across: mean over segments and its 95 % interval; of vertices the median too."""
+        """Return rows by scores: mean over segments with its 95 % interval; for vertices also the median."""
         takes = len({take for _, _, take in self.segments})
         title = f"{len(self.segments)} segments of {takes} takes · data {self.fingerprint[:12]}"
         caption = "mean over segments, with its 95 % interval where there are several takes, by which it is clustered"
@@ -87,7 +87,7 @@ class Reconstruction(Result):
         return table
 
     def plot(self) -> Figure:
-        """Boxes of vertex errors by Tukey: quartiles, whiskers to 1.5 times their distance, and what is beyond."""
+        """Draw Tukey's box plots of vertex errors: quartiles, whiskers to 1.5 interquartile ranges, and outliers."""
         figure = canvas(1.6 + 1.2 * len(self.rows), 3.4)
         axes = figure.subplots()
         axes.boxplot([row[ERROR] for row in self.rows.values()], widths=0.6, flierprops={"markersize": 2})
@@ -101,7 +101,7 @@ class Reconstruction(Result):
 
     @override
     def summary(self) -> dict[str, Any]:
-        """Means and standard errors by row and score."""
+        """Return means and standard errors by row and score."""
         return {row: {name: vars(score) for name, score in self[row].items()} for row in self.rows}
 
     @override
@@ -139,24 +139,24 @@ class PrincipalComponents:
 
     @classmethod
     def of(cls, segments: Segments, components: int) -> Self:
-        """The first components of segments, or as many as these have."""
+        """Return the first components of segments, or as many as exist."""
         values = _joined(segments.all())
         mean = values.mean(0)
-        away = values - mean  # (B, N D + S), where segments are fewer than numbers of one
+        away = values - mean  # (B, N D + S): fewer segments than dimensions
         _, shares = torch.linalg.eigh((away @ away.T).double())
         most = max(min(components, len(values) - 1), 1)
         directions, _ = torch.linalg.qr(away.T @ shares[:, -most:].flip(-1).to(away))
         return cls(mean, directions)
 
     def __call__(self, batch: Mapping[str, Any]) -> Tensor:
-        """x (B, N, D) as the components have it."""
+        """Return x (B, N, D), projected on the components."""
         values = _joined(batch) - self.mean
         near = self.mean + values @ self.directions @ self.directions.T
         return near[:, : -batch[SHAPE].shape[-1]].view_as(batch[WHOLE])
 
 
 def _joined(batch: Mapping[str, Any]) -> Tensor:
-    """[chi, beta], (B, N D + S)."""
+    """Return [chi, beta], (B, N D + S)."""
     return torch.cat([batch[WHOLE].flatten(1), batch[SHAPE]], -1)
 
 
@@ -171,24 +171,24 @@ def reconstruct_segments(
     configs: Mapping[str, Mapping[str, Any]] | None = None,
     progress: bool = True,
 ) -> Reconstruction:
-    """Scores how near segments come back from models, and from principal components of equal dimensions.
+    """Score the reconstructions of segments by models, and by principal components of the same dimension.
 
-    Every model sees the segments as its own frames (`model.timed`), and is compared with them as such; vertices are in
-    metres, whatever frames are.
+    Each model receives the segments in its own representation (`model.timed`), and is compared with them in it. Vertex
+    errors are in metres in every representation.
 
     Args:
-        models: by name, such as of `motion-latent`; of each `timed`, `encode` and `decode` are used.
-        segments: held-out ones, on one kind of body.
-        training: of which principal components are taken; without them there is no such row.
-        bound_particles: of the importance-weighted bound and its k-hat; 0 leaves both out.
-        seed: of the bounds' draws.
-        batch_size: segments at once.
-        configs: row to configuration, kept in JSON's types.
+        models: models by name, such as `motion-latent` models, with `timed`, `encode` and `decode`.
+        segments: test segments with the same kind of body.
+        training: segments for the principal components; None leaves this row out.
+        bound_particles: number of particles of the IWAE bound and its k-hat; 0 leaves both out.
+        seed: seed of the bounds.
+        batch_size: number of segments at once.
+        configs: row -> configuration, stored as JSON types.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: no model, or a batch or number of particles that makes no sense.
-        FloatingPointError: a segment comes back with what is no number.
+        ValueError: `models` is empty, or a batch size or number of particles is invalid.
+        FloatingPointError: a reconstruction is NaN or infinite.
     """
     if not models or batch_size < 1 or bound_particles < 0:
         raise ValueError(
@@ -225,26 +225,26 @@ def reconstruct_segments(
 
 
 class _Seen:
-    """The same segments as the frames of each model; made once for those who share them."""
+    """The same segments in the representation of each model; models with the same representation share them."""
 
     def __init__(self, segments: Segments) -> None:
         self.segments = segments
         self.known = {_key(segments.timed): segments}
 
     def by(self, timed: TimedFrames) -> Segments:
-        """As these frames."""
+        """Return the segments in this representation."""
         if (key := _key(timed)) not in self.known:
             self.known[key] = Segments(self.segments.motion, timed, self.segments.body)
         return self.known[key]
 
 
 def _key(timed: TimedFrames) -> str:
-    """What tells ways of seeing apart."""
+    """Return a text that identifies a representation."""
     return json.dumps(SegmentSchema({}, timed=timed).config())
 
 
 def _scores(model: Any, held: Segments, particles: int, batch: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Of a batch, (B,) each."""
+    """Return the scores of a batch, (B,) each."""
     seen = on_device_of(model, batch)
     found = _errors(held, model.decode(model.encode(seen), seen[SHAPE]).cpu(), batch)
     terms = SequenceELBO().terms(model, seen)
@@ -256,12 +256,12 @@ def _scores(model: Any, held: Segments, particles: int, batch: Mapping[str, Any]
 
 
 def _linear(known: PrincipalComponents, held: Segments, batch: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Of components."""
+    """Return the errors of principal components."""
     return _errors(held, known(batch), batch)
 
 
 def _errors(held: Segments, x: Tensor, batch: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Of frames (B, N, D): of the surface in millimetres, and of how long it lasts in milliseconds, (B,)."""
+    """Return errors (B,) of frames (B, N, D): of the surface in millimetres, of the duration in milliseconds."""
     made, theirs = (surfaces_of(held.timed, held.body, frames, batch[SHAPE]) for frames in (x, batch[WHOLE]))
     lasts = (held.timed.lasts(x) - held.timed.lasts(batch[WHOLE])).abs()
     return {ERROR: 1000 * vertex_error(made, theirs), DURATION: 1000 * lasts}

@@ -1,6 +1,6 @@
-"""Segments recovered from what was seen of them: what was found, how far from that, how surely; and files of it.
+"""Results of segment completion: the segments, their distance from the observations, and their uncertainty; file input.
 
-`completion.complete` looks for the segments; here is what there is to say of them.
+`completion.complete` searches for the segments; this module evaluates the results.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ from .embodied import SHAPE
 from .frames import OFFSETS
 
 LARGEST = 2**25
-"""Bytes of all arrays of a file of what was seen: nearly two thousand surfaces, or two million points."""
+"""Maximum total size in bytes of a file of observations: nearly two thousand surfaces, or two million points."""
 
 MOST, MOST_POINTS = 1000, 2**17
-"""Segments of a file and moments of a segment; and points of a segment."""
+"""Maximum number of segments and of moments per segment; and of points per segment."""
 
 FARTHEST, LATEST = 30.0, 60.0
-"""Metres from the origin and seconds from the first frame, beyond which numbers are in other units."""
+"""Metres from the origin and seconds from the first frame; larger values mean that the units are wrong."""
 
 DRAWS, LEVEL = 200, 0.95
-"""By which intervals are, and what they hold."""
+"""Number of draws for intervals, and their probability."""
 
 AT_ONCE = 512
-"""Draws to hold at once."""
+"""Number of draws in memory at once."""
 
 UNRELIABLE = 0.7
-"""k-hat above which intervals are rough."""
+"""k-hat above which intervals are unreliable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +62,12 @@ class Recovered:
     """Segments that were recovered.
 
     Args:
-        found: the most probable ones.
+        found: most probable segments.
         keys: (split, name) of each.
-        drawn: frames (n, B, N, D) and bodies (n, B, S) from the posterior.
-        khat: (B,), see `Posterior.evidence`.
-        away: how far they are from what was seen, (B,) in metres by name, see `SegmentCompletion.away`.
-        truth: x (B, N, D) and beta (B, S), where they are known.
+        drawn: frames (n, B, N, D) and bodies (n, B, S) drawn from the posterior.
+        khat: (B,), from `Posterior.evidence`.
+        away: mean distances (B,) from the observations in metres by name, from `SegmentCompletion.away`.
+        truth: x (B, N, D) and beta (B, S), if known.
     """
 
     found: Completed
@@ -79,11 +79,11 @@ class Recovered:
 
     @property
     def errors(self) -> dict[str, Tensor]:
-        """Of known truths, (B,) each: of vertices in metres, frame of chi by frame; and of durations in seconds."""
+        """Errors (B,) if the truth is known: of vertices in metres, per frame of chi, and of durations in seconds."""
         if self.truth is None:
             return {}
         model, (x, shape), truth = self.found.model, (self.found.x, self.found.shape), self.truth
-        rows = [slice(row, row + 1) for row in range(len(x))]  # surfaces are large
+        rows = [slice(row, row + 1) for row in range(len(x))]  # one segment at a time: surfaces are large
         vertices = [
             vertex_error(model.vertices(x[row], shape[row]), model.vertices(truth[WHOLE][row], truth[SHAPE][row]))
             for row in rows
@@ -92,7 +92,7 @@ class Recovered:
         return {"vertex error": torch.cat(vertices), "duration error": lasts.abs()}
 
     def table(self) -> Group:
-        """What was found, and below how surely; a row for each segment in both."""
+        """Return the results with their intervals and, below, diagnostics; one row per segment in both tables."""
         timed, draws = self.found.model.timed, len(self.drawn[0])
         ways = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
         errors = {f"from\n{name}\nmm": value for name, value in self.away.items()}
@@ -128,14 +128,16 @@ class Recovered:
         return Group(what, how)
 
     def motion(self, draws: int = 0) -> MotionSet:
-        """The most probable segments, and after each some of its draws: clips, from the origin, facing heading zero."""
+        """Return the most probable segments, each followed by some of its draws, as clips.
+
+        All clips start at the origin with heading zero."""
         pairs = zip((self.found.x, self.found.shape), self.drawn, strict=True)
         x, shape = (torch.cat([mode[None], drawn[:draws]]).transpose(0, 1).flatten(0, 1) for mode, drawn in pairs)
         ends = ["found", *(f"draw-{n:02d}" for n in range(1, draws + 1))]
         return self._moved(x, shape, [(split, f"{name}-{end}") for split, name in self.keys for end in ends])
 
     def true_motion(self) -> MotionSet | None:
-        """The truths, where they are known, in the same way."""
+        """Return the truths, if known, in the same form."""
         return None if self.truth is None else self._moved(self.truth[WHOLE], self.truth[SHAPE], self.keys)
 
     def _moved(self, x: Tensor, shape: Tensor, keys: Sequence[tuple[str, str]]) -> MotionSet:
@@ -158,15 +160,15 @@ def recover(
     seed: int = 0,
     progress: bool = False,
 ) -> Recovered:
-    """Completes segments, and says how well.
+    """Complete segments, and evaluate the results.
 
     Args:
-        model, seen, deviations, known, aggregate, descent, seed, progress: see `complete`.
-        keys: (split, name) of each.
-        truth: x (B, N, D) and beta (B, S), where they are known.
+        model, seen, deviations, known, aggregate, descent, seed, progress: same as in `complete`.
+        keys: (split, name) of each segment.
+        truth: x (B, N, D) and beta (B, S), if known.
 
     Raises:
-        ValueError: see `complete`; or nothing was seen of a segment.
+        ValueError: same as `complete`; or a segment has no observations.
     """
     _check_something(SegmentCompletion(model).read(seen))
     how: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
@@ -177,16 +179,16 @@ def recover(
 
 
 def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
-    """What somebody has seen of segments, of a file.
+    """Read observations of segments from a file.
 
     Args:
-        path: an npz of arrays by the names of `completion`: times or frames, some of surfaces, points and markers, and
-            beta where it is known; without the first axis, of one segment.
-        model: of segments.
+        path: npz of arrays with the names in `completion`: times or frames; some of surfaces, points and markers; and
+            beta if known. The first axis is omitted for a single segment.
+        model: model of segments.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, too large, or not as described; or nothing was seen.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged, too large, or not as described; or a segment has no observations.
     """
     arrays = _read(Path(path))
     try:
@@ -205,7 +207,7 @@ def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of numbers, of known names and bounded sizes."""
+    """Return arrays of numbers with known names and bounded sizes."""
     known = (TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE)
     with archive(path) as members:
         if unknown := [name for name in members if name not in known]:
@@ -217,7 +219,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _check_numbers(name: str, value: Tensor) -> None:
-    """Refuse more than can be looked for, and what is in other units."""
+    """Raise an error if there are too many observations, or if they are in the wrong units."""
     if value.dim() > 1 and name != SHAPE and (len(value) > MOST or value.shape[1] > MOST):
         raise ValueError(
             f"{name} has shape {tuple(value.shape)}; at most {MOST} segments and moments of each are taken"
@@ -237,7 +239,7 @@ def _check_numbers(name: str, value: Tensor) -> None:
 
 
 def _check_something(seen: Mapping[str, Any]) -> None:
-    """Refuse segments of which nothing was seen."""
+    """Raise an error if a segment has no observations."""
     kinds = [seen[name].isfinite().flatten(2).any(-1) for name in (SURFACES, POINTS, SPOTS) if name in seen]
     timed = [seen[name].isfinite() for name in (TIMES, FRAMES) if name in seen]
     some = torch.stack(kinds).any(0) if kinds else torch.stack(timed).all(0)
@@ -249,7 +251,7 @@ def _check_something(seen: Mapping[str, Any]) -> None:
 
 
 def _table(columns: Sequence[str], caption: str) -> Table:
-    """With a column for segments; on a narrow terminal cells are folded, and nothing of a number is cut away."""
+    """Return a table with a column for segments; narrow terminals wrap cells, so that numbers are never truncated."""
     table = Table(caption=caption)
     table.add_column("segment", overflow="fold")
     for column in columns:

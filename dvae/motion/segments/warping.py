@@ -1,8 +1,8 @@
-"""Dynamic time warping of frames onto a reference, given how far each frame is from each of the reference's.
+"""Dynamic time warping of frames onto a reference, from the local cost of each pair of frames.
 
-Sakoe and Chiba (1978), *Dynamic programming algorithm optimization for spoken word recognition*; and, for where in a
-longer sequence a reference is found, Müller (2007), *Information Retrieval for Music and Motion*, chapter 4. Both here
-run over whole rows or diagonals of all subsequences at once.
+Sakoe and Chiba (1978), *Dynamic programming algorithm optimization for spoken word recognition*. For the search for a
+reference in a longer sequence: Müller (2007), *Information Retrieval for Music and Motion*, chapter 4. Both are
+vectorised over whole rows or diagonals of all subsequences.
 """
 
 from __future__ import annotations
@@ -11,33 +11,35 @@ import numpy as np
 
 
 def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
-    """What it costs to warp each subsequence onto the whole reference.
+    """Return the cost of warping each subsequence onto the whole reference.
 
-    A path goes from the first frames of both to their last, each step one frame on in either or in both, which counts
-    twice (Sakoe and Chiba's symmetric form). So weights of any path add up to the frames of both, by which the sum is
-    divided: the cost is a weighted mean of local ones, in their unit, and those of short and long subsequences compare.
+    A path goes from the first frames of both to their last frames. Each step advances by one frame in one or in both;
+    advancing in both counts twice (Sakoe and Chiba's symmetric form). The weights of any path therefore add up to the
+    number of frames of both, and the sum is divided by this number. The cost is a weighted mean of local costs in their
+    unit, so short and long subsequences are comparable.
 
     Args:
-        local: (M, F), from each frame of the reference to each of the sequence.
-        longest: K, frames that a subsequence has at most.
+        local: (M, F), cost of each frame of the reference at each frame of the sequence.
+        longest: K, maximum number of frames in a subsequence.
 
     Returns:
-        (F, K): of the subsequence of k + 1 frames from frame s on at [s, k]; infinite where the sequence ends before.
+        (F, K): at [s, k], the cost of the subsequence of k + 1 frames that starts at frame s; infinite if the sequence
+        ends earlier.
 
     Raises:
-        ValueError: nothing to compare, or what is no number.
+        ValueError: the costs are empty or NaN.
     """
     if local.ndim != 2 or not local.size or longest < 1:
         raise ValueError(f"local costs have shape {local.shape} for at most {longest} frames; expected (M, F), none 0")
     if np.isnan(local).any():
         raise ValueError(f"{np.isnan(local).sum()} of the local costs are NaN; leave out frames that lack joints")
     (rows, frames), steps = local.shape, local.shape[0] + longest - 1
-    # Cell (i, k) of start s lies on diagonal d = i + k; there, local[i, s + k] is ahead[i, s + d].
+    # Cell (i, k) of start s is on diagonal d = i + k, where local[i, s + k] is ahead[i, s + d].
     ahead = np.full((rows, frames + steps), np.inf)
     for i in range(rows):
         ahead[i, i : i + frames] = local[i]
     found = np.full((frames, longest), np.inf)
-    before, last, now = (np.full((rows + 1, frames), np.inf) for _ in range(3))  # row 0 is before the reference
+    before, last, now = (np.full((rows + 1, frames), np.inf) for _ in range(3))  # row 0 precedes the reference
     for d in range(steps):
         lo, hi = max(0, d - longest + 1), min(rows, d + 1)
         cost = ahead[lo:hi, d : d + frames]
@@ -54,15 +56,15 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
 
 
 def alignment(local: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where in a sequence each frame of a reference is, at a pace from half to twice the reference's.
+    """Align a sequence with a reference, at a pace from half to twice the pace of the reference.
 
-    Steps are one frame on in both, or one in one and two in the other; the ends of both meet.
+    Steps are one frame in both, or one in one and two in the other. First and last frames are matched.
 
     Args:
         local: (M, F), with F between M / 2 and 2 M.
 
     Returns:
-        places (M,) in frames of the sequence, increasing, and the mean local cost on the path.
+        positions (M,) in frames of the sequence, increasing, and the mean local cost on the path.
 
     Raises:
         ValueError: one is more than twice as long as the other.
