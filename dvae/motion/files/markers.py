@@ -1,6 +1,6 @@
 """C3D, the markers of optical motion capture (The C3D File Format, Motion Lab Systems 2021); only positions are read.
 
-Existing readers in C and C++ crash the whole process on a damaged file. This reader was verified against them.
+Existing readers in C and C++ crash the whole process on a damaged file. This reader raises an error.
 """
 
 from __future__ import annotations
