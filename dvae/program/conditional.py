@@ -319,7 +319,7 @@ class Conditional(nn.Module):
         return state.network, {**drawn, **found}
 
     def select(self, state: Any, rows: Tensor) -> Any:
-        """Return the state with these rows (N,) of its batch (`rows.select`)."""
+        """Return the state with these rows (N,) of its batch (`networks.loop.select`)."""
         if self.network is None:
             return select(state, rows)
         if not isinstance(state, Standardised):
