@@ -463,7 +463,7 @@ class ArrayWindows:
 
     Raises:
         TypeError: if `observed` is not an integer.
-        ValueError: if x is not `(N, T, D)`, no steps remain to predict, the mask has another shape, the number of clip
+        ValueError: if x is not `(N, T, D)`, no steps remain to predict, the shape of the mask or the number of clip
             names or columns is wrong, or the season is below 1.
 
     Example:

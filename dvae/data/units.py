@@ -9,7 +9,8 @@ stays in float64, its values are read in float64, and only the difference become
 Units are different from views of the data (`dvae.data.views`). Latents and context also have units, and outputs keep
 the original unit. A distribution is transformed to the data's unit where it is built (`Law.in_units`, the
 push-forward), so given scales and all densities are in this unit. Positive data that span orders of magnitude are read
-as logarithms, but produced as a multiple of their mean: of the raw powers of a spectrum, a network sees only the peaks.
+as logarithms: of the raw powers of a spectrum, a network sees only the peaks. They are still produced as a multiple of
+their mean.
 """
 
 from __future__ import annotations

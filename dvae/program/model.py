@@ -69,14 +69,14 @@ class DynamicalVAE(nn.Module):
             once for all sequences of the batch. A forecast draws it once for each sample.
         grouped: static latents that the sequences of a group share. A batch gives the groups as "group" (B,); without
             it, every sequence is its own group (`dvae.program.groups`).
-        indicators: data variables for which the guide also reads which entries were observed: each coordinate has an
+        indicators: data variables for which the guide also reads which entries were observed. Each coordinate has an
             indicator of 0 or 1, all 1 without a mask (Collier et al., 2020, arXiv 2006.05301). Without indicators, the
             guide cannot distinguish a missing entry from one observed at 0, or at the mean of a variable with units.
 
     Raises:
         TypeError: if a size is not an integer, or `view` is a class instead of an instance.
-        ValueError: if the equations cannot be parsed or do not fit together, a size is missing, unknown or out of
-            range, or a network or distribution is a class instead of an instance.
+        ValueError: if the equations are invalid or do not fit together, a size is missing, unknown or out of range, or
+            a network or distribution is a class.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 2, "x": 3})
@@ -448,7 +448,7 @@ class DynamicalVAE(nn.Module):
         if any(count < 1 for count in draws.values()):
             raise ValueError(f"draws are numbers from 1, got {dict(draws)}")
 
-    # Uses of a model ------------------------------------------------------------------------------------------------
+    # Uses of a model -----------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
@@ -486,9 +486,8 @@ class DynamicalVAE(nn.Module):
             draw_emission: draw the data from their distribution (True) or use its means (False). Means have no emission
                 noise: they vary by the latents alone, and their quantiles are not prediction intervals. None draws,
                 unless the emission's scale is the weight of a squared error.
-            fix: values that all samples share: the future (B, H, D) of a data variable, or the value (B, D) of a static
-                latent, such as one sample of an earlier forecast. Later variables read it; latents are not inferred
-                from it.
+            fix: values that all samples share: futures (B, H, D) of data variables, or values (B, D) of static latents,
+                such as a sample of an earlier forecast. Later variables read it; latents are not inferred from it.
             chunk: maximum of sequences times samples in memory, in addition to the result. Random draws follow the
                 chunks.
 
@@ -527,10 +526,10 @@ class DynamicalVAE(nn.Module):
         far as the draws of the latents do. Draws also have the noise of the emission, and later entries read the
         earlier ones.
 
-        With one particle, only the guide uses what was observed after a missing entry. More particles correct the
-        guide: the method draws S K latents and missing entries, and resamples S of them with the weights p(z, x
-        observed) / q(z) (Mattei and Frellsen, 2019, arXiv 1812.02633). As K grows, these become draws given all
-        observed entries. Longer sequences require more particles.
+        With one particle, only the guide uses observations after a missing entry. More particles correct the guide
+        (Mattei and Frellsen, 2019, arXiv 1812.02633). The method draws S K latents and missing entries, and resamples S
+        of them with the weights p(z, x observed) / q(z). As K grows, these become draws given all observed entries.
+        Longer sequences require more particles.
 
         Some models do not generate the first frames, which are context. Missing entries there repeat the first frame
         that the model generates.
@@ -546,7 +545,7 @@ class DynamicalVAE(nn.Module):
             Name to (S, B, T, D) for the variables that have a mask.
 
         Raises:
-            ValueError: if the batch has no mask, or `particles` exceeds 1 for means or for a model without a
+            ValueError: if the batch has no mask, or `particles` is below 1, or above 1 for means or a model without a
                 likelihood.
         """
         with self.running():
@@ -597,7 +596,7 @@ class DynamicalVAE(nn.Module):
         if any(getattr(handler, "param_only", False) for handler in poutine.runtime._PYRO_STACK):
             pyro.module(self._name, self)
 
-    # Reading batches and returning data -----------------------------------------------------------------------------
+    # Reading batches and returning data ----------------------------------------------------------------------------
 
     @contextmanager
     def running(self) -> Iterator[None]:

@@ -110,7 +110,7 @@ class Oracle:
     Raises:
         TypeError: if `model` is not a model or `steps` is not an integer.
         ValueError: if the model is not linear-Gaussian given its discrete states, or has context or energies. Methods
-            raise it if a batch has another length, incomplete data variables, or groups.
+            raise it if a batch has another length, has groups, or misses a data variable.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)

@@ -40,8 +40,8 @@ class SelfFeeding:
             several data variables follow the order of the model: a variable reads the means of earlier ones from the
             same pass.
         gradient: whether gradients flow through the means, and so back in time. Without it, as in Bengio et al., a step
-            takes half the time or less, but the gradient differs from the gradient of the bound. Means at missing
-            entries always have a gradient.
+            takes half the time or less, but the gradient differs from the gradient of the bound with scheduled
+            sampling. Means at missing entries always have a gradient.
         start: number of first frames that are never replaced, such as those that a forecast observes.
         blocks: numbers of frames: after `start`, the first number stays, the second may be replaced, and so on in turns
             (Zhou et al., 2018, arXiv 1707.05363, use (5, 5)). None lets any frame be replaced.

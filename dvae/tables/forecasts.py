@@ -218,7 +218,7 @@ def _quantile(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
     """Return quantiles of draws (K, ...) at mean ranks k / (K + 1).
 
     With these ranks, intervals contain exchangeable values at their nominal level, as in `metrics.coverage`. NumPy's
-    default ranks (k - 1) / (K - 1) reach only from draw to draw, and its intervals are too narrow.
+    default ranks (k - 1) / (K - 1) span only the range of the draws, and its intervals are too narrow.
     """
     found: np.ndarray = np.quantile(draws, levels, axis=0, method="weibull")
     return found

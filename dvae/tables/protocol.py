@@ -28,8 +28,8 @@ class Cut:
         season: period of the data in steps, such as 7 for days; the reference forecast "seasonal" repeats it.
 
     Raises:
-        ValueError: if only one of `observed` and `horizon` is given, the season exceeds `observed`, or no share remains
-            for training.
+        ValueError: if only one of `observed` and `horizon` is given, `split` is "time" without them, the season exceeds
+            `observed`, or no share remains for training.
     """
 
     observed: Frames | None = None
