@@ -1,4 +1,4 @@
-"""A batch: values of variables by name, and what is known of the sequences."""
+"""Batches: values of variables by name, with lengths, masks and groups of the sequences."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 WHOLE = "x"
-"""Name of the data where a view makes several variables of them."""
+"""Name of the data as a whole, if a view splits them into several variables."""
 
 
 class Batch(dict[str, Any]):
-    """Sequences, one in each row of every tensor: values (B, T, D) of local variables, (B, D) of static ones, by name.
+    """Sequences by variable name, one per row: values (B, T, D) of local variables, (B, D) of static ones.
 
-    A batch is a dictionary, so that users and data loaders can write one. Five names are no variables; read them by
-    the attributes below. Changes keep the type: `batch | {...}`, `rows`, `map`.
+    A batch is a dictionary, which users and data loaders can create. Five names are not variables; the attributes below
+    read them. Operations keep the type: `batch | {...}`, `rows`, `map`.
 
     >>> batch = Batch(x=torch.zeros(2, 3, 1), lengths=torch.tensor([3, 2]))
     >>> batch.lengths.tolist(), batch.mask(), batch.rows(slice(1))["x"].shape
@@ -25,11 +25,11 @@ class Batch(dict[str, Any]):
 
     reserved: ClassVar[tuple[str, ...]] = ("lengths", "mask", "group", "log_det", "beside")
     reader: Any = None
-    """What has read the batch (`DynamicalVAE.read`), which takes it as it is; None after a change."""
+    """Reader that validated the batch and will not read it again (`DynamicalVAE.read`); None after a change."""
 
     @property
     def lengths(self) -> Any:
-        """Number of valid steps (B,) of right-padded sequences; None where all steps are valid."""
+        """Number of valid steps (B,) of right-padded sequences; None if all steps are valid."""
         return self.get("lengths")
 
     @property
@@ -39,17 +39,17 @@ class Batch(dict[str, Any]):
 
     @property
     def log_det(self) -> Any:
-        """Log-determinant of a view that changes volume, (B,) or by step (B, T); None where it is 0."""
+        """Log-determinant of a view that changes volume, (B,) or by step (B, T); None if it is 0."""
         return self.get("log_det")
 
     @property
     def volume(self) -> Any:
-        """`log_det` summed over steps, (B,); None where it is 0."""
+        """`log_det` summed over steps, (B,); None if it is 0."""
         return self.log_det.sum(-1) if self.log_det is not None and self.log_det.dim() == 2 else self.log_det
 
     @property
     def beside(self) -> Mapping[str, Any]:
-        """What some views read beside the data, by name, and no other model."""
+        """Additional inputs of some views, by name; models do not read them."""
         found: Mapping[str, Any] = self.get("beside", {})
         return found
 
@@ -62,13 +62,13 @@ class Batch(dict[str, Any]):
         """Return the masks by variable.
 
         Args:
-            whole: name of the variable to which a mask without a name belongs.
+            whole: name of the variable that owns a mask without a name.
         """
         mask = self.get("mask", {})
         return dict(mask) if isinstance(mask, Mapping) else {whole: mask}
 
     def mask(self, name: str = WHOLE) -> Any:
-        """Return True where a variable was observed, as its values; None where all of it was."""
+        """Return True where a variable was observed, in the shape of its values; None if all entries were observed."""
         mask = self.get("mask")
         return mask.get(name) if isinstance(mask, Mapping) else mask
 
@@ -79,7 +79,7 @@ class Batch(dict[str, Any]):
         return x if mask is None else torch.where(mask, x, torch.nan)
 
     def map(self, change: Callable[[Any], Any]) -> Batch:
-        """Return the batch with every tensor changed."""
+        """Return the batch with `change` applied to every tensor."""
         return Batch({n: Batch(v).map(change) if isinstance(v, Mapping) else change(v) for n, v in self.items()})
 
     def rows(self, which: Any) -> Batch:

@@ -1,7 +1,7 @@
-"""Long arrays, in memory or mapped from a disk: gone through in blocks, and cut into windows where these are drawn.
+"""Long arrays, in memory or mapped from disk, processed in blocks and cut into windows on demand.
 
-What is made of a mapped array (`dvae.data.npy`) is made of a block or of some windows of it, so that memory does not
-grow with its length. Arrays in memory are treated alike: nothing is copied that is not used.
+Functions read a mapped array (`dvae.data.npy`) block by block or window by window, and memory does not grow with its
+length. Arrays in memory are treated alike, and no unused part is copied.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ import torch
 from torch import Tensor
 
 NUMBERS = 2**17
-"""Of a block: copies of it in double precision, a megabyte each, stay in a processor's cache."""
+"""Numbers in a block: copies in double precision, a megabyte each, fit into a processor's cache."""
 
 
 def ranges(values: np.ndarray | Tensor) -> Iterator[slice]:
-    """Rows of values (N, ...) in order, as many at a time as have about `NUMBERS` numbers."""
+    """Yield slices of the rows of values (N, ...) in order, with about `NUMBERS` numbers each."""
     rows = max(NUMBERS // max(prod(values.shape[1:]), 1), 1)
     for start in range(0, len(values), rows):
         yield slice(start, start + rows)
 
 
 def blocks(values: np.ndarray | Tensor) -> Iterator[Any]:
-    """Values (N, ...) in order, so many rows at a time."""
+    """Yield blocks of the rows of values (N, ...) in order."""
     return (values[rows] for rows in ranges(values))
 
 
 def row_blocks(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Rows of arrays (N, C) one after the other in such blocks, in which short arrays are together."""
+    """Yield blocks of the rows of several arrays (N, C) in order; short arrays share a block."""
     held, size = list[np.ndarray](), 0
     for block in chain.from_iterable(map(blocks, arrays)):
         held.append(block)
@@ -46,13 +46,13 @@ def row_blocks(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
 
 
 def cut(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
-    """Windows (B, T, ...) of arrays (N, ...), copied in a floating type that holds all their values.
+    """Return windows (B, T, ...) of arrays (N, ...), copied to a floating type that represents all their values.
 
     Args:
-        arrays: with rows of one shape.
-        which: (B,) places of arrays.
+        arrays: arrays with rows of one shape.
+        which: (B,) indices of arrays.
         starts: (B,) first rows.
-        lengths: (B,) rows of each window, or of all; behind a shorter one its last row is repeated.
+        lengths: (B,) numbers of rows, or one number for all; shorter windows repeat their last row.
     """
     steps = [lengths] * len(which) if isinstance(lengths, int) else lengths.tolist()
     dtype = np.result_type(np.float32, *{values.dtype for values in arrays})
@@ -65,12 +65,12 @@ def cut(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Te
 
 @dataclass(frozen=True, eq=False)
 class ColumnSummary:
-    """What is known of columns, (C,) each, NaN left aside.
+    """Statistics of columns, (C,) each, without NaN.
 
     Args:
-        count: of values.
-        mean, variance: of them, as of a population; 0 where there is none.
-        least, largest: of them; infinite where there is none.
+        count: number of values.
+        mean, variance: population mean and variance; 0 for empty columns.
+        least, largest: minimum and maximum; infinite for empty columns.
     """
 
     count: np.ndarray
@@ -81,10 +81,10 @@ class ColumnSummary:
 
     @classmethod
     def of(cls, parts: Iterable[np.ndarray | Tensor]) -> ColumnSummary:
-        """That of all rows of parts (n, C), each of which is read once, in double precision.
+        """Summarise all rows of parts (n, C), each read once, in double precision.
 
         Raises:
-            ValueError: there is no part.
+            ValueError: without any part.
         """
         found: ColumnSummary | None = None
         for part in parts:
@@ -97,7 +97,7 @@ class ColumnSummary:
 
     @classmethod
     def of_block(cls, values: np.ndarray) -> ColumnSummary:
-        """That of rows (n, C) in double precision, which are used up."""
+        """Summarise rows (n, C) in double precision; the array is overwritten."""
         there = ~np.isnan(values)
         count = there.sum(0)
         known: Any = True if there.all() else there
@@ -108,7 +108,7 @@ class ColumnSummary:
         return cls(count, mean, np.einsum("nc,nc->c", values, values) / count.clip(1), *ends)
 
     def joined(self, other: ColumnSummary) -> ColumnSummary:
-        """That of the rows of both (Chan, Golub and LeVeque 1983, "Algorithms for computing the sample variance")."""
+        """Combine two summaries (Chan, Golub and LeVeque 1983, "Algorithms for computing the sample variance")."""
         count = self.count + other.count
         share, apart = other.count / count.clip(1), other.mean - self.mean
         variance = (1 - share) * self.variance + share * other.variance + share * (1 - share) * apart**2
@@ -117,20 +117,20 @@ class ColumnSummary:
 
 
 class Digest(Protocol):
-    """A hash in the making, as of `hashlib`."""
+    """A hash object, as in `hashlib`."""
 
     def update(self, data: Any, /) -> None:
-        """Goes on with these bytes."""
+        """Add bytes to the hash."""
 
 
 def hash_values(digest: Digest, values: np.ndarray, dtype: str | np.dtype) -> None:
-    """Goes on with the bytes of an array in C order, as numbers of such a type."""
+    """Add the bytes of an array to a hash, in C order and converted to a dtype."""
     for block in blocks(values):
         digest.update(np.ascontiguousarray(block, dtype))
 
 
 def hash_list(digest: Digest, items: Iterable[Any]) -> None:
-    """Goes on with what `repr` says of a list of these, which need not be held at once."""
+    """Add the `repr` of a list of items to a hash; the items need not fit in memory at once."""
     said, before = map(repr, items), b"["
     while some := list(islice(said, 4096)):
         digest.update(before + ", ".join(some).encode())

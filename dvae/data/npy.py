@@ -1,7 +1,7 @@
-"""npy files that anybody may have written: their headers, read by a few rules, and arrays mapped where they lie.
+"""npy files from untrusted sources: strict parsing of headers, and memory-mapped arrays.
 
-A mapped array is not in memory: what is read of it is the system's to keep, which gives it up when others need the
-room. So it may be larger than memory.
+A mapped array may be larger than memory. The operating system caches the parts that are read, and drops them if other
+programs need the memory.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ HEADER = re.compile(
 )
 CODE = re.compile(r"[<>|=]?(?:[biufcSUOMmV]\d{0,9}|\?)")
 LONGEST = 4096
-"""Bytes of a header."""
+"""Maximum bytes of a header."""
 NOTHING = 2**20
-"""Bytes that the places of an array may take which holds none."""
+"""Maximum bytes of an empty array if dimensions of size 0 count as 1."""
 
 
 class Refused(ValueError):
-    """A file is damaged, or holds what is not data."""
+    """A file is damaged, or its content is not data."""
 
 
 def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any]:
-    """Dtype, shape and order of an npy file, of which nothing is evaluated.
+    """Return dtype, shape and order of an npy file, without evaluating its header as code.
 
     Args:
-        read: its next bytes, so many or those that are left.
+        read: function that returns the next n bytes of the file, or the remaining ones.
 
     Raises:
-        Refused: another file, or another header than numpy writes for a plain array.
+        Refused: if this is not an npy file, or its header is not one that NumPy writes for a plain array.
     """
     magic = read(8)
     if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\x00", b"\x02\x00"):
@@ -57,7 +57,7 @@ def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any
 
 
 def dtype_of(code: str) -> np.dtype:
-    """Of numbers, text or objects, from its code such as "<f4"."""
+    """Return the dtype of numbers, text or objects from its code, such as "<f4"."""
     try:
         dtype = np.dtype(code) if CODE.fullmatch(code) else None
     except (TypeError, ValueError, OverflowError):
@@ -68,7 +68,7 @@ def dtype_of(code: str) -> np.dtype:
 
 
 def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = "declares") -> None:
-    """Refuses an array that its bytes do not make, and one of a great many places that hold nothing."""
+    """Check that the shape matches the number of bytes; also refuse an empty array with very large dimensions."""
     needed, places = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
     if len(shape) > 32 or needed != size or places > max(size, NOTHING):
         short = f", needs {needed:,}; it was cut short, copy or write it again" if needed > size else ""
@@ -76,18 +76,19 @@ def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = 
 
 
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
-    """The numbers of an npy file, mapped: nothing is read before it is used, and nobody can write to them.
+    """Return the numbers of an npy file as a read-only memory map; data are read on use.
 
-    Whoever cuts the file short meanwhile ends the program; a file that is replaced, as by `files.written`, stays as it
-    was opened.
+    If another process truncates the file, the program crashes. If the file is replaced, as `files.written` does, the
+    map keeps the old content.
 
     Args:
         path: the file.
         links: follow a link, for a path that the user typed.
 
     Raises:
-        ValueError: a link, or no file; no npy file of real numbers in C order, or one that is truncated.
-        OSError: it cannot be opened.
+        ValueError: if the path is a link or not a file, or the file is truncated or not an npy file of real numbers in
+            C order.
+        OSError: if it cannot be opened.
 
     Example:
         >>> import tempfile
@@ -111,7 +112,7 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
                     "numpy.ascontiguousarray"
                 )
             found = np.memmap(file, dtype, "r", file.tell(), shape)
-            found.filename = os.path.abspath(path)  # by which joblib's processes map it too
+            found.filename = os.path.abspath(path)  # for joblib, whose processes map it too
             return found.view(np.ndarray)
     except Refused as error:
         raise ValueError(f"{os.fspath(path)} {error}") from error
@@ -126,7 +127,7 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
 
 
 def is_mapped(array: Any) -> bool:
-    """Whether an array lies in a mapped file, as `numpy.memmap` does and all that is cut from it."""
+    """Return whether an array is memory-mapped, such as a `numpy.memmap` or a view of one."""
     while isinstance(array, np.ndarray):
         array = array.base
     return isinstance(array, mmap)

@@ -1,4 +1,4 @@
-"""Schemas: what a model must know of data to be built for them, without the data themselves."""
+"""Schemas: descriptions of data, sufficient to build a model without the data themselves."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from .views import View
 
 
 class SchemaError(ValueError):
-    """Data of which less is known than a method needs to know."""
+    """The schema misses information that a method requires."""
 
 
 @dataclass(frozen=True)
 class Schema:
-    """Sequences of numbers. What is known of other kinds of data is added by a subclass.
+    """A description of sequences of numbers; subclasses describe other kinds of data.
 
     Args:
-        sizes: dimension of every variable of the data, context included, such as {"x": 48}, as models see them.
-        length: T, steps of a sequence; None where they differ, or nobody knows.
-        observed: O, the steps that forecasts start from; None likewise.
+        sizes: dimension of every variable of the data as models see them, context included, such as {"x": 48}.
+        length: T, steps of a sequence; None if they differ or are unknown.
+        observed: O, observed steps of a forecast; None if they differ or are unknown.
 
     Raises:
-        TypeError, ValueError: sizes or lengths that are none.
+        TypeError, ValueError: if sizes or lengths are invalid.
     """
 
     kind: ClassVar[str] = "sequences"
     per: ClassVar[str] = "frame"
-    """What bounds are per."""
+    """Unit of bounds."""
 
     sizes: Mapping[str, Size]
     length: Frames | None = None
@@ -46,44 +46,44 @@ class Schema:
 
     @property
     def preset(self) -> str:
-        """Name by which methods keep options for such data; "" for none."""
+        """Name of a method's preset options for such data; "" for none."""
         return ""
 
     @property
     def view(self) -> View:
-        """What models see of the data."""
+        """Transformation of the data that models see."""
         return View()
 
     @property
     def emission(self) -> LawSpec | None:
-        """The law of x that suits the data, where they say one."""
+        """Suitable distribution of x, if the data determine one."""
         return None
 
     @property
     def covariates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Names of local and of static context that methods have their factors read, where the data have such."""
+        """Names of local and of static context that the factors of methods read."""
         return (), ()
 
     @property
     def indicators(self) -> tuple[str, ...]:
-        """Names of data of which training sequences lack entries, and guides read which: see `DynamicalVAE`."""
+        """Names of data with missing training entries; guides read their indicators, as in `DynamicalVAE`."""
         return ()
 
     @property
     def together(self) -> Sequence[int]:
-        """For each coordinate of x a number; those of one number are observed together or not at all."""
+        """A label for each coordinate of x; coordinates with equal labels are observed or missing together."""
         return [0] * self.size("x")
 
     @property
     def units(self) -> Mapping[str, Sequence[Coordinate]]:
-        """Variable to how its coordinates are read and made."""
+        """Variable to the units of its coordinates."""
         return {}
 
     def size(self, name: str) -> int:
-        """The size of a variable.
+        """Return the size of a variable.
 
         Raises:
-            SchemaError: it is not known.
+            SchemaError: if the size is unknown.
         """
         if name not in self.sizes:
             raise SchemaError(f"sizes missing for {name}; given are {', '.join(self.sizes) or 'none'}")
@@ -91,20 +91,20 @@ class Schema:
 
     @property
     def windows(self) -> Schema:
-        """The schema of the same data where models see them as they are; runs that share it can be judged together."""
+        """Schema of the same data without a view; runs with equal ones can be evaluated together."""
         return self
 
     @classmethod
     def of(cls, data: Any, who: str = "this method") -> Self:
-        """The schema of data.
+        """Return the schema of data.
 
         Args:
             data: a schema, windows that have one, x (N, T, D), a batch, or sizes by name.
-            who: needs to know this kind of schema.
+            who: name of the method that requires this kind of schema.
 
         Raises:
-            TypeError: a table, whose columns need roles.
-            SchemaError: nothing of which this kind of schema is known.
+            TypeError: if the data are a table, whose columns need roles.
+            SchemaError: if the data do not have this kind of schema.
         """
         refuse_table(data)
         arrays = Tensor | np.ndarray
@@ -125,10 +125,10 @@ class Schema:
         return found
 
     def config(self) -> dict[str, Any]:
-        """The schema in JSON's types; `from_config` of its kind reads it."""
+        """Return the schema as JSON types, for `from_config` of its class."""
         return {"sizes": dict(self.sizes), "length": self.length, "observed": self.observed}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """The schema that `config` wrote."""
+        """Return the schema that `config` described."""
         return cls(**config)

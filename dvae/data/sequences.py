@@ -1,19 +1,19 @@
-"""Data: what the loop, evaluation, comparison and criticism need of them, as protocols, and sequences in memory.
+"""Protocols of data for training, evaluation, comparison and criticism, and sequences in memory.
 
-A batch is a `Batch`, or a dictionary of which one can be made. Local variables are (B, T, D), static ones (B, D);
-"lengths" (B,) counts the valid frames of right-padded sequences, and "mask" (B, T, D) is True where an entry of the
-observed variable was observed (or maps several such names to masks). "beside" maps names to what some views read, such
-as the turns of joints beside their positions.
+A batch is a `Batch`, or a dictionary that can become one. Local variables have the shape (B, T, D), static ones (B, D).
+"lengths" (B,) counts the valid frames of right-padded sequences. "mask" (B, T, D) is True where an entry of the
+observed variable was observed; for several variables it maps names to masks. "beside" maps names to additional inputs
+of some views, such as the rotations of joints in addition to their positions.
 
-| who | asks for |
+| used by | protocol |
 |---|---|
-| the loop, to train | `Source`: draws batches |
-| the loop, to validate | `InBatches`: some sequences after the others; or what comparison does |
-| comparison | `Listed`: all sequences at once; or arrays, or a batch |
+| training | `Source`: draws batches |
+| validation | `InBatches`: iterates over batches of sequences; or the same as comparison |
+| comparison | `Listed`: returns all sequences at once; or arrays, or a batch |
 | evaluation and criticism | `HeldOutWindows`: listed windows with a past, names and a fingerprint |
 
-`ArrayWindows` and `Sequences` make them of arrays, which may be mapped from a disk (`numpy.memmap`) and are then read
-as they are drawn.
+`ArrayWindows` and `Sequences` implement them for arrays. Arrays may be mapped from disk (`numpy.memmap`) and are then
+read on demand.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ from .units import exceeds_float32
 
 @runtime_checkable
 class Source(Protocol):
-    """Training data: anything that draws batches, such as windows of sequences."""
+    """Training data: an object that draws batches, such as windows of sequences."""
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Mapping[str, Any]:
         """Return a batch, drawn with the generator alone."""
@@ -43,7 +43,7 @@ class Source(Protocol):
 
 @runtime_checkable
 class Fingerprinted(Protocol):
-    """Data that can be told from others: a run that resumes, and a record, say on which it rests."""
+    """Data with a fingerprint, which resumed runs and results use to identify them."""
 
     @property
     def fingerprint(self) -> str:
@@ -52,32 +52,32 @@ class Fingerprinted(Protocol):
 
 @runtime_checkable
 class Listed(Protocol):
-    """Data that can be had whole."""
+    """Data that can be loaded completely."""
 
     def all(self) -> Mapping[str, Any]:
-        """All sequences, one in each row, always in the same order."""
+        """Return all sequences, one per row, always in the same order."""
 
 
 @runtime_checkable
 class InBatches(Protocol):
-    """Data that can be gone through without having them whole."""
+    """Data that can be iterated without loading them completely."""
 
     def __len__(self) -> int:
-        """How many sequences."""
+        """Return the number of sequences."""
 
     def batches(self, batch_size: int) -> Iterator[Mapping[str, Any]]:
-        """All sequences, so many in a batch, always in the same order."""
+        """Yield all sequences in batches, always in the same order."""
 
 
 @runtime_checkable
 class HeldOutWindows(Fingerprinted, Listed, Protocol):
-    """Windows to be judged on: their first frames are observed, the others are to be predicted."""
+    """Windows for evaluation: the first frames are observed, the others are to be predicted."""
 
     @property
     def protocol(self) -> Any:
         """A dataclass with `observed` (frames).
 
-        `observed` is None of whole sequences, of which there are bounds, and no forecasts.
+        `observed` is None for whole sequences, which have bounds but no forecasts.
         """
 
     @property
@@ -86,34 +86,34 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
 
     @property
     def description(self) -> Mapping[str, Any]:
-        """What else a record is to say of the data, in JSON's types, nothing of it being required.
+        """Further information on the data, in JSON types; every entry is optional.
 
-        "title" lists phrases for titles; "columns" {name: unit} names the coordinates of x, in their order, in units
-        that tables print, "" for none; "means" are subtracted from their numbers, and "scales" divide them, to have no
-        unit, in the same order; "season" is a period of the data, in frames, for a reference row; "called" is what a
-        clip and a frame are called in tables, such as ["sequence", "step"].
+        "title" lists phrases for titles. "columns" {name: unit} names the coordinates of x in their order, with units
+        for tables, "" for none. In the same order, "means" are subtracted from the numbers and "scales" divide them to
+        remove units. "season" is a period of the data in frames, for a reference row. "called" gives the words for a
+        clip and a frame in tables, such as ["sequence", "step"].
         """
 
 
 def clusters(windows: Any) -> list[tuple[str, str, int]]:
-    """Keys of windows by what is independent of each other: by clips, unless the windows know of more (`clusters`)."""
+    """Return keys of windows that identify independent units: clips, unless the windows define `clusters`."""
     return list(getattr(windows, "clusters", None) or windows.keys)
 
 
 def called(said: Mapping[str, Any]) -> tuple[str, str]:
-    """What a clip and a frame are called, by what windows say of themselves."""
+    """Return the words for a clip and a frame in a description of windows."""
     clip, frame = said.get("called", ("clip", "frame"))
     return clip, frame
 
 
 def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:
-    """The unit of every named column of x; empty where the windows name none."""
+    """Return the unit of every named column of x; empty if the windows have no column names."""
     found: Mapping[str, str] = windows.description.get("columns", {})
     return found
 
 
 def scales_of(windows: HeldOutWindows) -> Sequence[float]:
-    """By what columns are divided to be told together: their scales where they share no unit, else nothing."""
+    """Return scales that make columns comparable: those of the windows if units differ, otherwise none."""
     units = [*columns_of(windows).values()]
     mixed = len(units) > 1 and (len({*units}) > 1 or "" in units)
     return windows.description.get("scales", ()) if mixed else ()
@@ -127,8 +127,8 @@ class Sequences:
         batch: the variables, each with N rows.
 
     Raises:
-        ValueError: when rows differ in number, a shape is neither (N, T, D) nor (N, D), or an entry that is
-            neither masked nor padding is NaN or infinite.
+        ValueError: if numbers of rows differ, a shape is neither (N, T, D) nor (N, D), or an entry that is neither
+            masked nor padding is NaN or infinite.
     """
 
     batch: Batch
@@ -171,7 +171,7 @@ class Sequences:
         return len(next(iter(self.batch.leaves().values())))
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Return `batch_size` different sequences in random order; all of them if there are no more."""
+        """Return `batch_size` different sequences in random order, or all if there are fewer."""
         chosen = torch.randperm(len(self), generator=generator)[:batch_size]
         return self.batch.rows(chosen)
 
@@ -183,15 +183,15 @@ class Sequences:
 
 @dataclass(frozen=True, eq=False)
 class Hiding:
-    """A source whose batches lack more of x than its own, at random and anew each time.
+    """A source that hides further entries of x at random, anew in each batch.
 
-    The bound stays one, of what is left. A guide that is to tell latents from sequences with gaps meets them so, where
-    training sequences have few or none.
+    The bound remains valid for the visible entries. The guide thereby learns from incomplete sequences if training
+    sequences have few missing values or none.
 
     Args:
-        source: of the batches.
-        share: of the entries of x that are hidden; as many whole steps as single entries.
-        together: for each coordinate of x a number; those of one number are hidden together.
+        source: source of the batches.
+        share: share of hidden entries of x, half of them in whole steps and half singly.
+        together: a label for each coordinate of x; coordinates with equal labels are hidden together.
     """
 
     source: Any
@@ -211,26 +211,26 @@ class Hiding:
 
     @property
     def fingerprint(self) -> str:
-        """That of the source, where it has one."""
+        """Fingerprint of the source, if it has one."""
         found: str = self.source.fingerprint
         return found
 
 
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
-    """Means over some dimensions of what is not NaN."""
+    """Return means over some dimensions, without NaN."""
     found: Tensor = values.mean(dims)
     return values.nanmean(dims) if found.isnan().any() else found
 
 
 def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
-    """Sequences whose missing entries lie on the straight line between the observed ones around them, in time.
+    """Return sequences with missing entries interpolated linearly in time between observed ones.
 
-    Before the first and after the last observed entry of a coordinate that one stays; of one that is never observed
-    there is 0.
+    Before the first and after the last observed entry of a coordinate, its value is repeated. A coordinate that is
+    never observed is 0.
 
     Args:
-        x: (..., T, D), anything where entries are missing.
-        mask: (..., T, D), True where an entry was observed; None for all.
+        x: (..., T, D), with any values at missing entries.
+        mask: (..., T, D), True where an entry was observed; None if all were.
 
     Example:
         >>> x = torch.tensor([[0.0, 9.0, 9.0, 3.0, 9.0]]).mT
@@ -250,17 +250,17 @@ def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def gaps(times: Tensor | np.ndarray, lengths: Tensor | None = None) -> Tensor:
-    """The time (B, T, 1) since the step before: a covariate of irregular steps that any network reads.
+    """Return the time (B, T, 1) since the previous step, a covariate for irregular steps.
 
-    That of the first step, before which there is nothing, is 0; so are those of padding.
+    It is 0 at the first step and at padding.
 
     Args:
-        times: (B, T), rising, in any unit. Days since 1970 in single precision have no minutes: give double, or take
-            the start of each sequence from it.
-        lengths: (B,) valid steps, where some are padding.
+        times: (B, T), increasing, in any unit. Days since 1970 in single precision do not resolve minutes: pass double
+            precision, or subtract the start of each sequence.
+        lengths: (B,) valid steps, if some are padding.
 
     Raises:
-        ValueError: times that are not finite, or do not rise.
+        ValueError: if times are not finite or not increasing.
 
     Example:
         >>> gaps(torch.tensor([[3.0, 4.0, 6.5, 0.0]]), torch.tensor([3])).flatten().tolist()
@@ -286,14 +286,14 @@ def gaps(times: Tensor | np.ndarray, lengths: Tensor | None = None) -> Tensor:
 
 
 def since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
-    """The time (B, T, D) since each entry was last observed, before this step: a covariate of missing values.
+    """Return the time (B, T, D) since each entry was last observed before this step, a covariate for missing values.
 
-    Of one that never was, the time since the first step; 0 there. (Che et al., 2018, "Recurrent neural networks for
-    multivariate time series with missing values", where it is delta.)
+    For an entry that was never observed, it is the time since the first step; at the first step it is 0. Source: Che et
+    al., 2018, "Recurrent neural networks for multivariate time series with missing values", where it is called delta.
 
     Args:
         mask: (B, T, D), True where an entry was observed.
-        gaps: (B, T, 1), see `gaps`; where nothing is said, every step takes 1.
+        gaps: (B, T, 1), as returned by `gaps`; by default 1 at every step.
 
     Example:
         >>> mask = torch.tensor([[[True], [False], [False], [True], [True]]])
@@ -301,7 +301,7 @@ def since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
         [0.0, 1.0, 2.0, 3.0, 1.0]
     """
     steps = torch.ones_like(mask[..., :1], dtype=torch.get_default_dtype()) if gaps is None else gaps
-    clock = steps.double().cumsum(1)  # in double: a short gap late in a sequence is not lost
+    clock = steps.double().cumsum(1)  # in double precision, to resolve a short gap late in a sequence
     clock = (clock - clock[:, :1]).expand(mask.shape)
     last = torch.where(mask, clock, 0.0).cummax(1).values
     return (clock - torch.cat([clock[:, :1], last[:, :-1]], 1)).to(steps.dtype)
@@ -319,25 +319,25 @@ def refuse_table(data: Any) -> None:
 
 
 def is_divided(data: Any) -> bool:
-    """Whether data have parts for training, validation and test, such as `dvae.tables.PanelData`."""
-    return callable(getattr(type(data), "windows", None))  # not of an instance: some windows keep others by that name
+    """Return whether data have splits for training, validation and test, such as `dvae.tables.PanelData`."""
+    return callable(getattr(type(data), "windows", None))  # of the type, since some windows have such an attribute
 
 
 def take_split(data: Any, split: str) -> Any:
-    """Return the windows of one split where data are divided, and any other data unchanged.
+    """Return the windows of one split if the data have splits, otherwise the data unchanged.
 
     Raises:
-        TypeError: data are a table.
+        TypeError: if the data are a table.
     """
     refuse_table(data)
     return data.windows(split) if is_divided(data) else data
 
 
 def held_out_windows(data: Any) -> HeldOutWindows:
-    """Return windows to evaluate on; of divided data those of the test split.
+    """Return windows to evaluate on, from the test split if the data have splits.
 
     Raises:
-        TypeError: data do not say which steps are observed.
+        TypeError: if the data do not define observed steps.
     """
     windows = take_split(data, "test")
     if not isinstance(windows, HeldOutWindows):
@@ -355,7 +355,7 @@ def sequences(data: Any) -> Sequences:
         data: x as a tensor or array (N, T, D), which may be mapped, a batch, or `Listed` data.
 
     Raises:
-        TypeError, ValueError: when it is none of these.
+        TypeError, ValueError: if it is none of these.
     """
     refuse_table(data)
     if isinstance(data, Sequences):
@@ -382,19 +382,19 @@ def sequences(data: Any) -> Sequences:
 
 
 def as_source(data: Any) -> Source:
-    """Return training data that draw batches: as they are, or those of `sequences`."""
+    """Return training data that draw batches: unchanged if they do, else as `sequences`."""
     refuse_table(data)
     return data if isinstance(data, Source) else sequences(data)
 
 
 def in_batches(data: Any) -> InBatches:
-    """Return validation data that can be gone through: as they are, or those of `sequences`."""
+    """Return validation data that can be iterated: unchanged if they can, else as `sequences`."""
     data = take_split(data, "validation")
     return data if isinstance(data, InBatches) else sequences(data)
 
 
 def unmasked(values: Any) -> tuple[Any, np.ndarray | None]:
-    """Return an array without its NumPy mask, 0 where it was masked, and where it was observed, None for everywhere."""
+    """Return an array without its NumPy mask, 0 where it was masked, and its observed entries (None if all)."""
     if not isinstance(values, np.ma.MaskedArray):
         return values, None
     mask = np.ma.getmaskarray(values)
@@ -402,10 +402,10 @@ def unmasked(values: Any) -> tuple[Any, np.ndarray | None]:
 
 
 def check_real(values: Any, name: str = "an array") -> None:
-    """Refuse complex numbers, records and sparse tensors, which no model reads.
+    """Check that values are not complex numbers, records or sparse tensors, which no model reads.
 
     Raises:
-        TypeError: an array or tensor of complex numbers or with fields, or a sparse tensor.
+        TypeError: if an array or tensor is complex, has fields, or is sparse.
     """
     dtype = getattr(values, "dtype", None)
     if isinstance(values, Tensor) and values.layout is not torch.strided:
@@ -420,11 +420,11 @@ def check_real(values: Any, name: str = "an array") -> None:
 
 
 def tensor_of(values: Any) -> Tensor:
-    """Return a tensor on an array's own memory, or on the mapped file, to which nobody may write then.
+    """Return a tensor that shares the memory of an array, or its mapped file, which must then stay read-only.
 
     Raises:
-        TypeError: complex numbers, records, a sparse tensor, or an array of which some entries are masked.
-        ValueError: a tensor on the meta device.
+        TypeError: if values are complex, records, sparse, or partly masked.
+        ValueError: if a tensor is on the meta device.
     """
     check_real(values)
     if isinstance(values, Tensor):
@@ -444,27 +444,27 @@ def tensor_of(values: Any) -> Tensor:
 
 @dataclass(frozen=True)
 class ArrayProtocol:
-    """How plain arrays are split into observed and predicted frames."""
+    """The split of plain arrays into observed and predicted frames."""
 
     observed: int
 
 
 @dataclass(frozen=True, eq=False)
 class ArrayWindows:
-    """Plain arrays as windows to evaluate on.
+    """Plain arrays as windows for evaluation.
 
     Args:
         x: `(N, T, D)`, tensor or numpy array, which may be mapped, or masked (`numpy.ma`).
-        observed: frames the model sees; the other T - observed are predicted.
-        clips: name of the clip each window was cut from; without it the windows count as independent.
-        mask: `(N, T, D)`, True where an entry was observed, where some are missing.
+        observed: number of frames that the model sees; it predicts the other T - observed.
+        clips: name of the clip that each window was cut from; without names, windows count as independent.
+        mask: `(N, T, D)`, True where an entry was observed; None if all were.
         columns: {name: unit} of the D coordinates, "" for no unit; tables print them.
-        season: a period of the data, in frames.
+        season: period of the data, in frames.
 
     Raises:
-        TypeError: observed steps that are no whole number.
-        ValueError: x that is not `(N, T, D)`, observed steps that leave none to predict, a mask of another shape, as
-            many clip names as windows or columns as coordinates are not given, or a season below 1.
+        TypeError: if `observed` is not an integer.
+        ValueError: if x is not `(N, T, D)`, no steps remain to predict, the shape of the mask or the number of clip
+            names or columns is wrong, or the season is below 1.
 
     Example:
         >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=5, clips=["a", "a", "a", "b", "b", "b"])
@@ -528,7 +528,7 @@ class ArrayWindows:
         return digest.hexdigest()
 
     def all(self) -> Batch:
-        """All windows, x `(N, T, D)`, whole numbers as floating-point ones, and the mask if there is one."""
+        """Return all windows, x `(N, T, D)` with integers converted to floating point, and the mask if there is one."""
         x = tensor_of(self.x)
         wide = torch.float64 if exceeds_float32(x.dtype) else torch.get_default_dtype()
         batch = Batch(x=x if x.is_floating_point() else x.to(wide))

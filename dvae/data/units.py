@@ -1,15 +1,16 @@
-"""Units: the mean and the spread of a variable, in which networks read it and make it.
+"""Units: mean and spread that standardise a variable for networks.
 
-A network that must find them out first learns much more slowly where what varies is a tenth of what is always there.
-Densities and all that a program returns stay in the variable's own unit.
+A network learns much more slowly on raw values if their variation is a tenth of their mean. Densities and all outputs
+of a program stay in the variable's own unit.
 
-A variable of the data, or context, may lie far from 0 for its spread, as pressures in pascals do. Its mean stays in
-float64, its values are read in float64, and only their difference becomes the model's float32.
+A variable of the data or the context may lie far from 0 relative to its spread, such as pressures in pascals. Its mean
+stays in float64, its values are read in float64, and only the difference becomes the model's float32.
 
-Units are no view of the data (`dvae.data.views`). Latents and context have them too, of which nothing is handed out in
-another unit. A law is put into the data's unit where it is made (`Law.in_units`, the push-forward), so that given
-scales and every density are in that. And positive data that go over orders of magnitude are read as logarithms, though
-made as a multiple of their mean: of the powers of a spectrum as they are, a network sees the peaks alone.
+Units are different from views of the data (`dvae.data.views`). Latents and context also have units, and outputs keep
+the original unit. A distribution is transformed to the data's unit where it is built (`Law.in_units`, the
+push-forward), so given scales and all densities are in this unit. Positive data that span orders of magnitude are read
+as logarithms: of the raw powers of a spectrum, a network sees only the peaks. They are still produced as a multiple of
+their mean.
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ from typing_extensions import override
 from .blocks import ColumnSummary, blocks
 
 ROUNDING = 2e-15
-"""Standard deviation over the mean up to which values in float64 are a constant with rounding errors."""
+"""Largest ratio of standard deviation to mean at which float64 values count as a constant with rounding errors."""
 RESOLVED = 6e-6
-"""Standard deviation over the mean below which float32 loses more than a hundredth of it."""
+"""Ratio of standard deviation to mean below which float32 loses more than a hundredth of the deviation."""
 SMALLEST = 1e-18
-"""Least standard deviation: the inverse of its square is a float32."""
+"""Smallest standard deviation, such that the inverse of its square is a float32."""
 TOO_SMALL = f"models compute in float32, which needs at least {SMALLEST:g}; multiply the values by a constant"
 
 
 LEVELS = "subtract from each sequence its own mean, or fit in float64"
-"""What to do if sequences have levels so far apart that float32 resolves nothing around one mean."""
+"""Advice for sequences at levels so far apart that float32 resolves no variation around one mean."""
 
 
 def is_lost(known: ColumnSummary, center: Any) -> np.ndarray:
-    """Whether columns vary, but by less than float32 resolves at their distance from a center."""
+    """Return whether columns vary, but by less than float32 resolves at their distance from a center."""
     spread = np.sqrt(known.variance)
     return (spread > ROUNDING * abs(known.mean)) & (spread < RESOLVED * abs(known.mean - center))  # type: ignore[no-any-return]
 
@@ -56,18 +57,18 @@ def lost_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
 
 
 def exceeds_float32(dtype: torch.dtype | np.dtype) -> bool:
-    """Whether float32 rounds some values of a type."""
+    """Return whether float32 rounds some values of a type."""
     name = getattr(dtype, "name", str(dtype)).removeprefix("torch.")
     return name in ("float64", "int32", "int64", "uint32", "uint64")
 
 
 class Coordinate(NamedTuple):
-    """How networks read a coordinate, such as a column of a table, and make it.
+    """Units of one coordinate, such as a column of a table.
 
     Args:
-        mean, scale: of the unit.
-        typical: what stands for a missing value.
-        floor: least value whose logarithm is read; 0 where values are read and not their logarithms.
+        mean, scale: mean and scale that standardise the values.
+        typical: replacement for a missing value.
+        floor: smallest value whose logarithm is read; 0 to read values instead of logarithms.
         level, spread: mean and standard deviation of the logarithms.
     """
 
@@ -84,12 +85,12 @@ EXACT = ("mean", "typical")
 
 
 class Units(nn.Module):
-    """A mean for every coordinate and one scale for all, which keeps angles; 0 and 1 until `fit`.
+    """A mean for every coordinate and one scale for all, which preserves angles; 0 and 1 until `fit`.
 
     Args:
         size: D.
-        coordinates: those of a table, each with units of its own; nothing of them is fitted.
-        exact: keep means in float64 where they are given, or fitted to values in float64.
+        coordinates: units of each column of a table, which replace the fitted ones.
+        exact: keep means in float64 if they are given or fitted to float64 values.
     """
 
     mean: Tensor
@@ -111,12 +112,12 @@ class Units(nn.Module):
 
     @torch.no_grad()
     def fit(self, values: Tensor | np.ndarray) -> None:
-        """Takes mean and root mean variance of values (..., D), in memory or mapped, which are read in blocks.
+        """Set mean and root mean variance from values (..., D), in memory or mapped, which are read in blocks.
 
         Warns if float32 does not resolve how sequences (N, T, D) vary after their common mean is subtracted.
 
         Raises:
-            ValueError: values that do not vary, or are of another size; coordinates that have their units.
+            ValueError: if the values do not vary or have another size, or coordinates were given their units.
         """
         if self.scale.dim():
             raise ValueError("these coordinates have units of their own, which were given; there is nothing to fit")
@@ -141,7 +142,7 @@ class Units(nn.Module):
                     f"in {lost.any(1).sum()} of {len(lost)} sequences, such as {lost.any(1).argmax()}, coordinate "
                     f"{lost.any(0).argmax()} varies by less than float32 resolves at its distance from the mean of "
                     f"all sequences, {known.mean[lost.any(0).argmax()]:.9g}; {LEVELS}",
-                    stacklevel=3,  # `no_grad` is between
+                    stacklevel=3,  # the decorator `no_grad` adds a frame
                 )
 
     @property
@@ -151,7 +152,7 @@ class Units(nn.Module):
 
     @override
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Keeps float64 where the model changes its precision."""
+        """Keep float64 if the model changes its precision."""
         kept = {n: v for n, v in self.named_buffers() if self.exact and n in EXACT and v.dtype is torch.float64}
         super()._apply(fn, recurse)
         for name, value in kept.items():
@@ -160,30 +161,30 @@ class Units(nn.Module):
 
     @override
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
-        """Keeps float64 where the state has it, and only there."""
+        """Use float64 exactly where the state does."""
         for name in self._buffers.keys() & {*EXACT} if self.exact else ():
             kept = prefix + name in state_dict and state_dict[prefix + name].dtype is torch.float64
             setattr(self, name, getattr(self, name).to(torch.float64 if kept else self.scale.dtype))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def relative(self, values: Tensor) -> Tensor:
-        """Values (..., D) less the mean where they are in float64, as float32 resolves them; else as they are."""
+        """Return values (..., D), minus the mean if they are in float64, since float32 resolves the rest."""
         return (values - self.mean).to(self.scale.dtype) if self.wide else values
 
     def absolute(self, values: Tensor) -> Tensor:
-        """The inverse of `relative`."""
+        """Invert `relative`."""
         return values + self.mean if self.wide else values
 
     @property
     def filling(self) -> Tensor:
-        """(D,) what stands for missing values."""
+        """Replacements (D,) for missing values."""
         return self.typical if self.scale.dim() else self.mean
 
     def forward(self, values: Tensor) -> Tensor:
-        """Values (..., D) without unit."""
+        """Return standardised values (..., D)."""
         plain: Tensor = (values - self.mean).to(self.scale.dtype) / self.scale
         if not self.logarithms:
             return plain
         read = self.floor > 0
-        logarithms = values.clamp(min=torch.where(read, self.floor, 1.0)).log()  # finite where it is not read, too
+        logarithms = values.clamp(min=torch.where(read, self.floor, 1.0)).log()  # finite in unused entries
         return torch.where(read, (logarithms.to(self.level.dtype) - self.level) / self.spread, plain)

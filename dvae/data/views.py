@@ -1,12 +1,12 @@
-"""Views: bijections between the data and what a model sees of them.
+"""Views: bijections between the data and their representation in a model.
 
-A model has one view. A batch goes through it where it is read (`DynamicalVAE.read`), and what the model makes of the
-data goes back through it where it is handed out (`DynamicalVAE.shown`): between the two, everything is as the model
-sees it. Views of one kind of data are with that data.
+A model has one view. `DynamicalVAE.read` applies it to a batch, and `DynamicalVAE.shown` applies its inverse to the
+model's data. In between, all values are in the representation of the model. Views for one kind of data are in the
+package of these data.
 
-Densities and bounds are of the data as they are given: where a view changes volume, its log-determinant is added to
-what a model says of what it sees. All views here keep volume. A view that is no bijection of the data either refuses
-`log_det`, so that a model has no density, or sets `View.measured`: densities are then of what the model sees.
+Densities and bounds refer to the data as given: for a view that changes volume, the log-determinant is added to the log
+density of the representation. All views here keep volume. A view that is no bijection either raises in `log_det`, and
+the model has no density, or sets `View.measured`: densities then refer to the representation.
 
 >>> view = dvae.data.views.Parts({"legs": [0, 2], "arms": [1]})
 >>> batch = dvae.data.Batch(x=torch.tensor([[[1.0, 2.0, 3.0]]]))
@@ -30,51 +30,51 @@ from .batch import WHOLE, Batch
 
 
 class View:
-    """What a model sees of the data; this view, all as it is.
+    """The representation of the data in a model; this base class is the identity.
 
-    What a view finds in the data and needs for the way back, as a heading, it adds under a name of its own. Values
-    that were seen are seen as they are.
+    A view may add values that its inverse needs, such as a heading, under a name of its own. Applying a view twice has
+    no further effect.
     """
 
     names: tuple[str, ...] = ()
-    """Names in batches, beside those of the variables: what the view reads, and what it adds."""
+    """Names of other batch entries: those that the view reads, and those that it adds."""
     parts: Mapping[str, Sequence[int]] | None = None
-    """Data variables that are coordinates of x, in place of it."""
+    """Data variables that are coordinates of x and replace it."""
     history: str | None = None
-    """Name of the context that is the data themselves."""
+    """Name of the context variable that contains the data themselves."""
     past: int = 0
-    """Frames of x that are context, in place of data."""
+    """Number of first frames of x that become context."""
     measured: str = ""
-    """What densities are of, where it is not the data as they are given; bounds of other things do not compare."""
+    """Quantity of densities, if it is not the data as given; bounds of different quantities do not compare."""
 
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
-        """Refuses a model that cannot have this view.
+        """Check that a model is compatible with this view.
 
         Raises:
-            ValueError: saying why.
+            ValueError: if it is not, with the reason.
         """
 
     def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
-        """The data as they are seen.
+        """Return the data in the model's representation.
 
         Args:
             data: values (B, ...) by name.
-            beside: a batch that was seen, where the data are more of the same sequences.
+            beside: a transformed batch, if `data` continue its sequences.
 
         Raises:
-            ValueError: data that cannot be seen so.
+            ValueError: if the data cannot be transformed.
         """
         return data
 
     def inverse(self, seen: Batch) -> Batch:
-        """The data that are seen so; values (..., B, T, D) of these and of what the view added, (B, ...)."""
+        """Return the data of a representation: values (..., B, T, D), and additions of the view (B, ...)."""
         return seen
 
     def log_det(self, data: Batch) -> Tensor:
-        """Log of the absolute determinant of the Jacobian: (B,), 0 of a view that keeps volume.
+        """Return the log absolute determinant of the Jacobian, (B,); 0 for a view that keeps volume.
 
-        A view that changes each entry of x by itself gives it by entry, (B, T, D), of which those that are missing or
-        padding do not count; with any other that changes volume, data have to be complete.
+        A view that transforms each entry of x separately returns it by entry, (B, T, D); missing entries and padding do
+        not count. Any other view that changes volume requires complete data.
         """
         some = next(iter(data.values()))
         found: Tensor = some.new_zeros(len(some))
@@ -82,14 +82,14 @@ class View:
 
     @property
     def keeps_volume(self) -> bool:
-        """Whether there is no other log-determinant than 0."""
+        """Whether the log-determinant is always 0."""
         return type(self).log_det is View.log_det
 
     def counted(self, data: Batch) -> Tensor:
-        """`log_det` over the entries that were observed: by step (B, T) where it is by entry, else (B,).
+        """Return `log_det` summed over observed entries: by step (B, T) if it is by entry, else (B,).
 
         Raises:
-            ValueError: one of whole sequences, some of whose entries are missing or padding, or one of another shape.
+            ValueError: if it is not by entry and some entries are missing or padding, or if its shape is invalid.
         """
         log_det = self.log_det(data)
         if log_det.dim() == 1 and not data.partial:
@@ -110,10 +110,10 @@ class View:
 
 @dataclass(frozen=True)
 class Offered(View):
-    """The data as they are, beside context that a model need not read.
+    """The identity, with context that a model may ignore.
 
     Args:
-        names: of the context, which batches may hold whether the model has such variables or not.
+        names: names of context that batches may contain even if the model has no such variables.
     """
 
     names: tuple[str, ...] = ()
@@ -124,13 +124,13 @@ class Offered(View):
 
 
 class Views(View):
-    """Views one after the other.
+    """A sequence of views.
 
     Args:
-        *views: the first sees the data, the last one shows the model.
+        *views: views in the order from the data to the model.
 
     Raises:
-        ValueError: a `Past`, which nothing scores, behind a view that changes its volume.
+        ValueError: if a `Past`, which is not scored, follows a view that changes volume.
     """
 
     def __init__(self, *views: View):
@@ -185,10 +185,10 @@ class Views(View):
 
 @dataclass(frozen=True)
 class Parts(View):
-    """Data variables that are coordinates of one array x, which stands for all of them in batches and forecasts.
+    """Data variables that are coordinates of one array x, which represents all of them in batches and forecasts.
 
     Args:
-        parts: variable to its coordinates. Every coordinate belongs to one of them.
+        parts: variable to its coordinates. Every coordinate belongs to exactly one variable.
 
     Example:
         >>> view = Parts({"legs": [0, 2], "arms": [1]})
@@ -237,9 +237,9 @@ class Parts(View):
 
 @dataclass(frozen=True)
 class History(View):
-    """The data once more, as a context variable.
+    """A copy of the data as a context variable.
 
-    Its relation is a mask of one's own, such as h_{1:O}, that hides the frames to be generated.
+    Its relation must be a custom mask, such as h_{1:O}, that hides the frames to be generated.
 
     Args:
         history: name of the context variable.
@@ -274,15 +274,15 @@ class History(View):
 
 @dataclass(frozen=True)
 class Past(View):
-    """The first frames of x as a static variable, from which the others go on.
+    """The first frames of x as a static variable, which the other frames continue.
 
-    A model that reads its past so makes the future alone: bounds are of the future given the past, and forecasts, which
-    know nothing else, have latents from the prior.
+    A model with this view generates only the future. Bounds refer to the future given the past. Forecasts have no other
+    data, and their latents come from the prior.
 
     Args:
-        name: of the past, (B, O D), frame after frame.
+        name: name of the past, (B, O D), frame after frame.
         frames: O.
-        also: names of context over the same frames, of which the past says nothing more.
+        also: names of context over the same frames, cut in the same way.
 
     Example:
         >>> {name: tuple(value.shape) for name, value in Past("s")(Batch(x=torch.zeros(2, 5, 3))).items()}
@@ -295,7 +295,7 @@ class Past(View):
 
     @property
     def past(self) -> int:  # type: ignore[override]
-        """All of them."""
+        """Number of first frames that become context."""
         return self.frames
 
     @override

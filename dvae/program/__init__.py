@@ -1,4 +1,4 @@
-"""What runs: a batch read and checked, the factors of two equations, and the Pyro programs made of them."""
+"""Programs: validated batches, the factors of two factorizations, and the Pyro model and guide built from them."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Reading a batch: values by name, in a model's precision, checked before anything runs."""
+"""Reading a batch: values by name, in a model's precision, validated before any program runs."""
 
 from __future__ import annotations
 
@@ -24,24 +24,25 @@ from .groups import Groups
 from .rollout import Rollout
 
 CHUNK = 2048
-"""Sequences times samples that a forecast holds at once."""
+"""Default maximum of sequences times samples that a forecast keeps in memory."""
 
 AnyBatch = Tensor | Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Reader:
-    """Reads batches of a model.
+    """A reader of a model's batches.
 
     Args:
         sizes: dimension of every variable.
-        local: whether a variable has a value for every step.
-        observed, context: names of the data variables, and of those that a batch has to give.
-        view: what the model sees of the data.
-        extras: names of what else a batch may hold.
-        made: those of the data that are functions of their parents, which a program is not given.
-        laws: conditionals of the data, which say where values are and which are one event.
-        density: whether the data have one, of which a view that changes volume has to tell.
+        local: name to whether the variable has a value for every step.
+        observed: names of the data variables.
+        context: names of the variables that a batch must give.
+        view: transformation of the data that the model sees.
+        extras: names of other entries that a batch may have.
+        made: data variables that are deterministic given their parents, and are not passed to a program.
+        laws: conditionals of the data, which give the support and the events of the values.
+        density: whether the data have a density, and a view that changes volume needs a log-determinant.
         grouped: names of static latents that groups of sequences share.
     """
 
@@ -59,18 +60,20 @@ class Reader:
     def read(
         self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor], wide: Collection[str] = ()
     ) -> Batch:
-        """The batch by name, in this precision, as the model sees it; what was read stays as it is.
+        """Return the batch by name, in this precision and as the model sees it.
+
+        Reading the result again does not change it.
 
         Args:
-            batch: see `DynamicalVAE.model`.
-            dtype: of floating-point values.
-            means: name to what stands for missing entries of a variable, where that is not 0.
+            batch: as in `DynamicalVAE.model`.
+            dtype: precision of floating-point values.
+            means: name to the value at missing entries, where it is not 0.
             wide: names of variables that are read in float64 whatever the dtype.
 
         Raises:
-            TypeError: a table.
-            ValueError: names that the model does not have, a mask of nothing, tensors on the meta device, or values
-                that float32 does not resolve.
+            TypeError: if the batch is a table.
+            ValueError: if the batch has names that the model does not know, a mask without its variable, tensors on the
+                meta device, or values that float32 does not resolve.
         """
         if batch is None:
             return Batch()
@@ -85,7 +88,7 @@ class Reader:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
-        exact = {*wide, whole, *self.view.names} if wide else set()  # views make the variables of these
+        exact = {*wide, whole, *self.view.names} if wide else set()  # the view computes the variables from these
         values = _tensors(Batch(batch), dtype, names, exact)
         if "mask" in values:
             values["mask"] = values.masks(whole)
@@ -98,7 +101,7 @@ class Reader:
             seen["log_det"] = self.view.counted(values)
         narrow = [n for n, v in seen.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
         seen |= {name: _narrowed(name, seen[name], dtype, seen) for name in narrow}
-        if "mask" in seen:  # of context too, which is told no more of it
+        if "mask" in seen:  # masks of context fill its values and are then dropped
             known = {name: mask for name, mask in seen.masks().items() if name in seen}
             for name in known.keys() & self.laws.keys():
                 for event in map(list, self.laws[name].events):
@@ -132,16 +135,17 @@ class Reader:
         length: int | None,
         size: int,
     ) -> Rollout:
-        """A run of the factorization over a batch.
+        """Return a run of the factorization over a batch.
 
         Args:
-            factorization, conditionals: what is run.
-            batch: of `read`.
-            length: T; None for the batch's.
-            size: B, where the batch does not tell.
+            factorization: the factorization.
+            conditionals: name to `Conditional` of each factor.
+            batch: batch that `read` returned.
+            length: T; None for the length of the batch.
+            size: B, if the batch does not determine it.
 
         Raises:
-            ValueError: a batch that cannot be read.
+            ValueError: if the batch is invalid.
         """
         lengths, masks, index = batch.lengths, batch.masks(), batch.group if self.grouped else None
         groups = None if index is None else once(self, [index], lambda: Groups.of(index))
@@ -161,7 +165,7 @@ class Reader:
             valid = valid_steps(lengths, length)[..., None]
             values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
         self._check_context(factorization, values)
-        checked = [length, lengths, *given, *masks.values()]  # by guide and model both
+        checked = [length, lengths, *given, *masks.values()]  # memoized for guide and model
         once(self, checked, lambda: self._check_values(values, masks, lengths, length))
         return Rollout(
             factorization=factorization,
@@ -178,7 +182,7 @@ class Reader:
         )
 
     def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:
-        """Lengthens the history to all steps: its mask hides what is not there yet."""
+        """Pad the history to all steps; its mask hides the padding."""
         name = self.view.history
         if name is None or name not in values or (past := values[name].shape[1]) >= length:
             return
@@ -199,7 +203,7 @@ class Reader:
     def _check_values(
         self, values: Mapping[str, Tensor], masks: Mapping[str, Tensor], lengths: Tensor | None, length: int
     ) -> None:
-        """Refuses what no law has a density for, or lengths that are none, by one verdict: a GPU is waited for once."""
+        """Check that values are finite and in the support, and lengths valid, with one synchronisation of the GPU."""
         wrong = {name: ~torch.isfinite(value.sum()) for name, value in values.items()}  # a NaN survives the sum
         outside = {
             name: found
@@ -227,7 +231,7 @@ class Reader:
                 )
 
     def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:
-        """Which observed entries are where the law has no density, as the value; None where none can be."""
+        """Return which observed entries lie outside the support, as a mask of the value; None if none can be."""
         law = self.laws[name]
         if (support := law.support) is None:
             return None
@@ -240,10 +244,10 @@ class Reader:
         return wrong
 
     def check(self, name: str, value: Tensor) -> None:
-        """Refuses a value (B, T, D), or (B, D), of another shape.
+        """Check that a value has the shape (B, T, D), or (B, D) if it is static.
 
         Raises:
-            ValueError: saying what was expected.
+            ValueError: if the shape differs.
         """
         local = self.local[name]
         expected = f"(B, {'T, ' if local else ''}{self.sizes[name]})"
@@ -258,7 +262,7 @@ def _no_lengths(lengths: Tensor, length: int) -> str:
 
 
 def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
-    """Tensors, floating-point ones and those of these names in a precision; the others are counts and masks."""
+    """Return entries as tensors; floating-point values and these names are cast, counts and masks are not."""
     found = Batch()
     for name, each in batch.items():
         if isinstance(each, Mapping):
@@ -272,16 +276,16 @@ def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Col
 
 
 def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Tensor:
-    """The value in the precision of the model.
+    """Return the value in the precision of the model.
 
     Raises:
-        ValueError: values that float32 does not resolve.
+        ValueError: if float32 does not resolve the values.
     """
     if dtype is not torch.float32 or not exceeds_float32(value.dtype) or value.dim() < 2 or not value.numel():
         return value.to(dtype)
     mask, lengths = batch.mask(name), batch.lengths
-    if mask is None and lengths is None and value.dtype not in (torch.uint32, torch.uint64):  # torch has no aminmax
-        least, most = value.flatten(0, -2).aminmax(dim=0)  # a quick look: the deviation is at least range / sqrt(2 N)
+    if mask is None and lengths is None and value.dtype not in (torch.uint32, torch.uint64):  # no aminmax
+        least, most = value.flatten(0, -2).aminmax(dim=0)  # quick test: the deviation is at least range / sqrt(2 N)
         bound = RESOLVED * math.sqrt(2 * value.numel() / value.shape[-1])
         if ((most == least) | (most - least > bound * torch.maximum(most.abs(), least.abs()))).all():
             return value.to(dtype)
@@ -299,7 +303,7 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
 
 
 def _moments(name: str, value: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation (D,) in float64 of the observed entries; NaN without any."""
+    """Return mean and standard deviation (D,) of the observed entries in float64; NaN without any."""
     mask, lengths, known = batch.mask(name), batch.lengths, value.double()
     if mask is not None and mask.shape == value.shape:
         known = torch.where(torch.as_tensor(mask, device=value.device), known, torch.nan)
@@ -312,14 +316,14 @@ def _moments(name: str, value: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
 
 
 def check_scale(batch: AnyBatch, names: Collection[str]) -> None:
-    """Refuse variables that vary, but by less than models in float32 resolve.
+    """Check that variables vary by more than the smallest scale that float32 models resolve, or not at all.
 
     Args:
         batch: x as a tensor, or a batch.
-        names: of the variables.
+        names: names of the variables.
 
     Raises:
-        ValueError: the greatest standard deviation is below `units.SMALLEST`, and not 0.
+        ValueError: if the largest standard deviation is below `units.SMALLEST`, but not 0.
     """
     refuse_table(batch)
     given = Batch(batch if isinstance(batch, Mapping) else {WHOLE: batch})
@@ -334,7 +338,7 @@ def check_scale(batch: AnyBatch, names: Collection[str]) -> None:
 
 
 def _meaning(support: Any) -> str:
-    """Where values are, in words."""
+    """Return the support in words."""
     if isinstance(support, ProductSupport):
         return "; ".join(f"of {', '.join(map(str, places))}: {_meaning(own)}" for places, own in support.parts)
     while hasattr(support, "base_constraint"):
@@ -352,7 +356,7 @@ def _meaning(support: Any) -> str:
 
 
 def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tuple[int, int]:
-    """B and T, of the values where these tell."""
+    """Return B and T, from the values if they determine them."""
     sizes = {value.shape[0] for value in values.values()} or {size}
     if len(sizes) > 1:
         raise ValueError(f"the batch holds different numbers of sequences: {shapes(values)}")
@@ -372,14 +376,14 @@ def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tupl
 
 
 def shapes(values: Mapping[str, Tensor]) -> str:
-    """The values' names and shapes, in words."""
+    """Return the names and shapes of the values as text."""
     return ", ".join(f"{name} {tuple(value.shape)}" for name, value in values.items())
 
 
 def repeat(value: Any, samples: int) -> Any:
-    """A batch, or a tensor (B, ...), `samples` times over: (samples * B, ...), sample by sample.
+    """Return a batch, or a tensor (B, ...), repeated as (samples * B, ...), sample by sample.
 
-    Each time its groups are others.
+    Each copy has its own groups.
     """
     if not isinstance(value, Mapping):
         return again(value, samples)
@@ -392,7 +396,7 @@ def repeat(value: Any, samples: int) -> Any:
 
 
 def rows(value: Any, part: slice) -> Any:
-    """Some of the sequences of a batch, or of a tensor (B, ...)."""
+    """Return some sequences of a batch, or of a tensor (B, ...)."""
     if isinstance(value, Mapping):
         return (value if isinstance(value, Batch) else Batch(value)).rows(part)
     return value[part]
@@ -401,21 +405,21 @@ def rows(value: Any, part: slice) -> Any:
 def in_chunks(
     make: Callable[[slice, int], Mapping[str, Tensor]], size: int, samples: int, chunk: int
 ) -> dict[str, Tensor]:
-    """What is made of all sequences and samples, (S, B, ...), with no more than a chunk of them at once beside it.
+    """Compute values (S, B, ...) for all sequences and samples in chunks, to limit memory in addition to the result.
 
     Args:
-        make: values (n, b, ...) by name, from a slice of b sequences and n samples.
+        make: function of a slice of b sequences and a number of samples n; returns values (n, b, ...) by name.
         size: B.
         samples: S.
-        chunk: the most sequences times samples.
+        chunk: maximum of sequences times samples in one call of `make`.
 
     Raises:
-        ValueError: no samples, or a chunk that holds nothing.
+        ValueError: if samples or chunk is below 1.
     """
     if samples < 1 or chunk < 1:
         raise ValueError(f"samples and chunk are at least 1, got {samples} and {chunk}")
     found: dict[str, Tensor] = {}
-    for first in range(0, max(size, 1), chunk):  # of no sequences too, which `make` refuses
+    for first in range(0, max(size, 1), chunk):  # runs once for an empty batch too, so that `make` raises
         part = slice(first, min(first + chunk, size))
         at_once = chunk // max(part.stop - first, 1)
         for start in range(0, samples, at_once):

@@ -1,4 +1,4 @@
-"""One factor of a factorization as a module: a network on the parents, a law of its features."""
+"""One factor of a factorization as a module: a network on the parents and a distribution of its features."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from ..networks.loop import Rows, at, follow, once, once_valid, over, select, sh
 from .groups import Groups
 
 CONSTANT = "1"
-"""What the network of a guide's factor without parents reads."""
+"""Name of the constant input to the network of a guide's factor without parents."""
 
 
 @dataclass
 class Standardised:
-    """The state of a network's loop, and the draws so far without unit."""
+    """The state of a network's loop, with the standardised draws so far."""
 
     network: Any
     kept: dict[str, Rows]
@@ -37,7 +37,7 @@ class Standardised:
 
 @contextmanager
 def evaluating(*modules: nn.Module) -> Iterator[None]:
-    """eval() for the length of a block."""
+    """Switch modules to eval mode for the length of a block."""
     training = [part for module in modules for part in module.modules() if part.training]
     for module in modules:
         module.eval()
@@ -49,30 +49,31 @@ def evaluating(*modules: nn.Module) -> Iterator[None]:
 
 
 def like(module: nn.Module) -> Tensor:
-    """A tensor of the module's type and device."""
+    """Return a tensor of the module, for its dtype and device."""
     for tensor in module.parameters():
         return tensor
     return next(module.buffers())
 
 
 class Conditional(nn.Module):
-    """p(child | parents) or q(child | parents).
+    """A conditional distribution p(child | parents) or q(child | parents).
 
     Args:
-        factor: the factor. Without parents a generative one has no network; a guide's reads a constant.
+        factor: the factor. Without parents, a generative factor has no network and a guide's factor reads a constant.
         sizes: dimension of every variable.
-        network, law: descriptions of the two parts.
-        generative: p rather than q.
+        network: description of the network.
+        law: description of the distribution.
+        generative: True for p, False for q.
         data: names of the data variables.
-        guide: of a static latent without parents its q(w | ...), which some priors are made of.
-        indicators: names of data that the network reads with their indicators beside them: 1 where an entry was
-            observed, 0 where not.
+        guide: q(w | ...) of a static latent without parents, which some priors contain.
+        indicators: names of data that the network reads together with indicators: 1 where an entry was observed, else
+            0.
 
     Raises:
-        ValueError: a network and a law that do not go together.
+        ValueError: if the network and the distribution do not fit together.
 
     Attributes:
-        discrete, reparameterised, whole: as the law declares (`Law.discrete`, `Law.event_dim`).
+        discrete, reparameterised, whole: as the distribution declares (`Law.discrete`, `Law.event_dim`).
     """
 
     inside: Tensor | None
@@ -107,24 +108,24 @@ class Conditional(nn.Module):
         features = 0 if self.network is None else self.network.features
         self.law = law.build(Shape(self.size, features, factor.local, factor.child, data, guide))
         self.parents = [parent.name for parent in factor.parents]
-        self.units: dict[str, Units] = {}  # not registered here: they are the model's
+        self.units: dict[str, Units] = {}  # the model registers them
         self.discrete = self.law.discrete
         self.reparameterised = self.law.reparameterised and not self.law.discrete
         self.whole = self.law.event_dim == 1
         self.support = None if self.law.support is None or is_real(self.law.support) else self.law.support
-        """Where its values are, if that is somewhere in particular and the same whatever the parents."""
+        """Support of the values; None if it is the real line or depends on the parents."""
         self.events = [range(self.size)] if self.whole else self.law.events
-        """Coordinates that are one event each, and observed together."""
+        """Groups of coordinates; each group is one event and is observed as a whole."""
         self.register_buffer("inside", self.law.inside(self.size), persistent=False)
-        self._seen = False  # whether the law has made a distribution, which was as declared
+        self._seen = False  # whether a distribution was compared with its declaration
         for length in range(2, 9):
             self.check(length)
 
     def _declared(self, law: TorchDistribution) -> None:
-        """Refuse a distribution that is not as its law declares.
+        """Check that a distribution matches the declaration of its `Law`.
 
         Raises:
-            ValueError: another event, or another support.
+            ValueError: if its event shape or support differs.
         """
         event = (self.size,) if self.whole else ()
         if tuple(law.event_shape) != event or not (self.whole or law.batch_shape[-1:] == (self.size,)):
@@ -134,7 +135,7 @@ class Conditional(nn.Module):
                 + (f"the event {event}" if self.whole else f"no event, and the last dimension {self.size} in its batch")
             )
         support: Any = None
-        with suppress(NotImplementedError):  # a distribution that says nothing of its support
+        with suppress(NotImplementedError):  # some distributions have no support
             support = law.support
         if support is not None and not is_real(support):
             declared = self.law.support is None or not is_real(self.law.support)
@@ -146,10 +147,10 @@ class Conditional(nn.Module):
         self._seen = True
 
     def check(self, length: int) -> None:
-        """Refuses a residual law that reads what the factor does not, at sequences of this length.
+        """Check that a residual distribution reads the child's previous value, at sequences of this length.
 
         Raises:
-            ValueError: the factor does not read the child's own value a step before.
+            ValueError: if the factor does not read the child's own value one step before.
         """
         own = self.factor.parent(self.factor.child)
         if self.law.residual and not (own and own.relation and own.relation.reads(-1, length)):
@@ -160,13 +161,13 @@ class Conditional(nn.Module):
             )
 
     def scored(self, value: Tensor, counted: Tensor | None) -> Tensor:
-        """The value (..., D) with any other that has a density at entries that do not count.
+        """Return the value (..., D) with a valid placeholder at entries that do not count.
 
-        What stands there may have none, as 0 of a positive variable, and its gradient would be NaN.
+        An uncounted entry may have no density, such as 0 for a positive variable, and its gradient would be NaN.
 
         Args:
-            value: of the child.
-            counted: as the value, or (...) of whole events.
+            value: value of the child.
+            counted: mask of the shape of `value`, or (...) for whole events.
         """
         if self.inside is None or counted is None:
             return value
@@ -180,7 +181,10 @@ class Conditional(nn.Module):
         lengths: Tensor | None = None,
         groups: Groups | None = None,
     ) -> Parameters:
-        """The law's parameters at all steps, (B, T, D), or (B, D) for a static child, of which groups share one."""
+        """Return the parameters at all steps, (B, T, D), or (B, D) for a static child.
+
+        Sequences of a group share them.
+        """
         if self.network is None:
             shape = (batch, length, 0) if self.factor.local else (batch, 0)
             return self._in_units(self.law(like(self.law).new_empty(shape)))
@@ -193,7 +197,7 @@ class Conditional(nn.Module):
         return self._in_units(self.law(features, previous))
 
     def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
-        """The parents among `values`, without unit and with their indicators, or a constant in place of none."""
+        """Return the parents, standardised and with their indicators; a constant if the factor has none."""
         if not self.parents:
             return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
         read = [*self.parents, *map(presence, self.parents)]
@@ -203,7 +207,7 @@ class Conditional(nn.Module):
         return found | told
 
     def _indicated(self, value: Tensor, seen: Tensor | None, lengths: Tensor | None) -> Tensor:
-        """The value (B, T, D), or (B, D), with its indicators behind it; 0 at padding."""
+        """Return the value, (B, T, D) or (B, D), with its indicators appended; these are 0 at padding."""
 
         def compute() -> Tensor:
             told = torch.ones_like(value) if seen is None else seen.to(value)
@@ -215,12 +219,12 @@ class Conditional(nn.Module):
 
     @property
     def _made_in(self) -> Units | None:
-        """The units that the law's parameters are put into, where these can be."""
+        """Units of the child, if the parameters of its distribution can be transformed to them."""
         return self.units.get(self.factor.child) if self.law.location_scale else None
 
     def _in_units(self, parameters: Parameters) -> Parameters:
         if parameters and torch.is_autocast_enabled(parameters[0].device.type):
-            # networks may compute in half precision, but not densities, divergences and draws
+            # networks may compute in half precision, but densities, divergences and draws must not
             parameters = tuple(parameter.to(like(self).dtype) for parameter in parameters)
         units = self._made_in
         if units is None:
@@ -231,35 +235,35 @@ class Conditional(nn.Module):
 
     @property
     def offset(self) -> Tensor | None:
-        """(D,) the mean of values in float64, less which the parameters are; None where values are as the model is."""
+        """Mean (D,) in float64 that parameters exclude; None if values are in the model's precision."""
         units = self._made_in
         if units is None or not units.wide or not self.law.centred:
             return None
         return units.mean if self.law.centred is True else units.mean * constant(self.law.centred, units.mean)
 
     def centred(self, value: Tensor) -> Tensor:
-        """The value (..., D) of the child less the offset, as the parameters are."""
+        """Return the value (..., D) of the child minus the offset, to match the parameters."""
         offset = self.offset
         return value if offset is None else (value - offset).to(like(self).dtype)
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """The distribution of the child, see `Law.distribution`."""
+        """Return the distribution of the child for these parameters (`Law.distribution`)."""
         law, offset = self.law.distribution(parameters), self.offset
         if not self._seen:
             self._declared(law)
         return law if offset is None else Offset(law, offset, parameters[0].dtype)
 
     def mean(self, parameters: Parameters) -> Tensor:
-        """The mean of the child (..., D)."""
+        """Return the mean of the child, (..., D)."""
         return self._placed(self.law.mean(parameters))
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Values (..., D) of the child, see `Law.draw`."""
+        """Return values (..., D) of the child (`Law.draw`)."""
         return self._placed(self.law.draw(parameters, noise))
 
     @property
     def drawing(self) -> Callable[[Parameters, Tensor], Tensor]:
-        """`draw`, for a loop: the law's own where values have no offset."""
+        """`draw` for use in a loop: the method of the distribution itself if values have no offset."""
         return self.law.draw if self.offset is None else self.draw
 
     def _placed(self, value: Tensor) -> Tensor:
@@ -267,11 +271,11 @@ class Conditional(nn.Module):
         return value if offset is None else value + offset
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """The state before a loop that draws those of the parents that are not `given`."""
+        """Return the state before a loop that draws the parents that are not in `given`."""
         if self.network is None:
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
-        # read from the draws, given or not
+        # these are read from the draws, even if given
         own = self.factor.child if self.law.residual and self._made_in is not None else None
         live = [name for name in self.units if name in self.parents and (name not in given or name == own)]
         if not live:
@@ -279,7 +283,10 @@ class Conditional(nn.Module):
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
-        """The law's parameters (B, D) at step t, the last of so many that are taken at once, and the next state."""
+        """Return the parameters (B, D) at step t and the next state.
+
+        The call evaluates `count` steps at once, and t is the last of them.
+        """
         if self.network is None:
             return tuple(p[t] for p in state), state
         inner, read = self._without_unit(state, drawn)
@@ -293,7 +300,7 @@ class Conditional(nn.Module):
         return self._in_units(self.law(features, previous, t)), self._advanced(state, inner)
 
     def stretch(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
-        """The law's parameters (B, N, D) at N steps from t on, where what they read is known, and the next state."""
+        """Return the parameters (B, N, D) at N steps from t on, with all their inputs known, and the next state."""
         if self.network is None:
             return tuple(torch.stack(p[t : t + count], dim=1) for p in state), state
         inner, read = self._without_unit(state, drawn)
@@ -305,14 +312,14 @@ class Conditional(nn.Module):
         return self._in_units(self.law(features, previous, t)), self._advanced(state, inner)
 
     def _without_unit(self, state: Any, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
-        """The state of the network, and the draws as it reads them."""
+        """Return the state of the network, and the draws standardised as the network reads them."""
         if not isinstance(state, Standardised):
             return state, drawn
         found = {n: follow(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
         return state.network, {**drawn, **found}
 
     def select(self, state: Any, rows: Tensor) -> Any:
-        """The state with these rows (N,) of its batch (see `rows.select`)."""
+        """Return the state with these rows (N,) of its batch (`networks.loop.select`)."""
         if self.network is None:
             return select(state, rows)
         if not isinstance(state, Standardised):
@@ -322,14 +329,14 @@ class Conditional(nn.Module):
 
     @staticmethod
     def _advanced(state: Any, inner: Any) -> Any:
-        """The state with the network's next one."""
+        """Return the state with the next state of the network."""
         if not isinstance(state, Standardised):
             return inner
         state.network = inner
         return state
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
-        """Draws (B, T, D) and their parameters by one fused loop, where the factor is a Gaussian chain; else None."""
+        """Return draws (B, T, D) and their parameters by one fused loop; None if the factor is no Gaussian chain."""
         if torch.is_autocast_enabled(noise.device.type):  # the fused loop runs in one precision
             return None
         if self.factor.child in self.units:

@@ -1,6 +1,7 @@
-"""What a fitted model makes of data: sequences that go on, and means given latents of the guide.
+"""Forecasts, reconstructions and imputations of a fitted model.
 
-These are the bodies of `DynamicalVAE.forecast`, `reconstruct` and `impute`, which say what they take and return.
+These functions implement `DynamicalVAE.forecast`, `reconstruct`, `impute` and `states`, which document arguments and
+results.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .conditional import like
 from .groups import Groups
 
 WEIGHT = "log weight"
-"""Beside what is drawn, how much more likely the latents are given what was observed than under the guide."""
+"""Key of the log importance weight p(z, x observed) / q(z) of each draw."""
 
 
 def forecast(
@@ -33,16 +34,16 @@ def forecast(
     fix: Mapping[str, Tensor] | None,
     chunk: int,
 ) -> dict[str, Tensor]:
-    """The latents of the past from the guide, then the model runs free.
+    """Infer the latents of the past with the guide, then run the model free.
 
-    Where the view has the whole past as context (`views.Past`), there are no data for the guide to read, and latents
-    are from the prior.
+    If the view makes the whole past context (`views.Past`), the guide has no data to read, and latents come from the
+    prior.
     """
     require(Count, horizon=horizon, samples=samples)
     require(Annotated[int, Range(1)], chunk=chunk)
     data = model.read(batch)
     told: Any = batch if isinstance(batch, Mapping) else ()
-    redrawn = [name for name in model.shared if name not in told]  # for every sample anew
+    redrawn = [name for name in model.shared if name not in told]  # drawn for each sample
     if data.lengths is not None:
         raise ValueError("forecast continues sequences of one length; cut the batch to it, or forecast them in turn")
     first = data.get(model.view.history or model.observed[0])
@@ -56,8 +57,8 @@ def forecast(
     local = {name for name in data if name in model.context and data[name].dim() == 3}
     seen = data | {name: data[name][:, :past] for name in local}
     if past:
-        model.rollout(seen, guide=True)  # refuses what cannot be read, of all sequences
-    # what the guide makes of the past alone, once for all samples
+        model.rollout(seen, guide=True)  # validates all sequences before the loop over chunks
+    # the guide's features of the past, computed once for all samples
     alike = model.forks and not redrawn and not model.grouped and model.latents[:1] == model.prior_order[:1]
     forked = model.latents[:1] if alike else ()
 
@@ -82,16 +83,16 @@ def forecast(
         made |= {name: made[name][:, :, past:] for name in model.observed}
         made = model.shown(made, rows(data, part))
         again = {n: rows(v, part).expand_as(made[n]) for n, v in given.items() if n in model.observed}
-        return model.shown({**made, **again}) if again else made  # as it was given: the way there and back rounds
+        return model.shown({**made, **again}) if again else made  # the original, since the view's round trip rounds
 
-    # Samples that are all the same are one: rows of one product may differ in their last bits.
+    # Identical samples are computed once: rows of one matrix product may differ in their last bits.
     distinct = samples if model.latents or model.summed or redrawn or drawn else 1
     out = in_chunks(futures, size, distinct, _together(model, data, size, chunk))
     return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
 
 def _fixed(model: Any, given: Mapping[str, Tensor], data: Batch, size: int, horizon: int) -> dict[str, Tensor]:
-    """What is fixed as the model sees it, that of data over past and future."""
+    """Return the fixed values as the model sees them; data include the past."""
     free = {*model.observed, *(name for name in model.latents if not model.generative.local(name))}
     for name, value in given.items():
         if name not in free or free & set(model.observed) <= set(given):
@@ -109,9 +110,9 @@ def _fixed(model: Any, given: Mapping[str, Tensor], data: Batch, size: int, hori
 
 
 def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
-    """Means of the data given latents from the guide, teacher-forced."""
+    """Return means of the data given latents from the guide, teacher-forced."""
     data = model.read(batch)
-    whole = model.rollout(data, guide=True)  # refuses what cannot be read
+    whole = model.rollout(data, guide=True)  # validates all sequences
 
     def means(part: slice, count: int) -> dict[str, Tensor]:
         some = repeat(rows(data, part), count)
@@ -121,7 +122,7 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
             rollout.states = rollout.summation.draw()
         found = {}
         for name in model.generative.variables:
-            if name in model.observed and name not in rollout.values:  # a function of its parents
+            if name in model.observed and name not in rollout.values:  # deterministic given its parents
                 rollout.know(name, rollout.draw(name))
             if name in model.observed:
                 found[name] = model.generator[name].mean(rollout.parameters(name, rollout.values[name]))
@@ -132,11 +133,11 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
 
 
 def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
-    """Probabilities of the states that are summed out, given the data and latents from the guide."""
+    """Return probabilities of the states that are summed out, given the data and latents from the guide."""
     if not model.summed:
         raise ValueError(f"nothing is summed out in {model.generative}; discrete latents have sizes of dvae.Discrete")
     data = model.read(batch)
-    whole = model.rollout(data, guide=True)  # refuses what cannot be read
+    whole = model.rollout(data, guide=True)  # validates all sequences
 
     def probabilities(part: slice, count: int) -> dict[str, Tensor]:
         some = repeat(rows(data, part), count)
@@ -147,7 +148,7 @@ def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, T
 
 
 def _given(model: Any, batch: AnyBatch, latents: Mapping[str, Tensor]) -> Any:
-    """The generative run in which data and latents are known."""
+    """Return the generative run with data and latents known."""
     rollout = model.rollout(batch)
     rollout.values.update(latents)
     return rollout
@@ -156,7 +157,7 @@ def _given(model: Any, batch: AnyBatch, latents: Mapping[str, Tensor]) -> Any:
 def impute(
     model: Any, batch: AnyBatch, samples: int, chunk: int, draw: bool | None, particles: int
 ) -> dict[str, Tensor]:
-    """The data, where they are missing with means given latents from the guide, or draws one after the other."""
+    """Return the data with missing entries replaced by means given latents from the guide, or by sequential draws."""
     refuse_table(batch)
     given = Batch(batch if isinstance(batch, Mapping) else {})
     masks = given.masks(WHOLE if model.view.parts else model.observed[0])
@@ -172,16 +173,16 @@ def impute(
     found = {}
     for name, mask in masks.items():
         value = made[name]
-        lacking = mask.shape[1] - value.shape[2]  # frames that the model starts from, and does not make
+        lacking = mask.shape[1] - value.shape[2]  # leading frames, which the model reads as context
         value = torch.cat([value[:, :, :1].expand(-1, -1, lacking, -1), value], 2)
         found[name] = torch.where(torch.as_tensor(mask), torch.as_tensor(given[name]).to(value), value)
     return found
 
 
 def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int, particles: int) -> dict[str, Tensor]:
-    """The data with draws of what is missing, each given latents from the guide and what came before it."""
+    """Return the data with missing entries drawn, each given latents from the guide and all earlier values."""
     data = model.read(batch)
-    whole = model.rollout(data, guide=True)  # refuses what cannot be read
+    whole = model.rollout(data, guide=True)  # validates all sequences
     groups = whole.groups if model.grouped else None
 
     def draws(part: slice, count: int) -> dict[str, Tensor]:
@@ -213,17 +214,17 @@ def _resampled(
     chunk: int,
     groups: Groups | None,
 ) -> dict[str, Tensor]:
-    """Sampling importance resampling: of K draws for each sample those that their weights choose, none twice.
+    """Choose samples among K draws each by sampling importance resampling without replacement.
 
-    Without replacement (Gelman et al., Bayesian Data Analysis, 2013, 10.4), by the largest weights times exponential
-    noise (Efraimidis and Spirakis, 2006): samples stay different ones where a few weights are all.
+    Sampling without replacement (Gelman et al., Bayesian Data Analysis, 2013, 10.4) takes the largest weights times
+    exponential noise (Efraimidis and Spirakis, 2006). Samples stay distinct even if a few weights dominate.
 
     Args:
-        draws: values (n, b, ...) and `WEIGHT` (n, b), from a slice of b sequences and n draws.
+        draws: function that returns values (n, b, ...) and `WEIGHT` (n, b) for a slice of b sequences and n draws.
         size: B.
         samples, particles: S and K.
-        chunk: the most sequences times draws at once.
-        groups: of sequences that share latents, which are chosen together.
+        chunk: maximum of sequences times draws at once.
+        groups: groups of sequences that share latents; a group is resampled jointly.
     """
     pool = samples * particles
     at_once = max(1, chunk // pool) if groups is None else size
@@ -243,5 +244,5 @@ def _resampled(
 
 
 def _together(model: Any, data: Batch, size: int, chunk: int) -> int:
-    """The most sequences times samples at once: at least all sequences, where groups of them share latents."""
+    """Return the maximum of sequences times samples at once; at least all sequences if groups of them share latents."""
     return max(chunk, size) if model.grouped and data.group is not None else chunk

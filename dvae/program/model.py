@@ -1,8 +1,8 @@
-"""DynamicalVAE: two factorizations and their networks as a Pyro model and guide.
+"""A pair of factorizations and their networks, as a Pyro model and guide.
 
-There is one sample site per variable, whatever the number of steps: `w` with event (D,), `z` and `x` with event (T, D),
-inside the plate "sequences". Everything else (free running, forecasts, reconstruction, scoring) is this one program
-with different things known.
+The programs have one sample site per variable, whatever the number of steps. A static `w` has the event shape (D,),
+local `z` and `x` have (T, D), all inside the plate "sequences". Free runs, forecasts, reconstructions and scores use
+the same program and differ only in which values are given.
 """
 
 from __future__ import annotations
@@ -43,38 +43,40 @@ from .summed import Discrete, Sums
 
 _COUNT = itertools.count()
 SHARED: Any = {"shared": True}
-"""What the site of a variable says that all sequences share."""
+"""The `infer` entry that marks the site of a variable shared by all sequences."""
 
 
 class DynamicalVAE(nn.Module):
-    """A generative model and a guide from their equations.
+    """A generative model and its guide, built from their equations.
 
     Args:
-        generative: such as "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", as text or a `Factorization`.
-        inference: such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"; "" where nothing is latent. "faithful" for the
-            smallest guide that misses nothing of what the posterior depends on (`faithful`). None for no inference
-            network: the guide is the prior, so that every KL term is exactly zero.
-        sizes: dimension of every variable, context included; `Discrete` of a latent that is categorical and summed out.
+        generative: text such as "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", or a `Factorization`.
+        inference: text such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"; "" for a model without latents.
+            "faithful" is the smallest guide that keeps every dependency of the posterior (`faithful`). None uses the
+            prior as the guide, and every KL term is exactly zero.
+        sizes: dimension of every variable, context included. A `Discrete` size makes a latent categorical, and the
+            model sums it out.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
-            factor, "p" for all generative ones, "q" for the guide's, and "default".
-        laws: the same for the laws; `distributions.Normal()` where nothing is said. A generative factor without parents
-            is N(0, I) unless "p(w)" itself is a key, such as of `distributions.Mixture()`.
+            factor, "p" for all generative factors, "q" for all factors of the guide, and "default".
+        laws: distributions of the factors, with the same keys; the default is `distributions.Normal()`. A generative
+            factor without parents is N(0, I), unless "p(w)" itself is a key, for example with
+            `distributions.Mixture()`.
         observed: names of the data variables; every other variable with a generative factor is a latent.
-        masks: relations of one's own, name to function of T (see `Factorization.parse`).
-        view: what the model sees of the data, such as their parts; as it is where nothing is said (see
-        `dvae.data.views`). shared: static context that the programs draw themselves, once for all sequences of a batch,
-            where it does not hold it: name to law. A forecast draws it once for each sample.
-        grouped: static latents that the sequences of a group share, of which a batch says "group" (B,); see
-            `dvae.program.groups`. Without that every sequence is a group.
-        indicators: data variables of which the guide reads which entries were observed, beside their values: each
-            coordinate has one of 0 and 1, all 1 without a mask (Collier et al., 2020, arXiv 2006.05301). Without
-            them the guide cannot tell a missing entry from one that was observed at 0, or at the mean of a variable
-            with units.
+        masks: custom relations, name to function of T (`Factorization.parse`).
+        view: transformation of the data that the model sees, such as a split into parts (`dvae.data.views`); none by
+            default.
+        shared: static context, name to distribution. If a batch does not give such a variable, the programs draw it
+            once for all sequences of the batch. A forecast draws it once for each sample.
+        grouped: static latents that the sequences of a group share. A batch gives the groups as "group" (B,); without
+            it, every sequence is its own group (`dvae.program.groups`).
+        indicators: data variables for which the guide also reads which entries were observed. Each coordinate has an
+            indicator of 0 or 1, all 1 without a mask (Collier et al., 2020, arXiv 2006.05301). Without indicators, the
+            guide cannot distinguish a missing entry from one observed at 0, or at the mean of a variable with units.
 
     Raises:
-        TypeError: a size that is no whole number, or a class in place of a view.
-        ValueError: equations that cannot be read or do not fit together; sizes missing, unknown or out of range; a
-            class in place of a network or law.
+        TypeError: if a size is not an integer, or `view` is a class instead of an instance.
+        ValueError: if the equations are invalid or do not fit together, a size is missing, unknown or out of range, or
+            a network or distribution is a class.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})", {"z": 2, "x": 3})
@@ -83,14 +85,14 @@ class DynamicalVAE(nn.Module):
     """
 
     extras: ClassVar[tuple[str, ...]] = ()
-    """What a batch may hold that is no variable, for `penalties`."""
+    """Names of batch entries that are not variables, but that `penalties` reads."""
     forks: ClassVar[bool] = True
-    """Whether `draws` are continuations of a row; a program may mean something else by them."""
+    """Whether a forecast continues each row once per draw; a subclass may use `draws` differently."""
     per: str = "frame"
-    """What there is one log-likelihood of."""
+    """Unit of one log-likelihood: "frame" or "window"."""
 
     @alone
-    @torch.inference_mode(False)  # so that the parameters can be trained, wherever the model is built
+    @torch.inference_mode(False)  # keeps parameters trainable if the model is built in inference mode
     def __init__(
         self,
         generative: str | Factorization,
@@ -107,7 +109,7 @@ class DynamicalVAE(nn.Module):
         indicators: Collection[str] = (),
     ):
         super().__init__()
-        self._name = f"dvae{next(_COUNT)}"  # each model its own: Pyro's store is global
+        self._name = f"dvae{next(_COUNT)}"  # unique: Pyro's store is global
         self.generative = Factorization.parse(generative, masks)
         self.feeding: SelfFeeding | InputNoise = SelfFeeding(0.0)
         if not isinstance(view, View | None):
@@ -147,8 +149,8 @@ class DynamicalVAE(nn.Module):
         roots, rest = ([f for f in self.generative.factors if bool(f.parents) == more] for more in (False, True))
         self.generator: Any = self._conditionals(rest)
         guides = {} if inference is None else self._conditionals(self.inference.factors)
-        self.generator.update(self._conditionals(roots, guides))  # last: priors may be made of the guide
-        if inference is None:  # the very modules of the prior, which are not to be registered twice
+        self.generator.update(self._conditionals(roots, guides))  # last: a prior may contain the guide
+        if inference is None:  # the same modules as the prior, which must not be registered twice
             object.__setattr__(self, "encoder", {name: self.generator[name] for name in self.latents})
         else:
             self.encoder: Any = guides
@@ -225,18 +227,19 @@ class DynamicalVAE(nn.Module):
 
     @torch.inference_mode(False)
     def standardise(self, name: str, coordinates: Sequence[Coordinate] = ()) -> Units:
-        """Has networks read a variable without unit, by a mean and a scale that `fit` of the result takes.
+        """Make the networks read a variable standardised; call `fit` on the result to set mean and scale.
 
-        They make it without unit too where its law is a location and a scale (`Law.location_scale`); probabilities
-        and rates are made as they are. Densities and values stay in the variable's own unit; call it before the model
-        is fitted.
+        If the distribution of the variable has a location and a scale (`Law.location_scale`), networks also produce its
+        parameters standardised. Probabilities and rates are produced unchanged. Densities and values stay in the
+        variable's own unit. Call this method before the model is fitted.
 
         Args:
-            name: of the variable.
-            coordinates: how each is read and made, as of columns of a table, in place of what is fitted.
+            name: name of the variable.
+            coordinates: how to read and produce each coordinate, such as a column of a table; replaces the fitted
+                values.
 
         Raises:
-            ValueError: an unknown variable.
+            ValueError: if the variable is unknown.
         """
         if name not in self.sizes:
             raise ValueError(f"no variable {name!r}; there are {', '.join(self.sizes)}")
@@ -254,23 +257,26 @@ class DynamicalVAE(nn.Module):
 
     @property
     def likelihood(self) -> bool:
-        """Whether the data have a density given the latents; without one there is no bound (`distributions.Delta`)."""
+        """Whether the data have a density given the latents.
+
+        Models without one (`distributions.Delta`) have no bound.
+        """
         return not any(self.generator[name].law.deterministic for name in self.observed)
 
     @property
     def gradual(self) -> bool:
-        """Whether a curriculum changes what its programs do: draws of what sequences share."""
+        """Whether a curriculum affects the programs, through the draws of shared context."""
         return bool(self.shared)
 
     def is_drawn(self, means: bool = False) -> bool:
-        """Whether forecasts draw the data unless `draw_emission` is given.
+        """Return whether forecasts draw the data if `draw_emission` is not given.
 
         They do, unless the emission's scale is the weight of a squared error (`Law.error_weight`).
 
         Args:
-            means: means are preferred, as by scores that are published for means. Data are drawn nevertheless where
-                they are discrete and a mean is no value, and where nothing is latent and all samples would be the same
-                mean.
+            means: prefer means, for scores that are published for means. Data are drawn anyway if they are discrete,
+                since a mean is then not a possible value. They are also drawn if the model has no latents, since all
+                samples would be equal.
         """
         laws = [self.generator[name] for name in self.observed]
         if means and (self.latents or self.summed) and not any(each.discrete for each in laws):
@@ -280,19 +286,19 @@ class DynamicalVAE(nn.Module):
     def rollout(
         self, batch: AnyBatch | None, length: int | None = None, size: int = 1, *, guide: bool = False
     ) -> Rollout:
-        """Return a run over a batch in which nothing has been drawn yet; it draws on demand.
+        """Return a run over a batch that draws on demand.
 
         `model` and `guide` turn such a run into sample sites. Use it to evaluate conditional distributions step by
         step, as the oracle and the particle filter do.
 
         Args:
-            batch: see `model`; None for a free run.
-            length: T, if it differs from that of the data.
-            size: B, if there is no batch.
+            batch: as in `model`; None for a free run.
+            length: T, if it differs from the length of the data.
+            size: B, without a batch.
             guide: run the guide instead of the model.
 
         Raises:
-            ValueError: a batch that cannot be read.
+            ValueError: if the batch is invalid.
         """
         if guide:
             return self.reader.rollout(self.inference, self.encoder, self.read(batch), length, size)
@@ -314,23 +320,25 @@ class DynamicalVAE(nn.Module):
         draws: Mapping[str, int] | None = None,
         curriculum: float = 1.0,
     ) -> dict[str, Tensor]:
-        """The generative program p. Teacher-forced where the data are given, free where they are not.
+        """Run the generative program p: teacher-forced where data are given, free where they are not.
 
         Args:
-            batch: the data (B, T, D), or a mapping from variable names to tensors (context too), with optional
-                "lengths" (B,) of a ragged batch and "mask", True where an entry of the data was observed: (B, T, D),
-                or a mapping of these by name. At a missing entry the model reads its own mean, the guide 0, or the
-                mean of a variable with units. Arrays are taken as tensors, in the model's precision.
-            length: T. Beyond the length of the data, the data are a prefix from which the program continues.
-            size: B, where the batch does not tell.
-            prefix: name to the first values (B, O, D) of a latent, or the value (B, C) of a static one that is summed
-                out.
-            mean_emission: a free run sets the data variables, or those named, to their means and does not draw them.
-            self_feeding: what stands in for the data's history: a `SelfFeeding` (scheduled sampling), an `InputNoise`,
-                or a number, the probability or the share of the noise, in the way of the model's attribute `feeding`.
-            draws: latent to a number n: from there on the program goes on n times for each sequence, with a draw
-                of this variable each. Later variables have n times as many rows, draw by draw.
-            curriculum: how far the draws of what sequences share have come, see `distributions.Subset`.
+            batch: data (B, T, D), or a mapping from variable names to tensors, context included. Optional entries:
+                "lengths" (B,) of a ragged batch, and "mask", True where an entry of the data was observed, (B, T, D) or
+                a mapping by name. At a missing entry, the model reads its own mean and the guide reads 0 (the mean, for
+                a variable with units). Arrays become tensors in the model's precision.
+            length: T. If it exceeds the length of the data, the program continues the data.
+            size: B, if the batch does not determine it.
+            prefix: name to the first values (B, O, D) of a latent, or to the value (B, C) of a static latent that is
+                summed out.
+            mean_emission: in a free run, set the data variables, or the named ones, to their means instead of drawing
+                them.
+            self_feeding: replacement for the data's history: a `SelfFeeding` (scheduled sampling), an `InputNoise`, or
+                a number. A number sets the probability or the share of the noise of the model's attribute `feeding`.
+            draws: latent to a number n: the program draws this variable n times for each sequence and continues each
+                draw. Later variables have n times as many rows, ordered draw by draw.
+            curriculum: progress of the curriculum for the draws of shared context, from 0 to 1
+                (`distributions.Subset`).
 
         Returns:
             Name to value of every variable.
@@ -364,23 +372,23 @@ class DynamicalVAE(nn.Module):
                 rollout = rollout.fork((draws or {}).get(name, 1))
                 with rollout.plate:
                     rollout.know(name, self._site(name, rollout))
-        precision = like(self).dtype  # whatever autocast computes in
+        precision = like(self).dtype  # autocast may compute in another
         factors = {name: -e.to(precision) for name, e in self.penalties(rollout, data, draws or {}).items()}
         if data.log_det is not None and self.likelihood:
             factors["log_det"] = data.volume
         with pyro.plate("windows", rollout.batch // rollout.draws, dim=-1) if factors else nullcontext():
             for name, value in factors.items():
-                unit = dist.Unit(value, validate_args=False)  # a loss that is not finite is told by the step
+                unit = dist.Unit(value, validate_args=False)  # the training step reports a loss that is not finite
                 pyro.sample(name, unit, obs=value.new_empty((*value.shape, 0)), infer={"is_auxiliary": True})
         return rollout.states | rollout.values
 
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> Mapping[str, Tensor]:
-        """Energies that the program adds at its end as `pyro.factor` sites; none, unless a subclass has some.
+        """Return the energies that the program adds as `pyro.factor` sites; none, unless a subclass overrides this.
 
         Args:
-            rollout: the run, with the value of every variable, and `evaluate` for the conditionals.
-            data: the batch, as `read` gives it.
-            draws: as the program was given them.
+            rollout: the run, with the value of every variable and `evaluate` for its conditional distributions.
+            data: the batch that `read` returned.
+            draws: numbers of draws, as given to the program.
 
         Returns:
             Name to (B,), positive where it costs.
@@ -399,7 +407,7 @@ class DynamicalVAE(nn.Module):
     def guide(
         self, batch: AnyBatch, *, draws: Mapping[str, int] | None = None, curriculum: float = 1.0, **_: Any
     ) -> dict[str, Tensor]:
-        """The inference program q, with the arguments of `model`.
+        """Run the inference program q, with the arguments of `model`.
 
         Returns:
             Name to value of every latent.
@@ -421,12 +429,12 @@ class DynamicalVAE(nn.Module):
         return values
 
     def forward(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
-        """`model`, so that the module itself is the Pyro model of `elbo(model, model.guide)`."""
+        """Run `model`, which makes the module itself the Pyro model of `elbo(model, model.guide)`."""
         return self.model(batch, **options)
 
     @property
     def prior_order(self) -> tuple[str, ...]:
-        """The latents in the order in which the model draws them; `latents` is that of the guide."""
+        """The latents in the model's sampling order; `latents` follows the order of the guide."""
         return tuple(name for block in self.generative.blocks for name in block.names if name in self.latents)
 
     def _check_draws(self, draws: Mapping[str, int]) -> None:
@@ -440,19 +448,19 @@ class DynamicalVAE(nn.Module):
         if any(count < 1 for count in draws.values()):
             raise ValueError(f"draws are numbers from 1, got {dict(draws)}")
 
-    # What is done with it ------------------------------------------------------------------------------------------
+    # Uses of a model -----------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
-        """Free runs from the prior.
+        """Draw sequences from the prior.
 
         Args:
-            n: how many; ignored where the batch (of context) tells.
+            n: number of sequences; ignored if the batch (of context) determines it.
             length: T.
             batch: context.
 
         Returns:
-            Name to draws (n, T, D), or (n, D) of a static latent.
+            Name to draws (n, T, D), or (n, D) for a static latent.
         """
         with self.running():
             data = self.read(batch, size=n)
@@ -469,41 +477,41 @@ class DynamicalVAE(nn.Module):
         fix: Mapping[str, Tensor] | None = None,
         chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
-        """Continues observed sequences: latents of the past from the guide, then the model runs free.
+        """Continue observed sequences: the guide infers the latents of the past, then the model runs free.
 
         Args:
-            batch: the observed data (B, O, D), or a mapping; local context must reach over O + horizon steps.
+            batch: observed data (B, O, D), or a mapping; local context must cover O + horizon steps.
             horizon: H, the number of steps to continue.
             samples: S, continuations of each sequence.
-            draw_emission: draw the data from their distribution; False for its means. Means lack the emission's
-                noise: they vary by the latents alone, and their quantiles are no prediction intervals. None for
-                draws, unless the emission's scale is the weight of a squared error.
-            fix: what is the same in all samples: the future (B, H, D) of a data variable, or the value (B, D) of a
-                static latent, such as one sample of an earlier forecast. Later variables read it; latents are not
-                inferred from it.
-            chunk: sequences times samples to hold at once, beside the result; draws come chunk by chunk.
+            draw_emission: draw the data from their distribution (True) or use its means (False). Means have no emission
+                noise: they vary by the latents alone, and their quantiles are not prediction intervals. None draws,
+                unless the emission's scale is the weight of a squared error.
+            fix: values that all samples share: futures (B, H, D) of data variables, or values (B, D) of static latents,
+                such as a sample of an earlier forecast. Later variables read it; latents are not inferred from it.
+            chunk: maximum of sequences times samples in memory, in addition to the result. Random draws follow the
+                chunks.
 
         Returns:
-            Name to (S, B, H, D) for the data, (S, B, O + H, D) for local and (S, B, D) for static latents; with parts,
-            the whole too.
+            Name to (S, B, H, D) for data, (S, B, O + H, D) for local latents and (S, B, D) for static ones. With parts,
+            the result includes the whole.
 
         Raises:
-            ValueError: a ragged batch, a local context that ends before the horizon, or a fixed value that cannot be.
+            ValueError: if the batch is ragged, local context ends before the horizon, or a value cannot be fixed.
         """
         with self.running():
             return forecast(self, batch, horizon, samples, draw_emission, fix, chunk)
 
     @torch.no_grad()
     def reconstruct(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
-        """Means of the data given latents from the guide, teacher-forced; missing entries are filled in so.
+        """Return means of the data given latents from the guide, teacher-forced; missing entries are filled in.
 
         Args:
-            batch: see `model`.
+            batch: as in `model`.
             samples: S, draws of the latents for each sequence.
-            chunk: sequences times samples to hold at once, beside the result.
+            chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
-            Name to (S, B, T, D) for every data variable, and the whole where these are parts.
+            Name to (S, B, T, D) for every data variable; with parts, the result includes the whole.
         """
         with self.running():
             return reconstruct(self, batch, samples, chunk)
@@ -512,63 +520,66 @@ class DynamicalVAE(nn.Module):
     def impute(
         self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, particles: int = 1, chunk: int = CHUNK
     ) -> dict[str, Tensor]:
-        """Fill in missing entries S times; observed entries stay as they are.
+        """Fill in missing entries S times; observed entries keep their values.
 
-        The guide reads all observed entries, before and after a gap. Means of missing entries differ only as far as the
-        draws of the latents do. Draws also have the noise of the emission, and later entries read the earlier ones.
+        The guide reads all observed entries, before and after the missing ones. Means of missing entries differ only as
+        far as the draws of the latents do. Draws also have the noise of the emission, and later entries read the
+        earlier ones.
 
-        With one particle, only the guide uses what was observed after a gap. More particles correct the guide: the
-        method draws S K latents and missing entries, and resamples S of them with the weights
-        p(z, x observed) / q(z) (Mattei and Frellsen, 2019, arXiv 1812.02633). As K grows, these become draws given all
-        observed entries. Longer sequences require more particles.
+        With one particle, only the guide uses observations after a missing entry. More particles correct the guide
+        (Mattei and Frellsen, 2019, arXiv 1812.02633). The method draws S K latents and missing entries, and resamples S
+        of them with the weights p(z, x observed) / q(z). As K grows, these become draws given all observed entries.
+        Longer sequences require more particles.
 
-        Some models do not generate the first frames, which are context. Missing entries
-        there repeat the first frame that the model generates.
+        Some models do not generate the first frames, which are context. Missing entries there repeat the first frame
+        that the model generates.
 
         Args:
-            batch: with a "mask", see `model`.
+            batch: batch with a "mask", as in `model`.
             samples: S, draws of the latents for each sequence.
-            draw: draw the missing entries, or (False) take their means; None for what `is_drawn` returns.
-            particles: K, draws for each sample, of which it is chosen.
-            chunk: sequences times samples to hold at once, beside the result.
+            draw: draw the missing entries (True) or use their means (False); None uses `is_drawn`.
+            particles: K, candidates for each sample.
+            chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
             Name to (S, B, T, D) for the variables that have a mask.
 
         Raises:
-            ValueError: a batch without a mask, or particles where there is nothing to choose or to choose by.
+            ValueError: if the batch has no mask, or `particles` is below 1, or above 1 for means or a model without a
+                likelihood.
         """
         with self.running():
             return impute(self, batch, samples, chunk, draw, particles)
 
     @torch.no_grad()
     def states(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
-        """Probabilities of the states that are summed out, given the whole data and draws of the latents.
+        """Return probabilities of the states that are summed out, given all data and draws of the latents.
 
-        Their mean over draws is the posterior's as far as the guide is; without other latents they are exact.
+        Their mean over draws approximates the posterior as well as the guide does. They are exact for a model without
+        other latents.
 
         Args:
-            batch: see `model`.
+            batch: as in `model`.
             samples: S, draws of the latents for each sequence.
-            chunk: sequences times samples to hold at once, beside the result.
+            chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
-            Name to (S, B, T, C), or (S, B, C) of a static one.
+            Name to (S, B, T, C), or (S, B, C) for a static latent.
 
         Raises:
-            ValueError: a model that sums nothing out.
+            ValueError: if the model sums nothing out.
         """
         with self.running():
             return states(self, batch, samples, chunk)
 
     @torch.no_grad()
     def log_joint(self, batch: AnyBatch, latents: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
+        """Return log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
 
-        The log-determinant of a view that changes volume is one of them: the joint is that of the data as given.
+        A view that changes volume adds its log-determinant as one entry: the joint is a density of the data as given.
 
         Raises:
-            ValueError: a latent without a value, or with one of another shape.
+            ValueError: if a latent is missing or has the wrong shape.
         """
         if missing := [name for name in self.latents if name not in latents]:
             raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
@@ -581,33 +592,34 @@ class DynamicalVAE(nn.Module):
         return {name: trace.nodes[name]["log_prob"] for name in names}
 
     def _register(self) -> None:
-        """Names the parameters in Pyro's store while `pyro.infer.SVI` looks for them, and else costs nothing."""
+        """Register the parameters in Pyro's store while `pyro.infer.SVI` collects them; otherwise do nothing."""
         if any(getattr(handler, "param_only", False) for handler in poutine.runtime._PYRO_STACK):
             pyro.module(self._name, self)
 
-    # What is read, and what is handed out --------------------------------------------------------------------------
+    # Reading batches and returning data ----------------------------------------------------------------------------
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Evaluation mode for a block that runs programs of the model, during which other threads wait."""
+        """Switch to evaluation mode for a block that runs programs of the model; other threads wait."""
         with alone, evaluating(self) if self.training else nullcontext():
             yield
 
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
-        """Return a batch by name, in the model's precision and the view's form, with missing entries filled.
+        """Return a batch by name, in the model's precision and seen through its view, with missing entries filled.
 
-        A batch that was read before stays as it is. Variables that sequences share are drawn if the batch does not
-        give them, at a Pyro site outside the plate. Model and guide use the same draw, so it adds nothing to a bound.
-        A shared variable may be given once, (D,), or for each sequence, (B, D).
+        A batch that was read before is returned unchanged. Shared variables are drawn if the batch does not give them,
+        at a Pyro site outside the plate. Model and guide use the same draw, which therefore adds nothing to a bound. A
+        shared variable may be given once, (D,), or for each sequence, (B, D).
 
         Args:
-            batch: see `model`.
-            size: B, where the batch does not tell.
-            curriculum: see `model`.
-            precise: read the variables that have units in float64 where they are so, as to fit these.
+            batch: as in `model`.
+            size: B, if the batch does not determine it.
+            curriculum: as in `model`.
+            precise: read variables that have units in float64 if the batch holds them so, for fitting the units.
 
         Raises:
-            ValueError: names that the model does not have, a mask of nothing, or data that the view cannot show.
+            ValueError: if the batch has names that the model does not know, a mask without its variable, or data that
+                the view rejects.
         """
         if like(self).is_meta:
             raise ValueError(
@@ -618,7 +630,7 @@ class DynamicalVAE(nn.Module):
         if isinstance(batch, Batch) and batch.reader == reader and not precise:
             return batch
         means = {name: units.filling for name, units in self.units.items()}
-        # by guide and model both, but for what they share
+        # guide and model both read the batch
         wide = {name for name in self.units if name in self.wide or (precise and _is_wide(batch, name))}
         data = Batch(once(self, [batch], lambda: self.reader.read(batch, reader[1], means, wide)))
         one = {name: data.pop(name) for name in self.shared if name in data and data[name].dim() == 1}
@@ -627,7 +639,7 @@ class DynamicalVAE(nn.Module):
             if name not in data:
                 law = spec.distribution(self.sizes[name], curriculum)
                 value = one[name] if name in one else pyro.sample(name, law, infer=SHARED)
-                data[name] = once(self, [value, size], partial(self._of_each, value, size))  # by guide and model both
+                data[name] = once(self, [value, size], partial(self._of_each, value, size))  # memoized for both
         data.reader = None if precise else reader
         return data
 
@@ -635,21 +647,22 @@ class DynamicalVAE(nn.Module):
         return value.to(like(self)).expand(size, -1)
 
     def shown(self, values: Mapping[str, Tensor], data: Batch | None = None) -> dict[str, Tensor]:
-        """Values that the model made, with those of the data as the data are: back through the view.
+        """Map data variables that the model produced back to data space, through the inverse of the view.
 
         Args:
-            values: name to (..., B, T, D), as the model sees them.
-            data: the batch that they belong to, as `read` gives it; without it they stay as they were turned.
+            values: name to (..., B, T, D), in the model's space.
+            data: the batch that they belong to, as returned by `read`. It holds what the view needs for the way back,
+                such as a heading; without it that part of the transformation is not undone.
 
         Returns:
-            The same with the whole, where the view makes parts of it.
+            The same values; if the view splits the data into parts, the whole is added.
         """
         added = {name: data[name] for name in self.view.names if name in data} if data else {}
         return {**values, **self.view.inverse(Batch(added | {n: v for n, v in values.items() if n in self.observed}))}
 
 
 def _is_wide(batch: Any, name: str) -> bool:
-    """Whether float32 may not resolve a variable of a batch."""
+    """Return whether float32 may not resolve a variable of a batch."""
     value = batch.get(name) if isinstance(batch, Mapping) else batch
     return value is not None and exceeds_float32(value.dtype)
 
@@ -659,7 +672,7 @@ def _locality(factorization: Factorization) -> dict[str, bool]:
 
 
 def _note(factorization: Factorization, rollout: Rollout) -> Any:
-    """What a site says of its program: bounds decide from it where a KL term may be analytic, and average draws."""
+    """Return the `infer` entry of a site: bounds use it to choose analytic KL terms and to average draws."""
     return {"program": factorization, "run": rollout}
 
 

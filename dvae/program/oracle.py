@@ -1,12 +1,12 @@
-"""The oracle: linear-Gaussian models, whose evidence and whose every bound are known exactly.
+"""The oracle: linear-Gaussian models with exact evidence and exact bounds.
 
-With `networks.Linear` and normals of fixed scale, any factorization is one dense joint normal. Then log p(x), the exact
-posterior, and the evidence lower bound of any linear guide are closed forms; so is the expected gap between bound and
-evidence, over data from the model. Minimised over guides, that gap is what the guide's factorization costs: the price
-of its dropped arrows, in nats.
+With `networks.Linear` and normals of fixed scale, any factorization is one dense joint normal. Evidence log p(x), exact
+posterior and the ELBO of any linear guide then have closed forms. So does the KL gap, the expected difference between
+evidence and bound over data from the model. Its minimum over guides is the cost of the guide's factorization, that is
+of its missing edges, in nats.
 
-Discrete latents that move locations make the joint a mixture of such normals, one for each course of their states.
-Where these can be counted, evidence and posterior moments are known still; bounds of a guide are not.
+Discrete latents that shift locations turn the joint into a mixture of such normals, one for each state sequence. If
+these can be enumerated, evidence and posterior moments remain exact; bounds of a guide do not.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ def twin(
     observed: tuple[str, ...] = ("x",),
     scale: float = 0.3,
 ) -> DynamicalVAE:
-    """The linear-Gaussian model of a pair of factorizations, with random weights, in double precision.
+    """Return a linear-Gaussian surrogate of two factorizations, with random weights, in double precision.
 
     Args:
-        generative, inference, sizes, observed: as of `DynamicalVAE`.
+        generative, inference, sizes, observed: as in `DynamicalVAE`.
         steps: T, the number of time steps.
-        seed: of the weights.
+        seed: random seed of the weights.
         scale: standard deviation of the weights.
 
     Example:
@@ -75,20 +75,20 @@ def twin(
 
 
 def _is_partial(run: Rollout) -> bool:
-    """Whether entries may be missing or padding."""
+    """Return whether entries may be missing or padding."""
     return run.lengths is not None or bool(run.observed)
 
 
 _STARTS, _AWAY = 12, 0.6
-"""Further starts of the search for the best reduced model, and how far their weights are from those of the whole."""
+"""Number of random starts in the search for the best reduced model, and standard deviation of their weights' noise."""
 
 
 @dataclass(frozen=True)
 class _System:
     """v = W v + U d + b + diag(s) e for stacked variables v, stacked data d and standard normal e.
 
-    Each has one row for each sequence, or a single row where all sequences are complete. Padding is N(0, 1), which
-    nothing reads.
+    Each tensor has one row per sequence, or a single row if all sequences are complete. Padding is N(0, 1), and no
+    variable reads it.
     """
 
     weights: Tensor
@@ -100,17 +100,17 @@ class _System:
 class Oracle:
     """Exact quantities of a linear-Gaussian model and its guide.
 
-    Missing entries, lengths and units are those of the program: the model reads its own mean at a missing entry, and
-    nothing reads padding.
+    Missing entries, lengths and units work as in the program: the model reads its own mean at a missing entry, and no
+    variable reads padding.
 
     Args:
         model: a `twin`, or any `DynamicalVAE` of Linear networks with fixed scales.
         steps: T.
 
     Raises:
-        TypeError: no model, or steps that are no whole number.
-        ValueError: a model that is not linear-Gaussian, given the states of what is summed out, or has context or
-            energies; a batch of another length, without all data, or with groups.
+        TypeError: if `model` is not a model or `steps` is not an integer.
+        ValueError: if the model is not linear-Gaussian given its discrete states, or has context or energies. Methods
+            raise it if a batch has another length, has groups, or misses a data variable.
 
     Example:
         >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
@@ -126,7 +126,7 @@ class Oracle:
             raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
         if type(model).penalties is not DynamicalVAE.penalties:
             raise ValueError(f"{type(model).__name__} adds energies to the log joint, which is not normal then")
-        # what is affine in a variable far from 0 is found from values that float32 does not resolve
+        # float32 does not resolve affine functions of a variable far from 0
         self.model, self.steps = deepcopy(model).double() if model.wide else model, steps
         for name in model.summed:
             if other := [parent for parent in model.generator[name].parents if parent not in model.summed]:
@@ -139,7 +139,7 @@ class Oracle:
         return self.model.sizes[name] * (self.steps if self.model.generative.local(name) else 1)
 
     def _run(self, x: Tensor | Mapping[str, Tensor]) -> Rollout:
-        """The model's run over a batch, with its values, lengths and observed entries."""
+        """Return the model's run over a batch, with its values, lengths and observed entries."""
         run = self.model.rollout(x)
         if missing := [name for name in self.model.observed if name not in run.values]:
             raise ValueError(f"the batch has no {', '.join(missing)}; the oracle needs a value of every data variable")
@@ -158,7 +158,10 @@ class Oracle:
         return torch.cat([values[name].flatten(1) for name in names], dim=1)
 
     def _counted(self, names: tuple[str, ...], run: Rollout | None, observed: bool = True) -> Tensor:
-        """(R, N) 1 at entries that are not padding, nor missing where `observed`; R is 1 where all are there."""
+        """Return (R, N), 1 at entries that count and 0 at padding; R is 1 if all entries count.
+
+        With `observed`, missing entries do not count either.
+        """
         if run is None or not _is_partial(run):
             return torch.ones(1, sum(map(self._size, names)), dtype=torch.float64)
         parts = []
@@ -173,7 +176,7 @@ class Oracle:
     def _system(
         self, conditionals: Mapping[str, Any], names: tuple[str, ...], data: tuple[str, ...], run: Rollout | None = None
     ) -> _System:
-        """The affine functions that the conditionals are, from their locations at 0 and at every unit vector."""
+        """Return the conditionals as affine functions, from their locations at 0 and at every unit vector."""
         columns = (*names, *data)
         there, real = (self._counted(each, run, observed=False) for each in (columns, names))
         rows, count = there.shape
@@ -211,10 +214,10 @@ class Oracle:
             raise ValueError(f"{conditional.factor} reads logarithms of {', '.join(read)}, and is not linear in them")
 
     def _joint(self) -> tuple[Tensor, Tensor]:
-        """Mean and precision of (latents, data) under the model, both stacked variable by variable.
+        """Return mean and precision of (latents, data) under the model, both stacked variable by variable.
 
         Raises:
-            ValueError: a mixture of such.
+            ValueError: if the joint is a mixture.
         """
         if self.model.summed:
             raise ValueError(
@@ -225,9 +228,10 @@ class Oracle:
         return means[0, 0], precision[0]
 
     def _mixture(self, run: Rollout | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Log probability (C,) and mean (R, C, N) of each course of the states, and the precision (R, N, N) of all.
+        """Return log probability (C,) and mean (R, C, N) of each state sequence, and their common precision (R, N, N).
 
-        A missing entry is its mean, a function of its parents, so that what remains of it is N(0, 1) by itself.
+        The model replaces a missing entry by its mean, a function of its parents; the entry itself is an independent
+        N(0, 1).
         """
         model, names = self.model, (*self.model.latents, *self.model.observed)
         system = self._system(model.generator, names, model.summed, run)
@@ -235,7 +239,7 @@ class Oracle:
         rest = identity - system.weights
         missing = self._counted(names, run, observed=False) - self._counted(names, run)
         kept = 1 - missing
-        # without missing entries: those are replaced in all that reads them
+        # without missing entries, which are replaced wherever they are read
         own = torch.linalg.solve(identity - missing[..., None] * system.weights, rest, left=False)
         white = (kept / system.scale)[..., None] * own * kept[:, None] + torch.diag_embed(missing)
         moved, logs = system.bias[:, None], torch.zeros(1, dtype=torch.float64)
@@ -247,14 +251,14 @@ class Oracle:
         return logs, means, white.mT @ white
 
     def _log_probability(self, name: str, states: Mapping[str, Tensor]) -> Tensor:
-        """(C,), of courses of a variable that is summed out given those of the others."""
+        """Return log probabilities (C,) of state sequences of one variable given the other summed-out variables."""
         conditional, value = self.model.generator[name], states[name]
         law = conditional.law.distribution(conditional(states, len(value), self.steps))
         logs: Tensor = (law.logits * value).flatten(1).sum(1)
         return logs
 
     def _guide(self, run: Rollout | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Gain on the data, offset, and a root R of the covariance R R' of q(latents | data), for each row."""
+        """Return gain on the data, offset, and a root R of the covariance R R' of q(latents | data), for each row."""
         system = self._system(self.model.encoder, self.model.latents, self.model.observed, run)
         rest = torch.eye(system.bias.shape[1], dtype=torch.float64) - system.weights
         right = torch.cat([system.data_weights, system.bias[..., None], torch.diag_embed(system.scale)], dim=-1)
@@ -263,28 +267,28 @@ class Oracle:
         return solved[..., :data], solved[..., data], solved[..., data + 1 :]
 
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """log p(x), (B,), of data (B, T, D), or of their observed entries."""
+        """Return log p(x), (B,), of data (B, T, D), or of their observed entries."""
         seen = self.model.read(x)
         run = self._run(seen)
         evidence: Tensor = self._weighed(run, *self._mixture(run)).logsumexp(1)
         return evidence if seen.log_det is None else evidence + seen.volume
 
     def _weighed(self, run: Rollout, logs: Tensor, means: Tensor, precision: Tensor) -> Tensor:
-        """(B, C): log joint of the data and each course that the states may take."""
+        """Return the log joint (B, C) of the data and each state sequence."""
         counted = self._counted(self.model.observed, run)
         data = self._stack(run.values, self.model.observed) * counted
         start = means.shape[-1] - data.shape[1]
         covariance = torch.linalg.inv(precision)[:, None, start:, start:]
         law = torch.distributions.MultivariateNormal(means[..., start:], covariance)
-        # entries that do not count are 0, of N(0, 1) by themselves
+        # uncounted entries are 0, and independent N(0, 1)
         weighed: Tensor = logs + law.log_prob(data[:, None]) + (1 - counted).sum(1, True) * math.log(2 * math.pi) / 2
         return weighed
 
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Mean (B, N) and covariance of the latents, stacked in the guide's order, given data (B, T, D); 0 at padding.
+        """Return mean (B, N) and covariance of the latents given data (B, T, D); 0 at padding.
 
-        The covariance is (N, N), or each sequence's own, (B, N, N), of a batch with "mask" or "lengths" and of a model
-        with discrete latents summed out, whose posterior is a mixture.
+        Latents are stacked in the guide's order. The covariance is (N, N). It is (B, N, N) for a batch with "mask" or
+        "lengths", and for a model with discrete latents, whose posterior is a mixture.
         """
         run = self._run(x)
         logs, means, precision = self._mixture(run)
@@ -299,7 +303,7 @@ class Oracle:
         return mean, within + torch.einsum("bc,bci,bcj->bij", weights, away, away)
 
     def _given_states(self, run: Rollout, means: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean (B, C, N) and covariance (R, N, N) of the latents given the data and each course of the states."""
+        """Return mean (B, C, N) and covariance (R, N, N) of the latents given the data and each state sequence."""
         data = self._stack(run.values, self.model.observed) * self._counted(self.model.observed, run)
         n = means.shape[-1] - data.shape[1]
         within = torch.linalg.inv(precision[:, :n, :n])
@@ -307,11 +311,11 @@ class Oracle:
         return means[..., :n] + (data[:, None] - means[..., n:]) @ gain.mT, within
 
     def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """The exact evidence lower bound of the model's guide, (B,): no draws are taken."""
+        """Return the exact ELBO of the model's guide, (B,), without sampling."""
         evidence = self.evidence(x)
         if not self.model.latents:
             return evidence
-        self._joint()  # which a mixture has not
+        self._joint()  # raises for a mixture
         run = self._run(x)
         _, means, precision = self._mixture(run)
         gain, offset, root = self._guide(run)
@@ -323,7 +327,7 @@ class Oracle:
         return evidence - self._divergence(distance, precision, root)
 
     def gap(self) -> Tensor:
-        """The expected evidence minus bound, in nats a sequence, over complete data drawn from the model."""
+        """Return the KL gap: expected evidence minus bound, in nats per sequence, over complete data from the model."""
         gain, offset, root = (part[0] for part in self._guide())
         mean, precision = self._joint()
         n = len(offset)
@@ -337,7 +341,7 @@ class Oracle:
 
     @staticmethod
     def _divergence(distance: Tensor, precision: Tensor, root: Tensor) -> Tensor:
-        """Of N(m, root root') from N(n, precision^-1), with the distance of m and n under the precision."""
+        """Return KL(N(m, root root'), N(n, precision^-1)), given the distance of m and n under the precision."""
         spread = (root.mT @ precision * root.mT).sum((-2, -1))
         log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
         divergence: Tensor = 0.5 * (spread + distance - root.shape[-1] - log_volume)
@@ -345,7 +349,7 @@ class Oracle:
 
     @torch.inference_mode(False)
     def fit_guide(self, iterations: int = 2000) -> float:
-        """Fits the guide to the model's exact gap by L-BFGS and returns what is left of it, in nats a sequence."""
+        """Fit the guide to the model's exact KL gap by L-BFGS and return the remaining gap, in nats per sequence."""
         if not self.model.latents:
             return 0.0
         parameters = list(self.model.encoder.parameters())
@@ -376,14 +380,15 @@ def price(
     seeds: int = 5,
     observed: tuple[str, ...] = ("x",),
 ) -> Tensor:
-    """What a guide's factorization costs: the smallest expected gap in nats a sequence, (seeds,).
+    """Return the smallest KL gap of a guide's factorization, in nats per sequence, (seeds,).
 
-    Each seed is a linear-Gaussian model with random weights, and the best guide of this factorization for it. A guide
-    that holds the posterior's dependencies costs nothing where latents have one dimension; with more, what is left is
-    the price of its diagonal covariance. Over context, prices are averages: it is drawn from N(0, I).
+    Each seed is a linear-Gaussian model with random weights, and the gap is minimised over guides with this
+    factorization. A guide with all dependencies of the posterior has no gap if latents have one dimension. With more
+    dimensions, the remaining gap is the cost of its diagonal covariance. Context is drawn from N(0, I), and the gap is
+    an average over it.
 
     Args:
-        generative, inference, sizes, observed: as of `DynamicalVAE`.
+        generative, inference, sizes, observed: as in `DynamicalVAE`.
         steps: T.
         seeds: number of random models.
 
@@ -402,13 +407,13 @@ def price(
 
 
 def _context(model: Factorization, other: Factorization) -> tuple[Factor, ...]:
-    """Factors of what a model and its guide, or another model, are given."""
+    """Return factors for the context of a model and its guide, or of two models."""
     local = {name: part.local(name) for part in (model, other) for name in part.context if name not in model.variables}
     return tuple(Factor("p", name, each) for name, each in local.items())
 
 
 def _drawing(model: Factorization, context: tuple[Factor, ...]) -> Factorization:
-    """A model that draws its context too."""
+    """Return the model extended by factors for its context."""
     return replace(model, factors=(*context, *model.factors))
 
 
@@ -420,22 +425,23 @@ def model_price(
     seeds: int = 5,
     observed: tuple[str, ...] = ("x",),
 ) -> Tensor:
-    """What a model of fewer arrows costs: the least expected evidence that it loses, in nats a sequence, (seeds,).
+    """Return the smallest expected loss of evidence of a model with fewer edges, in nats per sequence, (seeds,).
 
-    Each seed is a linear-Gaussian model p with random weights, the one that `price` has. The cost is the least of
-    KL(p(x) || r(x)) over linear-Gaussian models r of the reduced factorization: both are normals whose covariances are
-    known, and no guide is involved. Without latents the search is convex. With latents it has local minima: it starts
-    at the weights of p less those of the missing arrows and at twelve random ones near these, and the result is the
-    least found, which is no less than the price.
+    Each seed is a linear-Gaussian model p with random weights, the same as in `price`. The cost is the minimum of
+    KL(p(x) || r(x)) over linear-Gaussian models r with the reduced factorization. Both are normals with known
+    covariances, and no guide is involved. Without latents the search is convex. With latents it has local minima. The
+    search then starts at the weights of p without the missing edges, and at twelve random points near them. The result
+    is the best minimum found, an upper bound of the cost.
 
     Args:
-        generative, sizes, observed: as of `DynamicalVAE`; sizes are of context too, see `price`.
-        reduced: a model of the same variables.
+        generative, observed: as in `DynamicalVAE`.
+        reduced: a factorization of the same variables with fewer edges.
+        sizes: dimension of every variable, context included.
         steps: T.
         seeds: number of random models.
 
     Raises:
-        ValueError: other variables than those of the model; less than 1 step or model.
+        ValueError: if the two models have different variables, or `steps` or `seeds` is below 1.
 
     Example:
         >>> dvae.model_price("p(x_t | x_{t-1})", "p(x_t)", {"x": 1}, steps=3, seeds=1) > 0
@@ -454,12 +460,12 @@ def model_price(
 
 
 def _lost(oracle: Oracle, less: Factorization) -> float:
-    """The least KL of the data's normal under the model from that under a reduced one.
+    """Return the smallest KL between the data's normal under the model and under a reduced model.
 
-    A model is R v = e, for its variables v less their means and standard normal e. Biases of the data give a reduced
-    one any mean of theirs, so that covariances C are all there is to compare. As latents may be rescaled, R has ones on
-    their diagonal; on that of the data it has the reciprocal scales of their noise. With J = (-P_xz P_zz^-1, I) for the
-    precision P = R'R, the data have the precision M = J P J', and the gradient of the divergence is R J'(C - M^-1) J.
+    A model is R v = e, for its variables v minus their means and standard normal e. Biases of the data give a reduced
+    model any mean of the data, and only covariances C remain to compare. Latents can be rescaled: R has ones on their
+    diagonal. On the diagonal of the data, it has the reciprocal scales of their noise. With J = (-P_xz P_zz^-1, I) for
+    the precision P = R'R, the data have the precision M = J P J'. The gradient of the divergence is R J'(C - M^-1) J.
     """
     model, names = oracle.model, (*oracle.model.latents, *oracle.model.observed)
     n = sum(map(oracle._size, model.latents))
@@ -487,7 +493,7 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
         slope = r @ onto.T @ (covariance - np.linalg.inv(margin)) @ onto
         return lost, np.concatenate([-slope[noise, noise] * r[noise, noise], slope[free]])
 
-    # the best scale of noise may be 0, where precisions have no end
+    # bounded, since the best noise scale may be 0, with infinite precision
     bounds = [(-10.0, None)] * len(noise) + [(None, None)] * int(free.sum())
 
     def search(start: np.ndarray, iterations: int) -> scipy.optimize.OptimizeResult:
@@ -496,7 +502,7 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
 
     start = np.concatenate([np.log(scale[n:]), root[free]])
     least = search(start, 20_000).fun
-    if n and least > 1e-9:  # without latents it is convex, and nothing is below 0
+    if n and least > 1e-9:  # convex without latents, and never below 0
         chance = np.random.default_rng(0)
         steps = _AWAY * chance.standard_normal((_STARTS, free.sum()))
         starts = [start + np.concatenate([np.zeros(len(noise)), step]) for step in steps]
@@ -513,15 +519,16 @@ def arrow_prices(
     seeds: int = 5,
     observed: tuple[str, ...] = ("x",),
 ) -> dict[str, Tensor]:
-    """What leaving out each arrow of a guide costs by itself, in nats a sequence; see `price`.
+    """Return the cost of removing each edge of a guide, one at a time, in nats per sequence (`price`).
 
     Args:
-        generative, inference, observed: as of `DynamicalVAE`.
-        sizes: of the variables; 1 each by default, with which a guide that misses nothing costs nothing.
-        steps, seeds: see `price`.
+        generative, inference, observed: as in `DynamicalVAE`.
+        sizes: dimension of every variable; 1 each by default, for which a faithful guide has no cost.
+        steps: as in `price`.
+        seeds: as in `price`.
 
     Returns:
-        {arrow: (seeds,), how much more the guide without it costs in each of the random models}, the dearest first.
+        {edge: (seeds,), increase of the KL gap without the edge in each random model}, largest mean first.
 
     Example:
         >>> {arrow: bool((cost > 0).all()) for arrow, cost in dvae.arrow_prices(
@@ -542,16 +549,17 @@ def model_arrow_prices(
     seeds: int = 5,
     observed: tuple[str, ...] = ("x",),
 ) -> dict[str, Tensor]:
-    """What leaving out each arrow of a model costs by itself, in nats a sequence; see `model_price`.
+    """Return the cost of removing each edge of a model, one at a time, in nats per sequence (`model_price`).
 
     Args:
-        generative, observed: as of `DynamicalVAE`.
-        sizes: of the variables; by default 2 of data and 1 of others, as what data of size 1 lose on one path can often
-            take another one.
-        steps, seeds: see `model_price`.
+        generative, observed: as in `DynamicalVAE`.
+        sizes: dimension of every variable. By default 2 for data, since data of size 1 can often replace a removed path
+            by another one, and 1 for other variables.
+        steps: as in `model_price`.
+        seeds: as in `model_price`.
 
     Returns:
-        {arrow: (seeds,), the evidence lost without it in each of the random models}, the dearest first.
+        {edge: (seeds,), loss of evidence without the edge in each random model}, largest mean first.
 
     Example:
         >>> {arrow: bool((cost > 1e-6).all()) for arrow, cost in dvae.model_arrow_prices(
@@ -564,11 +572,11 @@ def model_arrow_prices(
 
 
 def ones(*equations: Factorization) -> dict[str, int]:
-    """A size of 1 for each variable."""
+    """Return a size of 1 for each variable."""
     return dict.fromkeys((name for part in equations for name in (*part.variables, *part.context)), 1)
 
 
 def _dearest_first(written: Factorization, cost: Callable[[Factorization], Tensor]) -> dict[str, Tensor]:
-    """What each arrow costs, by what it is called."""
+    """Return the cost of each edge by its name, largest mean first."""
     found = {written.arrow(*arrow): cost(written.without(*arrow)) for arrow in written.arrows}
     return dict(sorted(found.items(), key=lambda item: -float(item[1].mean())))

@@ -1,7 +1,7 @@
-"""What inference needs of a model beyond torch's modules, as protocols.
+"""Protocols of the models that inference requires, in addition to torch's modules.
 
-`DynamicalVAE` has it all. A density or a classifier, which forecasts nothing, is a `Program`; a forecaster of one's
-own, whatever it is made of, is `Forecasting`.
+`DynamicalVAE` implements all of them. A density or a classifier does not forecast and implements `Program` only. A
+custom forecaster of any kind implements `Forecasting`.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from ..factorization.notation import Factorization
 
 @runtime_checkable
 class Program(Protocol):
-    """A Pyro model and its guide, for bounds and the loop."""
+    """A Pyro model and its guide, for bounds and training."""
 
     @property
     def likelihood(self) -> bool:
-        """Whether the data have a density given the latents; without it there is no bound."""
+        """Whether the data have a density given the latents; bounds require it."""
 
     @property
     def per(self) -> str:
-        """What there is one log-likelihood of: "frame" or "window"."""
+        """Unit of one log-likelihood: "frame" or "window"."""
 
     def model(self, batch: Any, **options: Any) -> Any:
-        """The generative program of a batch."""
+        """Run the generative program on a batch."""
 
     def guide(self, batch: Any, **options: Any) -> Any:
-        """The inference program of a batch, with the options of `model`."""
+        """Run the inference program on a batch, with the options of `model`."""
 
 
 @runtime_checkable
@@ -39,12 +39,12 @@ class Emitting(Protocol):
     """A forecaster that decides whether it draws the data."""
 
     def is_drawn(self, means: bool = False) -> bool:
-        """Whether forecasts draw the data by default; see `DynamicalVAE.is_drawn`."""
+        """Return whether forecasts draw the data by default, as in `DynamicalVAE.is_drawn`."""
 
 
 @runtime_checkable
 class Forecasting(Protocol):
-    """A model that forecasts, for evaluation; with a likelihood it is a `Program` too, and has a bound."""
+    """A model that forecasts, for evaluation. With a likelihood it also implements `Program` and has a bound."""
 
     @property
     def likelihood(self) -> bool:
@@ -52,11 +52,11 @@ class Forecasting(Protocol):
 
     @property
     def generative(self) -> Factorization:
-        """Its equations, for the record."""
+        """Generative factorization, stored with results."""
 
     @property
     def inference(self) -> Factorization:
-        """Those of its guide."""
+        """Factorization of the guide."""
 
     def forecast(self, batch: Any, horizon: int, samples: int = 1, **options: Any) -> Mapping[str, Tensor]:
-        """{"x": (S, B, H, D)}, futures of observed frames (B, O, D); options with `draw_emission`."""
+        """Return {"x": (S, B, H, D)}, futures of observed frames (B, O, D); options include `draw_emission`."""

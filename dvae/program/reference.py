@@ -1,4 +1,4 @@
-"""The generative program as one reads it, step by step; in tests the program that runs is compared with it."""
+"""The generative program as an explicit loop over time; tests compare the vectorised program with it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from .conditional import like
 
 
 def reference(model: Any, batch: AnyBatch) -> None:
-    """The generative program of a `DynamicalVAE` as a loop over time with one site per variable and step.
+    """Run the generative program of a `DynamicalVAE` as a loop over time, with one site per variable and step.
 
-    Sites are "z_1", "x_1", "z_2", ... as in the equations. Each factor is given noise in place of every value that is
-    not drawn yet, so that a network that reads what it should not changes the result. Slow.
+    Sites are named "z_1", "x_1", "z_2", ... as in the equations. Each factor receives noise in place of values that are
+    not drawn yet. A network that reads future values therefore changes the result. Slow.
     """
     rollout = model.rollout(batch)
     known = {name: value for name, value in rollout.values.items() if name not in model.observed}

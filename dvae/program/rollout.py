@@ -1,7 +1,8 @@
-"""One run of a factorization: what is known, and how the rest is drawn.
+"""One run of a factorization: its given values, and draws of the others.
 
-Teacher forcing, free running, forecasting, self-feeding and scoring are the same factors run with different things
-known. A `Rollout` holds what is known in one run; every site of the Pyro program asks it for draws and conditionals.
+Teacher forcing, free running, forecasting, scheduled sampling and scoring run the same factors with different values
+given. A `Rollout` stores the values of one run; every site of the Pyro program gets its draws and distributions from
+it.
 """
 
 from __future__ import annotations
@@ -30,20 +31,20 @@ from .summed import Summation, Sums
 
 @dataclass(frozen=True)
 class SelfFeeding:
-    """Scheduled sampling: frames of the data's history are replaced by the model's own means (Bengio et al., 2015).
+    """Scheduled sampling: the model's own means replace frames of the data's history (Bengio et al., 2015).
 
     Args:
-        probability: of each frame, independently.
-        passes: None runs through time, exactly. A number of passes approximates that in parallel: each computes the
-            means of all steps at once from the last pass's history (T passes are exact). Several data variables follow
-            one another within a pass, in the order of the model: a variable reads the means of those before it from
-            the same pass.
-        gradient: whether gradients flow through the means that are fed, and so back in time. Without (as Bengio et al.
-            have it) a step takes half the time or less, and the gradient is not that of the self-fed bound. The means
-            in place of missing entries always carry theirs.
-        start: frames at the beginning that stay as they are, such as those that a forecast will have observed.
-        blocks: from there on so many frames stay as they are, then so many may be replaced, and so on in turns (Zhou
-            et al., 2018, arXiv 1707.05363, have (5, 5)). None where each may be.
+        probability: probability of each frame, independently.
+        passes: None runs through time, exactly. A number of passes approximates this in parallel: each pass computes
+            the means of all steps at once from the history of the previous pass (T passes are exact). Within a pass,
+            several data variables follow the order of the model: a variable reads the means of earlier ones from the
+            same pass.
+        gradient: whether gradients flow through the means, and so back in time. Without it, as in Bengio et al., a step
+            takes half the time or less, but the gradient differs from the gradient of the bound with scheduled
+            sampling. Means at missing entries always have a gradient.
+        start: number of first frames that are never replaced, such as those that a forecast observes.
+        blocks: numbers of frames: after `start`, the first number stays, the second may be replaced, and so on in turns
+            (Zhou et al., 2018, arXiv 1707.05363, use (5, 5)). None lets any frame be replaced.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -63,11 +64,11 @@ class SelfFeeding:
             raise ValueError(f"blocks are numbers of frames from 1, as they are and replaced, got {self.blocks}")
 
     def at(self, level: float) -> SelfFeeding:
-        """The same with this probability, which a schedule gives."""
+        """Return a copy with this probability, for schedules."""
         return replace(self, probability=level)
 
     def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
-        """(B, T, 1) True at frames that are replaced, drawn anew."""
+        """Draw a mask (B, T, 1), True at frames that are replaced."""
         fed = torch.rand(batch, length, 1, device=device) < self.probability
         fed[:, : self.start] = False
         if self.blocks is not None:
@@ -77,7 +78,7 @@ class SelfFeeding:
         return fed
 
     def told(self, length: int) -> list[bool] | None:
-        """Which of T frames stay as they are, where chance has no part in it."""
+        """Return which of T frames stay unchanged, if this is not random; otherwise None."""
         if self.probability < 1:
             return None
         kept, own = self.blocks or (0, 1)
@@ -86,12 +87,12 @@ class SelfFeeding:
 
 @dataclass(frozen=True)
 class InputNoise:
-    """Normal noise on the data's history, so that a model learns to go on from what is somewhat off, as its own output.
+    """Normal noise on the data's history, which trains a model to continue from inexact inputs such as its own output.
 
-    The data that are scored have none. Source: Fragkiadaki et al., 2015, arXiv 1508.00271.
+    The scored data have no noise. Source: Fragkiadaki et al., 2015, arXiv 1508.00271.
 
     Args:
-        scale: standard deviation, in the unit in which networks read the variable (`dvae.data.units`).
+        scale: standard deviation, in the unit of the networks' inputs (`dvae.data.units`).
 
     Example:
         >>> model = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})
@@ -105,19 +106,19 @@ class InputNoise:
             raise ValueError(f"the scale of noise is finite and at least 0, got {self.scale}")
 
     def at(self, level: float) -> InputNoise:
-        """The same with this share of the scale, which a schedule gives."""
+        """Return a copy with this share of the scale, for schedules."""
         return InputNoise(level * self.scale)
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """Where the model may not read a variable of the data, and reads its own mean.
+    """Entries of a data variable that the model may not read; it reads its own mean instead.
 
     Args:
         entries: (B, T, 1 or D), or (B, D) of a static variable.
-        detached: those of them whose mean is fed without a gradient, or None.
-        told: at which steps there are none in any sequence, where that is known without a look at them, which a GPU
-            would be waited for.
+        detached: subset of the entries whose mean has no gradient, or None.
+        told: for each step, whether no sequence has such entries, if known without reading a tensor, which would
+            synchronise a GPU.
     """
 
     entries: Tensor
@@ -125,7 +126,7 @@ class Hidden:
     told: list[bool] | None = None
 
     def fill(self, value: Tensor, mean: Tensor, steps: int | slice = slice(None)) -> Tensor:
-        """The value (B, T, D) with the mean at these entries; at one step, (B, D) both."""
+        """Return the value (B, T, D) with the mean at these entries; for one step, both are (B, D)."""
         if self.detached is not None:
             mean = torch.where(self.detached[:, steps], mean.detach(), mean)
         return torch.where(self.entries[:, steps], mean, value)
@@ -136,25 +137,25 @@ class Rollout:
     """A run of `factorization` over a batch.
 
     Args:
-        factorization: what is run.
+        factorization: the factorization.
         conditionals: name to `Conditional`.
         batch, length: B and T.
-        values: what is known: data, context, statics (B, D) and, as they become known, latents (B, T, D).
+        values: known values: data, context, statics (B, D) and, once they are known, latents (B, T, D).
         data: names of the observed variables.
         lengths: (B,) valid steps of a ragged batch.
-        observed: name to (B, T, D) True where an entry of the data was observed. The model reads its own mean in
-            place of the others, the guide 0.
-        present: name of a local latent to (B, T), False at steps at which it is integrated out: its density does not
-            count there, and networks that read it are told (`networks.base.presence`).
-        prefix: name to (B, O, D) first values of a variable that is then drawn on.
-        mean_emission: names of data variables that are not drawn but set to their means.
-        feeding: what stands in for the data's history, or None.
-        draws: how many rows each sequence of the data has by now (see `fork`).
-        drawing: what the model may not read is drawn, in place of the model's own mean.
-        groups: which sequences share values of the `grouped` variables, or None where each is a group.
+        observed: name to (B, T, D), True where an entry of the data was observed. At other entries, the model reads its
+            own mean and the guide reads 0.
+        present: name of a local latent to (B, T), False at steps at which it is integrated out. Its density does not
+            count there, and networks that read it also read this mask (`networks.base.presence`).
+        prefix: name to the first values (B, O, D) of a variable that the run continues.
+        mean_emission: names of data variables that are set to their means instead of drawn.
+        feeding: replacement for the data's history, or None.
+        draws: current number of rows per sequence of the data (`fork`).
+        drawing: draw the entries that the model may not read, instead of using its means.
+        groups: groups of sequences that share the `grouped` variables; None if each sequence is its own group.
         grouped: names of static latents that groups share.
-        sums: how discrete latents are summed out, if there are any.
-        states: name to values of these that were drawn, for what reads them to be drawn; densities do not heed them.
+        sums: structure of the sum over discrete latents, if there are any.
+        states: name to drawn values of discrete latents, for draws of their readers; densities ignore them.
     """
 
     factorization: Factorization
@@ -193,11 +194,14 @@ class Rollout:
         return pyro.plate("sequences" if self.draws == 1 else f"sequences x {self.draws}", self.batch, dim=-1)
 
     def fork(self, n: int) -> Rollout:
-        """The run with every row n times over, draw by draw: what is known so far is shared by n continuations."""
+        """Return the run with every row repeated n times, draw by draw; itself for n = 1.
+
+        Copies share all known values.
+        """
         return self if n == 1 else self.again(n)
 
     def again(self, n: int) -> Rollout:
-        """Another run, with every row n times over, draw by draw."""
+        """Return a new run with every row repeated n times, draw by draw."""
 
         def each(values: Any) -> Any:
             return {name: again(value, n) for name, value in values.items()}
@@ -216,19 +220,20 @@ class Rollout:
         )
 
     def law(self, name: str, draws: int = 1) -> TorchDistribution:
-        """The distribution of a variable, for its Pyro site.
+        """Return the distribution of a variable, for its Pyro site.
 
         Args:
-            draws: of a static variable, which is then over the rows of `fork(draws)`. Its network runs once for all of
-                them: one that is random in training, such as a summary of a window somewhere, is the same for all
-                draws of a sequence, as it is in a forecast.
+            name: name of the variable.
+            draws: number of draws of a static variable, over the rows of `fork(draws)`. The network runs once for all
+                draws. If it is random in training, such as a summary of a random window, all draws of a sequence share
+                the result, as in a forecast.
         """
         if self.sums is not None and name in self.sums.readers:
             return Marginal(self, name)
         return self.conditional_law(name, draws)
 
     def conditional_law(self, name: str, draws: int = 1) -> TorchDistribution:
-        """The same given the states of what is summed out."""
+        """Return the distribution of a variable given drawn states of the summed-out latents."""
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
@@ -241,7 +246,7 @@ class Rollout:
 
     @property
     def known(self) -> dict[str, Tensor]:
-        """The values, at which steps latents are there, and which entries of the data were observed."""
+        """Known values, with the presence masks of latents and the indicators of observed entries."""
         there = {presence(name): steps for name, steps in self.present.items()}
         return {
             **self.states,
@@ -263,9 +268,9 @@ class Rollout:
         self.values[name] = value
 
     def mask(self, name: str) -> Tensor | None:
-        """True where a density of the variable counts, (B, T, D), or (B, T) of whole events; None if all do.
+        """Return True where a density of the variable counts, (B, T, D), or (B, T) for whole events; None if all count.
 
-        That of a static variable has no T.
+        For a static variable, the mask has no T.
         """
         conditional = self.conditionals[name]
         mask = self.observed.get(name)
@@ -279,13 +284,13 @@ class Rollout:
         return valid if mask is None else mask & valid
 
     def evaluate(self, name: str, value: Tensor) -> TorchDistribution:
-        """The conditionals of a local variable at all steps: batch (B, T, D), or (B, T) of whole events."""
+        """Return the conditionals of a local variable at all steps; batch shape (B, T, D), or (B, T)."""
         return self.conditionals[name].distribution(self.parameters(name, value))
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
-        """Those of `evaluate`, (B, T, ...); computed once for a value."""
+        """Return the parameters (B, T, ...) for `evaluate`, memoized for one value."""
         if not self._is_evaluated(name, value):
-            history = self.history(name)  # in whose loop it may be evaluated
+            history = self.history(name)  # this may run a loop that evaluates the variable
             if not self._is_evaluated(name, value):
                 known = {**self.known, name: value, **history}
                 self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
@@ -295,7 +300,7 @@ class Rollout:
         return name in self._evaluated and self._evaluated[name][0] is value
 
     def draw(self, name: str) -> Tensor:
-        """A draw (B, T, D) of a local variable, and with it of the variables that its loop interleaves it with."""
+        """Draw (B, T, D) of a local variable, together with all variables in its loop over time."""
         if name not in self._drawn or any(
             not _same(self.values.get(other, value), value)
             for other, value in self._drawn.items()
@@ -308,14 +313,14 @@ class Rollout:
         return self._drawn[name]
 
     def state(self, name: str) -> Tensor:
-        """A draw of what is summed out, (B, T, C) or (B, C), given what was drawn before it."""
+        """Draw a summed-out latent, (B, T, C) or (B, C), given the earlier draws."""
         if name not in self.states:
             local = self.conditionals[name].factor.local
             self.states[name] = self.draw(name) if local else self.conditional_law(name).sample()
         return self.states[name]
 
     def _draw_states(self, block: Block) -> None:
-        """Draws what a block reads of what is summed out, but for what is drawn with it."""
+        """Draw the summed-out latents that a block reads, except those within the block."""
         for name in block.names:
             for parent in self.conditionals[name].parents:
                 if self.sums is not None and parent in self.sums.sizes and parent not in block.names:
@@ -323,7 +328,7 @@ class Rollout:
 
     @property
     def summation(self) -> Summation:
-        """The sum over discrete latents, all else being known."""
+        """The sum over discrete latents, given all other variables."""
         assert self.sums is not None
         made = self._summation
         if made is None or any(made.values.get(name) is not value for name, value in self.values.items()):
@@ -332,14 +337,14 @@ class Rollout:
 
     @property
     def noisy(self) -> Collection[str]:
-        """Names of the data whose history has noise."""
+        """Names of the data variables with noise on their history."""
         return () if not isinstance(self.feeding, InputNoise) or not self.feeding.scale else self.data
 
     def history(self, name: str) -> dict[str, Tensor]:
-        """What a variable reads as the data's past where the model may not read them: its own means, or noisy data.
+        """Return replacements for data that a variable may not read: the model's own means, or noisy data.
 
-        Means are functions of parameters and latents, so that their gradient is part of the bound's, but where
-        self-feeding asks for none.
+        Means are functions of parameters and latents. Their gradient is part of the gradient of the bound, unless
+        scheduled sampling disables it.
         """
         if not self.hidden:
             return self._fed
@@ -350,11 +355,11 @@ class Rollout:
 
     @cached_property
     def _fed(self) -> dict[str, Tensor]:
-        """Name to (B, T, D): the data with the noise of the feeding; and block by block as `history` has them."""
+        """Name to (B, T, D): the noisy data of the feeding; `history` adds the means block by block."""
         found: dict[str, Tensor] = {}
         if not isinstance(self.feeding, InputNoise) or not self.feeding.scale:
             return found
-        for name in self.factorization.variables:  # in one order, as noise is drawn
+        for name in self.factorization.variables:  # a fixed order for the random draws
             if name in self.data and name in self.values and self.factorization.local(name):
                 value, units = self.values[name], self.conditionals[name].units.get(name)
                 noise = self.feeding.scale * torch.randn_like(value) * (1.0 if units is None else units.scale)
@@ -367,7 +372,7 @@ class Rollout:
 
     @cached_property
     def hidden(self) -> dict[str, Hidden]:
-        """What the model may not read of the data: missing entries, and frames that self-feeding replaces."""
+        """Data entries that the model may not read: missing ones, and frames that scheduled sampling replaces."""
         missing = {name: ~seen for name, seen in self.observed.items() if name in self.values and not seen.all()}
         hidden = {name: Hidden(entries) for name, entries in missing.items()}
         if not isinstance(self.feeding, SelfFeeding) or not self.feeding.probability:
@@ -382,7 +387,7 @@ class Rollout:
         return hidden
 
     def _feed(self, block: Block) -> dict[str, Tensor]:
-        """The data of a block with own means at the hidden entries."""
+        """Return the data of a block with the model's means at the hidden entries."""
         names = [name for name in block.names if name in self.hidden]
         if not names:
             return {}
@@ -400,7 +405,7 @@ class Rollout:
     def _run(
         self, block: Block, fed: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
     ) -> dict[str, Tensor]:
-        """Values of the unknown variables of a block; with `hidden`, of its data, with own means at those entries."""
+        """Return the unknown variables of a block; with `hidden`, its data with the model's means at those entries."""
         known_here = self.values.keys() | self.states.keys()
         live = [name for name in block.names if (name not in known_here if hidden is None else name in hidden)]
         told = {**self.known, **(fed or {})}
@@ -443,7 +448,7 @@ class Rollout:
     ) -> dict[str, Tensor]:
         draw = {name: self.conditionals[name].drawing for name in live}
         states = {name: self.conditionals[name].start(given, self.batch, self.length, self.lengths) for name in live}
-        padded = self._valid is not None and block.direction < 0  # a backward loop meets the padding first
+        padded = self._valid is not None and block.direction < 0  # a backward loop starts in the padding
         if len(live) == 1 and hidden is None and not padded and live[0] in noise and live[0] not in self.prefix:
             name = live[0]
             chain = self.conditionals[name].chain(states[name], block.direction, noise[name])
@@ -455,7 +460,7 @@ class Rollout:
         evaluated: dict[str, list[Parameters]] = {name: [] for name in live}
         steps = {name: values.unbind(1) for name, values in noise.items()}
         known = self._told_whole(live, hidden, told)
-        # parameters by which something is scored: not a future, nor what is read in place of the data
+        # keep parameters only for scoring: neither for a future nor for replacements of the data
         kept = not self.prefix if hidden is None else self._fed_with_gradient
         for first, count in _runs(known, block.direction):
             t = first + count - 1
@@ -494,7 +499,7 @@ class Rollout:
     def _told_whole(
         self, live: list[str], hidden: Mapping[str, Hidden] | None, told: Mapping[str, Tensor]
     ) -> list[bool]:
-        """At which steps all that a loop would make is known, of every sequence."""
+        """Return for each step whether all values of a loop are known for every sequence."""
         if any(name not in told for name in live):
             return [False] * self.length
         end = min(told[name].shape[1] for name in live)
@@ -509,7 +514,7 @@ class Rollout:
         return known + [False] * (self.length - end)
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
-        """The known first values of a variable; `value` at entries that are missing there."""
+        """Return the known first values of a variable, with `value` at missing entries."""
         known = self.prefix[name][:, steps]
         return torch.where(self.observed[name][:, steps], known, value) if name in self.observed else known
 
@@ -518,14 +523,14 @@ class Rollout:
 
 
 class Sequence(TorchDistribution):
-    """The law of a local variable in one run of a factorization: batch (B,), event (T, D).
+    """The distribution of a local variable in one run, with batch shape (B,) and event shape (T, D).
 
-    `rsample` draws step by step where the factorization asks for it; `log_prob` evaluates every step at once, given
-    the run's other values.
+    `rsample` draws step by step if the factorization requires it. `log_prob` evaluates all steps at once, given the
+    other values of the run.
 
     Args:
         rollout: the run.
-        name: the variable.
+        name: name of the variable.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -543,7 +548,7 @@ class Sequence(TorchDistribution):
         return constraints.independent(constraints.real, 2)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """A draw (B, T, D). Variables that are drawn in the same loop over time are drawn with it."""
+        """Draw (B, T, D), together with the variables in the same loop over time."""
         if sample_shape:
             raise NotImplementedError(
                 f"a Sequence draws one batch at a time, but shape {tuple(sample_shape)} was asked for; repeat the "
@@ -552,39 +557,39 @@ class Sequence(TorchDistribution):
         return self.rollout.draw(self.name)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """`rsample` without its gradient, which variables that are drawn with it keep."""
+        """Draw as `rsample`, without a gradient; variables drawn in the same loop keep theirs."""
         return self.rsample(sample_shape).detach()
 
     def steps(self, value: Tensor) -> TorchDistribution:
-        """The conditionals at all steps, given `value` and the run's other values; see `Rollout.evaluate`."""
+        """Return the conditionals at all steps, given `value` and the other values of the run (`Rollout.evaluate`)."""
         return self.rollout.evaluate(self.name, value)
 
     def given(self, value: Tensor) -> TorchDistribution:
-        """`steps` with padding and missing entries masked out: batch (B,), event (T, D)."""
+        """Return `steps` with padding and missing entries masked out: batch shape (B,), event shape (T, D)."""
         base, mask = self.steps(value), self.rollout.mask(self.name)
         return (base if mask is None else base.mask(mask)).to_event(2 - len(base.event_shape))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """(B,)."""
+        """Return the log density of each sequence, (B,)."""
         return self.given(value).log_prob(self.scored(value))
 
     def by_step(self, value: Tensor) -> Tensor:
-        """`log_prob` of every step, (B, T)."""
+        """Return `log_prob` of each step, (B, T)."""
         return self.counted(self.steps(value).log_prob(self.scored(value)))
 
     def counted(self, entries: Tensor) -> Tensor:
-        """The sum (B, T) of what belongs to entries (B, T, D), or to steps (B, T), without what does not count."""
+        """Sum entries (B, T, D), or steps (B, T), over D without those that do not count; returns (B, T)."""
         mask = self.rollout.mask(self.name)
-        # where, not a product: an entry that does not count may be infinite
+        # `where` instead of a product: an uncounted entry may be infinite
         entries = entries if mask is None else torch.where(mask, entries, 0.0)
         return entries.sum(-1) if entries.dim() == 3 else entries
 
     def scored(self, value: Tensor) -> Tensor:
-        """The value at which densities are evaluated, see `Conditional.scored`."""
+        """Return the value at which densities are evaluated (`Conditional.scored`)."""
         return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Sequence:
-        """Itself: a run has one batch shape."""
+        """Return itself; a run has only one batch shape."""
         if torch.Size(batch_shape) != self.batch_shape:
             raise NotImplementedError(
                 f"a Sequence of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}; "
@@ -594,9 +599,9 @@ class Sequence(TorchDistribution):
 
 
 class Marginal(Sequence):
-    """The law of a variable that reads discrete latents, these summed out: event (T, D), or (D,) of a static one.
+    """The distribution of a variable that reads summed-out latents; event shape (T, D), or (D,) if static.
 
-    Its density is that given all that comes before it, whatever the states; what is drawn reads states that are drawn.
+    Its density is conditional on all earlier variables and marginal over the states. Its draws read drawn states.
     """
 
     def __init__(self, rollout: Rollout, name: str):
@@ -610,7 +615,7 @@ class Marginal(Sequence):
         return constraints.independent(constraints.real, len(self._event_shape))
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """A draw (B, T, D) or (B, D)."""
+        """Draw (B, T, D) or (B, D)."""
         if len(self._event_shape) == 2:
             return super().rsample(sample_shape)
         for parent in self.rollout.conditionals[self.name].parents:
@@ -620,26 +625,26 @@ class Marginal(Sequence):
         return law.rsample() if law.has_rsample else law.sample()  # type: ignore[no-any-return]
 
     def steps(self, value: Tensor) -> TorchDistribution:
-        """There are none: with states summed out, steps depend on one another."""
+        """Raise an error: with states summed out, steps depend on one another."""
         raise NotImplementedError(f"with what {self.name} reads summed out, its steps have no laws by themselves")
 
     def by_step(self, value: Tensor) -> Tensor:
-        """Of every step given all before it, (B, T); (B,) of a static variable."""
+        """Return the log density of each step given all earlier ones, (B, T), or (B,) if static."""
         run = self.rollout
         if run.values.get(self.name) is not value:
             run = replace(run, values={**run.values, self.name: value})
         return run.summation.shares[self.name]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """(B,)."""
+        """Return the log density of each sequence, (B,)."""
         return self.by_step(value).flatten(1).sum(-1) if len(self._event_shape) == 2 else self.by_step(value)
 
 
 def _runs(known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
-    """First step and number of steps of what a loop evaluates at once.
+    """Yield first step and number of steps of each joint evaluation in a loop.
 
-    Forward in time these are runs of steps at which all values are known, and the step after such a run, whose
-    parameters read no other values than these, and what was drawn at that step before.
+    Forward in time, these are stretches of steps with all values known, together with the next step. Its parameters
+    read only known values and earlier draws at the same step.
     """
     if direction < 0:
         yield from ((t, 1) for t in reversed(range(len(known))))
@@ -654,7 +659,7 @@ def _runs(known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
 
 @lru_cache(maxsize=1024)
 def _check_custom_masks(factorization: Factorization, length: int) -> None:
-    """Refuses a custom mask that at this length reads what its loop has not drawn yet."""
+    """Check that no custom mask reads values that its loop has not drawn yet, at this length."""
     for block in factorization.blocks:
         for i, name in enumerate(block.names if block.direction else ()):
             for parent in factorization.factor(name).parents:
@@ -671,5 +676,5 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
 
 
 def _same(value: Tensor, drawn: Tensor) -> bool:
-    """Whether a site's value is the draw: Pyro may hand it back detached."""
+    """Return whether a site's value is the draw: Pyro may return it detached."""
     return value is drawn or torch.equal(value, drawn)

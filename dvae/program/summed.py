@@ -1,14 +1,14 @@
-"""Discrete latents, summed out: the density of all else by the forward algorithm, and their posterior from it.
+"""Discrete latents, summed out by the forward algorithm, and their posterior.
 
     p(v, x) = sum over k of prod_t p(k_t | k_{t-1}, ...) p(v_t | k_t, ...) p(x_t | k_t, ...)
 
-with v, latents that are drawn, and x, the data, given (Rabiner, 1989). A factor reads few steps of k, at lags up to L,
-so that the states of L + 1 steps are all that is held at once. Its densities at all of these come from few evaluations
-of all steps in parallel: at courses of k that repeat with the period of what the factor reads, every step sees one
-state of its window. What is left to a loop is the recursion itself, three small operations a step.
+The sum is given v, the latents that are drawn, and x, the data (Rabiner, 1989). A factor reads few steps of k, at lags
+up to L, and the recursion keeps the states of L + 1 steps only. All densities come from few evaluations of all steps in
+parallel. Each evaluation uses a sequence of states that repeats with the period of the factor's lags, and every step
+sees one state of its window. Only the recursion is a loop, with three small operations per step.
 
-Static latents are enumerated beside the chain. Every variable has a share of the log joint, its density given all that
-comes before it with the states summed out, log p(x_t | v_{<=t}, x_{<t}), so that bounds have their terms.
+Static latents are enumerated in addition to the chain. Every variable contributes a term to the log joint: its density
+given all earlier variables with the states summed out, log p(x_t | v_{<=t}, x_{<t}). Bounds use these terms.
 """
 
 from __future__ import annotations
@@ -29,17 +29,20 @@ from ..factorization.notation import Factor, Factorization
 from .conditional import like
 
 LARGEST = 4096
-"""States of a window, with those of static latents, that are summed over at once."""
+"""Maximum number of joint states of a window and the static latents."""
 WIDE = 2**11
-"""Most numbers of a step from every state, of all sequences, for blocks; beyond them these cost more than they save."""
+"""Maximum number of transition terms of a step, over all sequences, for blocks; above it they cost more time."""
 COURSES = 2**17
-"""Of states over a whole sequence, that are counted one by one, where that is asked for."""
+"""Maximum number of state sequences that are enumerated one by one."""
 
 
 class Discrete(int):
-    """The size of a latent that is categorical and summed out: its number of states; values are one-hot vectors.
+    """The size of a categorical latent that is summed out: its number of states; values are one-hot vectors.
 
-    It has a factor in the generative model, and none in the guide.
+    The latent has a factor in the generative model and none in the guide.
+
+    Raises:
+        ValueError: if there are fewer than two states.
 
     Example:
         >>> model = dvae.DynamicalVAE(
@@ -47,13 +50,10 @@ class Discrete(int):
         ... )
         >>> model.summed, model.latents
         (('k',), ())
-
-    Raises:
-        ValueError: fewer than two states.
     """
 
     def __new__(cls, states: int) -> Self:
-        """A number of states."""
+        """Create the size for a number of states."""
         if int(states) != states or states < 2:
             raise ValueError(f"a discrete latent has at least two states, a whole number of them, not {states}")
         return super().__new__(cls, states)
@@ -66,12 +66,13 @@ class Discrete(int):
 
 @dataclass(frozen=True)
 class Window:
-    """What a factor sees of the latents that are summed out.
+    """The summed-out latents that a factor reads.
 
     Args:
-        factor: it.
-        statics, chain: names of those it reads, with one value a sequence, and with one a step.
-        low, high: least and largest lag at which it reads the latter.
+        factor: the factor.
+        statics: names of the static latents that it reads.
+        chain: names of the local latents that it reads.
+        low, high: smallest and largest lag of the local ones.
     """
 
     factor: Factor
@@ -82,20 +83,20 @@ class Window:
 
     @property
     def period(self) -> int:
-        """Of the sequences at which it is evaluated."""
+        """Period of the state sequences at which the factor is evaluated."""
         return self.high - self.low + 1
 
 
 @dataclass(frozen=True)
 class Sums:
-    """How the latents of a model are summed out.
+    """The structure of the sum over a model's discrete latents.
 
     Args:
-        generative: the model.
-        sizes: of those that are summed out, by name.
+        generative: the generative factorization.
+        sizes: name to number of states of the latents that are summed out.
 
     Raises:
-        ValueError: what cannot be summed, with the number of states that it would take.
+        ValueError: if the sum has too many states; the message states their number.
     """
 
     generative: Factorization
@@ -112,46 +113,46 @@ class Sums:
 
     @cached_property
     def statics(self) -> tuple[str, ...]:
-        """Names of those with one value a sequence."""
+        """Names of the static latents."""
         return tuple(name for name in self.sizes if not self.generative.local(name))
 
     @cached_property
     def chain(self) -> tuple[str, ...]:
-        """Names of those with a value for every step."""
+        """Names of the local latents."""
         return tuple(name for name in self.sizes if self.generative.local(name))
 
     @cached_property
     def width(self) -> int:
-        """States of a step, of all of the chain together."""
+        """K, number of joint states of the local latents at one step."""
         return math.prod(self.sizes[name] for name in self.chain)
 
     @cached_property
     def kept(self) -> int:
-        """M, states of the static latents together."""
+        """M, number of joint states of the static latents."""
         return math.prod(self.sizes[name] for name in self.statics)
 
     @cached_property
     def windows(self) -> dict[str, Window]:
-        """By child, of the factors of what is summed out and of those that read it, in the order of the model."""
+        """Windows by child, for the factors of summed-out latents and their readers, in the order of the model."""
         ordered = (self.generative.factor(name) for block in self.generative.blocks for name in block.names)
         found = {factor.child: self._window(factor) for factor in ordered}
         return {name: w for name, w in found.items() if name in self.sizes or w.statics or w.chain}
 
     @cached_property
     def readers(self) -> tuple[str, ...]:
-        """Names of what reads it, and is not summed out itself."""
+        """Names of variables that read summed-out latents and are not summed out themselves."""
         return tuple(name for name in self.windows if name not in self.sizes)
 
     @cached_property
     def lag(self) -> int:
-        """L."""
+        """L, the largest lag."""
         return max((window.high for window in self.windows.values()), default=0)
 
     def require_data(self, replaced: Collection[str]) -> None:
-        """Refuses a model that reads some of these data, whose entries are replaced by its own means or noise.
+        """Check that the model does not read data that are replaced by its own means or by noise.
 
         Raises:
-            ValueError: the replacements depend on the states.
+            ValueError: if it does, since the replacements depend on the states.
         """
         read = {parent.name for factor in self.generative.factors for parent in factor.parents}
         if fed := sorted(read.intersection(replaced)):
@@ -181,10 +182,10 @@ class Sums:
         return Window(factor, tuple(statics), tuple(chain), min(lags), max(lags))
 
     def courses(self, length: int) -> dict[str, Tensor]:
-        """All that the states may be over a sequence: name to one-hot values (C, T, states), or (C, states).
+        """Return all state sequences: name to one-hot values (C, T, states), or (C, states) for a static latent.
 
         Raises:
-            ValueError: too many to count one by one.
+            ValueError: if there are too many to enumerate.
         """
         sizes = [self.sizes[name] for name in self.sizes for _ in range(length if name in self.chain else 1)]
         if (count := math.prod(sizes)) > COURSES:
@@ -201,7 +202,7 @@ class Sums:
         return found
 
     def patterns(self, window: Window, length: int) -> dict[str, Tensor]:
-        """Values at which a factor is evaluated: name to whole numbers (n, T), or (n,) of static latents."""
+        """Return the states at which a factor is evaluated: name to integers (n, T), or (n,) for static latents."""
         sizes = [self.sizes[name] for name in window.statics]
         sizes += [self.sizes[name] for name in window.chain for _ in range(window.period)]
         digits = np.stack(np.unravel_index(np.arange(math.prod(sizes)), sizes or [1])).astype(np.int64)
@@ -214,9 +215,10 @@ class Sums:
         return found
 
     def places(self, window: Window, length: int) -> Tensor:
-        """(T, J): in which pattern, and with its own state where it is summed out, a factor sees each joint state.
+        """Return the index (T, J) of the pattern that a factor sees in each joint state.
 
-        Joint states J are of the static latents, then of the chain at lags L to 0, the last one fastest.
+        For a factor of a summed-out latent, the index includes its own state. The J joint states enumerate the static
+        latents, then the chain at lags L to 0; the last one varies fastest.
         """
         names: list[tuple[str, int | None]] = [(name, None) for name in self.statics]
         names += [(name, lag) for lag in range(self.lag, -1, -1) for name in self.chain]
@@ -227,7 +229,7 @@ class Sums:
         for name in window.statics:
             place = place * self.sizes[name] + digits[name, None]
         for name in window.chain:
-            for residue in range(window.period):  # which lag is the step of this residue, seen from t?
+            for residue in range(window.period):  # the lag, seen from t, of the step with this residue
                 lag = window.low + (t - window.low - residue) % window.period
                 rows = np.stack([digits[name, own] for own in range(window.low, window.high + 1)])
                 place = place * self.sizes[name] + rows[lag[:, 0] - window.low]
@@ -238,7 +240,7 @@ class Sums:
 
     @torch.inference_mode(False)
     def placed(self, window: Window, length: int, device: torch.device) -> tuple[dict[str, Tensor], Tensor]:
-        """Patterns and places on a device, where they are brought once."""
+        """Return patterns and places on a device; each transfer happens once."""
         key = window.factor.child, length, device
         if key not in self._placed:
             told = {name: value.to(device) for name, value in self.patterns(window, length).items()}
@@ -251,14 +253,14 @@ class Sums:
 
 
 class Summation:
-    """The sum over discrete latents in one run, all else being known.
+    """The sum over discrete latents in one run, given all other variables.
 
     Args:
-        sums: how they are summed out.
-        rollout: the run (`Rollout`), with values of all that they and their readers read.
+        sums: structure of the sum.
+        rollout: run (`Rollout`) with values of all variables that the latents and their readers read.
 
     Raises:
-        ValueError: a model that reads its own means, or noise, in place of data, which depend on the states.
+        ValueError: if the model reads its own means or noise instead of data, since these depend on the states.
     """
 
     def __init__(self, sums: Sums, rollout: Any):
@@ -273,13 +275,13 @@ class Summation:
         self._steps = sum(self._local.values(), none).expand(shape)
 
     def _logs(self, name: str, window: Window) -> Tensor:
-        """Log densities or probabilities in all joint states: (B or 1, T, M, K^L, K); (B or 1, M) of a static one."""
+        """Return log densities or probabilities in all joint states, (B or 1, T, M, K^L, K), or (B or 1, M)."""
         sums, run, local = self.sums, self.rollout, window.factor.local
         conditional, own = run.conditionals[name], name in sums.sizes
         told, places = sums.placed(window, run.length, like(conditional).device)
         count = len(next(iter(told.values()))) if told else 1
         values = {n: one_hot(v, sums.sizes[n]).to(like(conditional)) for n, v in told.items()}
-        if values.keys() == {*conditional.parents}:  # the same for all sequences
+        if values.keys() == {*conditional.parents}:  # equal for all sequences
             parameters = conditional(values, count, run.length)
         else:
             again = run.again(count)
@@ -300,7 +302,7 @@ class Summation:
 
     @cached_property
     def shares(self) -> dict[str, Tensor]:
-        """Log density by variable that reads what is summed out, given all before it: (B, T), or (B,) if static."""
+        """Log density of each reader given all earlier variables, by name: (B, T), or (B,) if static."""
         before = self._filtered(self._start, self._steps)[:, :-1, ..., None].expand_as(self._steps)
         found = {}
         for logs, sofar in ((self._static, torch.zeros_like(self._start)), (self._local, before)):
@@ -312,22 +314,22 @@ class Summation:
         return found
 
     def _filtered(self, start: Tensor, steps: Tensor) -> Tensor:
-        """(B, T + 1, M, K^L): log joint of states with all up to each step, but for a constant of every step."""
+        """Return the log joint (B, T + 1, M, K^L) of states and variables so far, up to a constant per step."""
         alpha = start[..., None].expand(*start.shape, self.sums.width**self.sums.lag)
-        steps = steps - steps.detach().amax((2, 3, 4), keepdim=True)  # as they add up, digits are lost
-        if not self.sums.lag:  # no step looks back
+        steps = steps - steps.detach().amax((2, 3, 4), keepdim=True)  # a large sum would lose digits
+        if not self.sums.lag:  # no transition depends on earlier states
             return torch.cat([alpha[:, None], alpha[:, None] + steps.logsumexp(-1).cumsum(1)], 1)
         return forward_sums(alpha, steps)
 
     @torch.no_grad()
     def draw(self) -> dict[str, Tensor]:
-        """States from their posterior given all else, one-hot: (B, T, C), or (B, C) of static latents."""
+        """Draw states from their posterior given all other variables, one-hot: (B, T, C), or (B, C) if static."""
         width, rows = self.sums.width, torch.arange(len(self._start), device=self._start.device)
         joint = (self._filtered(self._start, self._steps)[:, :-1, ..., None] + self._steps).flatten(3)
         last = _drawn(joint[:, -1].flatten(1))
         static, window = last // joint.shape[-1], last % joint.shape[-1]
         symbols = [window % width]
-        for t in reversed(range(joint.shape[1] - 1)):  # a step is in the windows of those after it
+        for t in reversed(range(joint.shape[1] - 1)):  # the window of the next step contains all but the oldest state
             known = window // width
             oldest = _drawn(joint[rows, t, static].unflatten(1, (width, -1))[rows, :, known])
             window = oldest * width**self.sums.lag + known
@@ -341,7 +343,7 @@ class Summation:
 
     @torch.enable_grad()
     def probabilities(self) -> dict[str, Tensor]:
-        """Of the states given all else: (B, T, C), or (B, C) of static latents. They are slopes of the log density."""
+        """Return posterior probabilities (B, T, C), or (B, C) if static, as gradients of the log density."""
         parts = [part.detach().contiguous().requires_grad_() for part in (self._start, self._steps)]
         total = self._filtered(*parts)[:, -1].flatten(1).logsumexp(1).sum()
         static, steps = torch.autograd.grad(total, parts)
@@ -356,16 +358,19 @@ class Summation:
 
 
 def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
-    """The forward algorithm: (..., B, T + 1, M, W) from (..., B, M, W) and logs (B, T, M, W, K) of steps from W states.
+    """Run the forward algorithm and return log sums (..., B, T + 1, M, W).
 
-    Long series run in blocks (see `distributions.scan`) from each of the W states: a block is a step from W states to
-    W.
+    Long sequences run in blocks (`distributions.scan`) from each of the W states: a block is a step from W states to W.
+
+    Args:
+        start: log weights (..., B, M, W) of the states at the start.
+        steps: log densities (B, T, M, W, K) of each step from each of the W states.
     """
     batch, length, kept, window, width = steps.shape
     if length >= 4 * BLOCK and batch * kept * window**2 * width <= WIDE:
         padded = torch.cat([steps, steps.new_zeros(batch, -length % BLOCK, kept, window, width)], 1)
         blocks = padded.unflatten(1, (-1, BLOCK)).flatten(0, 1)
-        never = torch.finfo(steps.dtype).min / 1000  # at infinity there is no gradient
+        never = torch.finfo(steps.dtype).min / 1000  # infinite values have no gradient
         each = torch.full_like(steps[0, 0, 0, :, :1].expand(-1, window), never).fill_diagonal_(0.0)
         own = forward_sums(each[:, None, None].expand(-1, len(blocks), kept, -1), blocks)[:, :, 1:]
         own = own.unflatten(1, (batch, -1))  # (W, B, blocks, BLOCK, M, W)
@@ -380,5 +385,5 @@ def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
 
 
 def _drawn(logits: Tensor) -> Tensor:
-    """A place in the last dimension, by its probability."""
+    """Draw an index of the last dimension with these logits."""
     return torch.multinomial(logits.softmax(-1), 1)[:, 0]

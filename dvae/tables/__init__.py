@@ -1,4 +1,4 @@
-"""Tables: sequences of numbers, counts and classes with covariates, from whatever holds them, as data to fit to.
+"""Tables: sequences of numbers, counts and classes with covariates, from common data structures, as data for models.
 
 >>> import pandas as pd
 >>> frame = pd.DataFrame({"day": range(6), "riders": [3, 5, 2, 4, 6, 1], "open": [1, 1, 0, 1, 1, 0]})

@@ -1,4 +1,4 @@
-"""The windows at the end of a table: what was observed last, and the steps after it."""
+"""Windows at the end of a table: the last observed steps, and the steps after them."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from .windows import NAMED, PanelWindows
 
 
 def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> PanelWindows:
-    """One window for each sequence, whose future is after the last row that has a target.
+    """Return one window for each sequence, whose future follows the last row with a target.
 
-    Rows behind that one hold covariates that are known in the future, their targets empty.
+    Later rows contain covariates that are known in the future, with empty targets.
 
     Args:
         panel: the sequences.
-        schema: of the run.
+        schema: schema of the run.
         horizon: steps of the future; by default those of the schema.
 
     Raises:
-        ValueError: whole sequences; or no sequence that is long enough and has the covariates of its future.
+        ValueError: if sequences are not cut, or no sequence is long enough with covariates for its future.
 
     Warns:
-        UserWarning: some sequences have no window, saying which and why.
+        UserWarning: if some sequences have no window; the message names them and the reason.
     """
     observed, steps = schema.cut.observed, horizon or schema.cut.horizon
     if observed is None or steps is None:
         raise ValueError("whole sequences have no horizon; fit with observed and horizon steps to forecast")
     known = schema.columns.of("known")
     calendar, trained = panel.calendar, schema.calendar
-    if calendar.kind == trained.kind:  # these sequences may be too short to show a step
+    if calendar.kind == trained.kind:  # these sequences may be too short to infer a step
         calendar = replace(calendar, step=calendar.step or trained.step, gap=calendar.gap or trained.gap)
-    found, without = [], []  # with all of the past, of which covariates may have their last value
+    found, without = [], []  # with the complete past, for the last values of covariates
     for one in panel:
         present = panel.present(one)
         if present < observed:

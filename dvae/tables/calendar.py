@@ -1,7 +1,7 @@
-"""Calendar: the kind, time zone and calendar step of the times of a table, and the times that follow them.
+"""Calendar: kind, time zone and calendar step of the times of a table, and the times that follow them.
 
-Times are float64: numbers as they are, or seconds. A day, a week, a business day or a month is not a fixed number of
-seconds, so that dates at such steps are continued on the calendar, in their own time zone.
+Times are float64: plain numbers, or seconds. A day, a week, a business day or a month is not a fixed number of seconds.
+Dates with such steps are therefore continued on the calendar, in their own time zone.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HOUR, DAY = 3600, 86400
 MONTH = 30.4369
 """Mean days of a month."""
 SERIES = 50
-"""Sequences from which the calendar step of a panel is inferred."""
+"""Maximum number of sequences used to infer the calendar step of a panel."""
 _OFFSET = re.compile(r"(?:UTC)?[-+](?:[01]\d|2[0-3]):[0-5]\d", re.ASCII)
 _DAYS = ("MON", "TUE", "WED", "THU", "FRI", "SAT", "SUN")
 _STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4](?:{'|'.join(_DAYS)}))", re.ASCII)
@@ -38,10 +38,11 @@ class Calendar:
         kind: "numbers", "dates" (times are seconds since 1970, in UTC) or "durations" (times are seconds).
         zone: time zone of the dates, such as "Europe/Berlin" or "UTC+02:00"; None for dates without one.
         step: calendar step as a pandas alias, such as "1MS" or "1B"; None for steps of equal duration.
-        gap: median time between two steps, by which a sequence of one step continues; 0 where it is unknown.
+        gap: median time between two steps, used to continue a sequence of one step; 0 if unknown.
 
     Raises:
-        ValueError: unknown zone or step, a negative gap, or a zone or step of times that are not dates.
+        ValueError: if the zone or step is unknown, the gap is negative, or times that are not dates have a zone or
+            step.
     """
 
     kind: Literal["numbers", "dates", "durations"] = "numbers"
@@ -74,7 +75,7 @@ class Calendar:
         return replace(found, step=steps.most_common(1)[0][0]) if steps else found
 
     def shown(self, times: np.ndarray) -> Any:
-        """Times (N,) as pandas has them: dates in their zone, durations, or the numbers."""
+        """Return times (N,) as pandas objects: dates in their zone, or durations; numbers are unchanged."""
         import pandas as pd
 
         if self.kind == "numbers":
@@ -86,17 +87,17 @@ class Calendar:
         return dates if self.zone is None else dates.tz_localize("UTC").tz_convert(self.zone)
 
     def text(self, time: float) -> str:
-        """A time as `shown` has it, as text."""
+        """Return a time as text."""
         return f"{time:.15g}" if self.kind == "numbers" else str(self.shown(np.array([time]))[0])
 
     def after(self, times: np.ndarray, count: int) -> np.ndarray:
-        """Return the `count` times that follow.
+        """Return the next `count` times.
 
         The step is inferred from the times. If they are too few, it is the step of the calendar. Times without a
         calendar step continue by their median gap.
 
         Warns:
-            UserWarning: days that are some 23 or 25 hours long, in no time zone that has such days.
+            UserWarning: if some days last 23 or 25 hours, but the time zone has no clock changes.
         """
         import pandas as pd
 
@@ -107,7 +108,7 @@ class Calendar:
             for step in filter(None, steps):
                 if (following := _following(local, step, count)) is not None:
                     return self._seconds(following)
-            if len(local) > 1 and _is_daily(local):  # whatever the clocks do in between
+            if len(local) > 1 and _is_daily(local):  # regardless of clock changes
                 gap = (local[1:] - local[:-1]).to_series().median()
                 return self._seconds(pd.DatetimeIndex([local[-1] + gap * place for place in range(1, count + 1)]))
             if self.zone in (None, "UTC") and _changes_clocks(times):
@@ -121,31 +122,31 @@ class Calendar:
         return np.asarray(times[-1] + gap * np.arange(1, count + 1))
 
     def _local(self, times: np.ndarray) -> Any:
-        """Dates as the clocks of their zone show them."""
+        """Return dates as local times of their zone, without a zone."""
         dates = self.shown(times)
         return dates if self.zone is None else dates.tz_localize(None)
 
     def _seconds(self, local: Any) -> np.ndarray:
-        """Seconds since 1970 of dates as the clocks of their zone show them."""
-        if self.zone is not None:  # an hour that the clocks skip begins when they have skipped it
+        """Return seconds since 1970 of dates given as local times of their zone."""
+        if self.zone is not None:  # a skipped hour starts after the clock change
             local = local.tz_localize(self.zone, ambiguous=np.ones(len(local), bool), nonexistent="shift_forward")
         return seconds(local)
 
 
 NUMBERS = Calendar()
-"""Times that are numbers."""
+"""Calendar for times that are plain numbers."""
 
 
 def seconds(dates: Any) -> np.ndarray:
-    """Seconds since 1970 of a pandas index of dates, or seconds of durations."""
+    """Return seconds since 1970 of a pandas index of dates, or seconds of durations."""
     return np.asarray(dates.as_unit("us").asi8 / 1e6)
 
 
 def check_zone(zone: str) -> None:
-    """Refuse text that names no time zone.
+    """Check that text names a time zone.
 
     Raises:
-        ValueError: neither an offset such as "+02:00" nor a name of the IANA database.
+        ValueError: if it is neither an offset such as "+02:00" nor a name of the IANA database.
     """
     try:
         if not _OFFSET.fullmatch(zone):
@@ -157,12 +158,12 @@ def check_zone(zone: str) -> None:
 
 
 def _is_daily(local: Any) -> bool:
-    """Whether dates are all at one time of the day."""
+    """Return whether all dates have the same time of day."""
     return bool((local - local.normalize()).nunique() == 1)
 
 
 def _changes_clocks(times: np.ndarray) -> bool:
-    """Whether times are days apart, but for an hour twice a year."""
+    """Return whether times are days apart, except for an hour twice a year."""
     gaps = np.diff(times)
     changes = gaps % DAY != 0
     few = 0 < changes.sum() <= 2 + (times[-1] - times[0]) / (180 * DAY)
@@ -170,7 +171,7 @@ def _changes_clocks(times: np.ndarray) -> bool:
 
 
 def _step(local: Any) -> str | None:
-    """Calendar step of increasing dates; None where they have none, or are too few to show one."""
+    """Return the calendar step of increasing dates; None if they have none or are too few."""
     if len(local) < 3 or not _is_daily(local):
         return None
     days = float(np.median(np.diff(seconds(local)))) / DAY
@@ -186,7 +187,7 @@ def _step(local: Any) -> str | None:
 
 
 def _following(local: Any, step: str, count: int) -> Any:
-    """The `count` dates that follow by a calendar step; None where most dates do not follow each other by it."""
+    """Return the next `count` dates by a calendar step; None if most dates are not consecutive by it."""
     import pandas as pd
 
     days = None

@@ -39,7 +39,7 @@ _MOST = {"year": 9999, "quarter": 4, "week": 53, "month": 12, "day": 366, "hour"
 
 
 def is_clock(values: Any) -> bool:
-    """Whether a column holds times of day, such as 13:05."""
+    """Return whether a column contains times of day, such as 13:05."""
     known = values.dropna()
     if values.dtype.kind != "O":
         return False
@@ -74,7 +74,7 @@ def parts_of(frame: Any, names: Collection[str]) -> tuple[str, ...]:
 
 
 def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None) -> Any:
-    """Return the time of each row, from one column or several; numbers that are written as text become numbers."""
+    """Return the time of each row, from one column or several; numbers in text are converted."""
     if isinstance(time, tuple):
         return join_times(frame, time)
     column = frame[time]
@@ -89,14 +89,15 @@ def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None)
 def join_times(frame: Any, names: tuple[str, ...]) -> Any:
     """Return the time of each row from several columns.
 
+    Without a year, days are counted.
+
     Args:
         frame: table.
-        names: columns of dates and of clocks or hours; or of whole numbers, named year, month, day, hour, minute and
-            second, or in that order; or named year and quarter, or year and (ISO) week.
-            Without a year, days are counted.
+        names: columns of dates and of clocks or hours; or integers named year, month, day, hour, minute and second, or
+            in this order; or named year and quarter, or year and (ISO) week.
 
     Raises:
-        ValueError: columns that are no parts of a time.
+        ValueError: if the columns are not parts of a time.
     """
     import pandas as pd
 
@@ -130,7 +131,7 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
         return pd.Series(seconds / SECONDS[str(units[-1])], frame.index, name=label)
     month = parts.get("month", 3 * parts["quarter"] - 2 if "quarter" in parts else np.ones(len(frame)))
     months = (12 * (parts["year"] - 1970) + month - 1).astype(int).astype("datetime64[M]")
-    if "week" in parts:  # the first holds January 4
+    if "week" in parts:  # ISO week 1 contains January 4
         fourth = months.astype("datetime64[D]") + 3
         weekday = (fourth.astype(int) + 3) % 7  # 1970 began on a Thursday
         months = fourth - weekday + 7 * (parts["week"].astype(int) - 1)
@@ -150,7 +151,7 @@ def _refuse_late_days(days: np.ndarray, months: np.ndarray, label: str) -> None:
 
 
 def _part(column: Any, unit: str) -> Any:
-    """Return one part (N,) of each time: years, months and days as numbers, hours and smaller ones in seconds."""
+    """Return one part (N,) of each time: years, months and days as numbers, hours and smaller units in seconds."""
     if column.dtype.kind == "m":
         return column.dt.total_seconds().to_numpy(np.float64)
     if unit == "hour" and is_clock(column):

@@ -1,22 +1,22 @@
-"""Columns: what each column of a table holds and what it is for, as a small schema that stands beside the file.
+"""Columns: type and role of each column of a table, as a small schema file next to the table.
 
-id = ["station"]                      # tell sequences apart
+id = ["station"]                      # identify sequences
 time = "date"                         # or ["date", "hour"], which are joined
-zone = "Europe/Berlin"                # of the times, where they do not name it
+zone = "Europe/Berlin"                # time zone, if the times do not name it
 na_values = ["?"]                     # mark missing values
-group = "region"                      # of sequences, for panels
-split = "part"                        # train, validation or test, where the data say it
+group = "region"                      # group of each sequence, for panels
+split = "part"                        # train, validation or test, if the data define it
 
-[columns.riders]                      # a target, if not told otherwise
+[columns.riders]                      # a target, by default
 family = "count"                      # one of dvae.distributions.FAMILIES
 unit = "people"
 
 [columns.temperature]
-role = "known"                        # a covariate that a forecast is given for the future too, such as a plan
+role = "known"                        # a covariate that is also known in the future, such as a plan
 unit = "°C"
 
 [columns.weather]
-role = "past"                         # one that ends with the present
+role = "past"                         # a covariate that is known up to the present
 family = "category"
 classes = ["clear", "rain", "else"]
 other = "else"                        # the class of every other value
@@ -41,28 +41,28 @@ from .calendar import check_zone
 
 Role = Literal["target", "known", "past", "static"]
 WHOLE_STEPS = ("correlated",)
-"""Families whose columns are one event together."""
+"""Families with one event for all their columns."""
 MOST = 4096
-"""Columns, and classes of one."""
+"""Maximum number of columns, and of classes of a column."""
 _CHAIN = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"(?:\\.|[^"\\\n])*+"|'[^'\n]*+')\s*\.\s*){64}""")
-"""A dotted key deeper than any, of which `tomllib` takes the square of the time."""
+"""A dotted key deeper than in any schema; `tomllib` takes quadratic time to parse it."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column.
+    """A column of a table.
 
     Args:
-        name: of the column.
-        role: "target" for data that are modelled, "known" or "past" for covariates that are known in the future too or
-            end with the present, "static" for one value a sequence.
-        family: of the values, one of `dvae.distributions.FAMILIES`; of covariates "category" or "real".
-        unit: in which the values are, for tables and pictures.
-        classes: of a category, in the order of its coordinates.
-        other: one of the classes, which stands for every value that is none of them; "" refuses such values.
+        name: name of the column.
+        role: "target" for modelled data, "known" for covariates known in the future, "past" for covariates known up to
+            the present, "static" for one value per sequence.
+        family: family of the values, one of `dvae.distributions.FAMILIES`; for covariates "category" or "real".
+        unit: unit of the values, for tables and figures.
+        classes: classes of a category, in the order of its coordinates.
+        other: class that represents every unlisted value; "" raises an error for such values.
 
     Raises:
-        ValueError: a family that is none, a category without classes, or `other` that is none of these.
+        ValueError: if the family is unknown, a category has no classes, or `other` is not one of them.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Column:
     family: str = "real"
     unit: str = ""
     classes: tuple[str, ...] = ()
-    other: str = field(default="", repr=False)  # fingerprints of panels hash the rest
+    other: str = field(default="", repr=False)  # fingerprints of panels include all other fields
 
     def __post_init__(self) -> None:
         check(self)
@@ -98,27 +98,28 @@ class Column:
 
     @property
     def coordinates(self) -> list[str]:
-        """Names of its coordinates: of a category one for each class."""
+        """Names of its coordinates; a category has one for each class."""
         return [f"{self.name}={each}" for each in self.classes] or [self.name]
 
 
 @dataclass(frozen=True)
 class Columns:
-    """What the columns of a table are.
+    """The schema of a table's columns.
 
     Args:
-        columns: those that are read, in order.
-        id: names of the columns that tell sequences apart; none for one sequence.
-        time: name of the column that orders them, dates or numbers, or names of columns that are joined to one time,
-            see `dvae.tables.clocks`; rows as they stand, where there is none.
-        group: name of a column that is the same within each sequence, for panels.
-        split: name of a column that says "train", "validation" or "test".
-        zone: time zone of the times, such as "Europe/Berlin", whose clocks show the dates without an offset from UTC.
-        na_values: texts or numbers that mark missing values, beside empty cells and NaN.
+        columns: the columns to read, in order.
+        id: names of the columns that identify sequences; empty for a single sequence.
+        time: name of the column that orders rows, with dates or numbers, or names of columns that are joined to one
+            time (`dvae.tables.clocks`); None keeps the order of the rows.
+        group: name of a column that is constant within each sequence, for panels.
+        split: name of a column with values "train", "validation" or "test".
+        zone: time zone, such as "Europe/Berlin", of dates without an offset from UTC.
+        na_values: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
 
     Raises:
-        ValueError: two columns of one name, no target, a zone that is none or of no time, or another decimal sign.
+        ValueError: if two columns share a name, no column is a target, the zone is unknown or given without a time, or
+            the decimal sign is invalid.
     """
 
     columns: tuple[Column, ...]
@@ -126,7 +127,7 @@ class Columns:
     time: str | tuple[str, ...] | None = None
     group: str | None = None
     split: str | None = None
-    zone: str | None = field(default=None, repr=False)  # fingerprints of panels hash the times and values
+    zone: str | None = field(default=None, repr=False)  # fingerprints of panels include times and values
     na_values: tuple[str, ...] = field(default=(), repr=False)
     decimal: str | None = field(default=None, repr=False)
 
@@ -151,17 +152,17 @@ class Columns:
                 raise ValueError(f"zone is {self.zone!r}, and no column is the time; name it")
 
     def of(self, *roles: Role) -> list[Column]:
-        """The columns that play one of these roles."""
+        """Return the columns with one of these roles."""
         return [column for column in self.columns if column.role in roles]
 
     @property
     def times(self) -> tuple[str, ...]:
-        """Names of the columns of the time."""
+        """Names of the time columns."""
         return (self.time,) if isinstance(self.time, str) else self.time or ()
 
     @property
     def targets(self) -> list[Column]:
-        """The columns that are modelled."""
+        """Columns that are modelled."""
         return self.of("target")
 
     @property
@@ -175,14 +176,14 @@ class Columns:
         return [*self.id, *self.times, *filter(None, (self.group, self.split)), *self.names]
 
     def but(self, name: str, **told: Any) -> Self:
-        """The same, but that one column is another: what a person corrects.
+        """Return the schema with one column changed, to correct a proposal.
 
         Args:
-            name: of the column.
-            **told: its fields that are others, such as family="count"; one that becomes a category needs its classes.
+            name: name of the column.
+            **told: fields to change, such as family="count"; a new category also needs its classes.
 
         Raises:
-            ValueError: a column that is not there, or fields that do not fit together.
+            ValueError: if the column does not exist or the fields do not fit together.
         """
         own = self._known(name)
         if told.get("family", "category") != "category":
@@ -190,25 +191,25 @@ class Columns:
         return replace(self, columns=tuple(replace(each, **told) if each == own else each for each in self.columns))
 
     def without(self, *names: str) -> Self:
-        """The same, but for columns that are not read.
+        """Return the schema without some columns.
 
         Raises:
-            ValueError: a column that is not there, or no target left.
+            ValueError: if a column does not exist or no target remains.
         """
         aside = [self._known(name) for name in names]
         return replace(self, columns=tuple(each for each in self.columns if each not in aside))
 
     def _known(self, name: str) -> Column:
-        """A column by its name."""
+        """Return a column by name."""
         if name not in self.names:
             raise ValueError(f"no column {name!r}{nearest(name, self.names)}; there are {', '.join(self.names[:20])}")
         return self.columns[self.names.index(name)]
 
     def config(self) -> dict[str, Any]:
-        """It in JSON's types; `from_config` reads it."""
+        """Return the schema as JSON types, for `from_config`."""
         time = list(self.time) if isinstance(self.time, tuple) else self.time
         found: dict[str, Any] = {"id": list(self.id), "time": time, "group": self.group, "split": self.split}
-        # fingerprints of windows hash what is here
+        # fingerprints of windows hash these entries: default values stay out
         found |= {name: value for name in ("zone", "decimal") if (value := getattr(self, name))}
         found |= {"na_values": list(self.na_values)} if self.na_values else {}
         columns = {}
@@ -220,10 +221,10 @@ class Columns:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """What `config` wrote, or a person in TOML; columns are real targets where nothing is said.
+        """Return the schema from `config` or a TOML file; columns are real targets by default.
 
         Raises:
-            ValueError: entries that are none, with the nearest known one.
+            ValueError: if an entry is unknown; the message names the nearest known one.
         """
         rest = {**config}
         columns = rest.pop("columns", {})
@@ -238,7 +239,7 @@ class Columns:
         return cls(tuple(found), **layout(rest))
 
     def to_toml(self) -> str:
-        """The schema as a file to be edited."""
+        """Return the schema as an editable TOML file."""
         lines = [
             f"{name} = {_quoted(value) if isinstance(value, str) else _listed(value)}"
             for name in ("id", "time", "zone", "group", "split", "na_values", "decimal")
@@ -256,19 +257,19 @@ class Columns:
 
     @classmethod
     def from_toml(cls, text: str) -> Self:
-        """The schema of a file.
+        """Return the schema of a TOML file.
 
         Raises:
-            ValueError: no TOML, or entries that are none.
+            ValueError: if the text is not TOML or an entry is unknown.
         """
         return cls.from_config(parsed(text))
 
 
 def parsed(text: str) -> dict[str, Any]:
-    """What a TOML file of a stranger says.
+    """Return the content of an untrusted TOML file.
 
     Raises:
-        ValueError: no TOML, or tables within tables without end.
+        ValueError: if the text is not TOML or is nested too deeply.
     """
     try:
         if _CHAIN.search(text):
@@ -282,7 +283,7 @@ def layout(told: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a schema about the whole table, with their types checked.
 
     Raises:
-        ValueError: an entry that a schema does not have, or of another type.
+        ValueError: if an entry is unknown or has another type.
     """
     _refuse_others(told, (each.name for each in fields(Columns)), "the schema")
     found: dict[str, Any] = {}
@@ -314,6 +315,6 @@ def _listed(words: Iterable[str]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A TOML string."""
+    """Return text as a TOML string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(each if each >= " " and each != "\x7f" else f"\\u{ord(each):04x}" for each in escaped) + '"'

@@ -1,4 +1,4 @@
-"""Panels as runs keep and reopen them: a file with its columns, or one of `dvae.tables.domains` by its name."""
+"""Panel data as runs store and reopen them: a file with its schema, or a data set of `dvae.tables.domains` by name."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from .windows import PanelWindows
 
 @dataclass(frozen=True)
 class Tabled:
-    """Where a panel was, as a run keeps it.
+    """The source of a panel, as stored in a run.
 
     Args:
-        path: the file as it was given.
+        path: path of the file, as given.
         fingerprint: SHA-256 of the sequences.
     """
 
@@ -36,12 +36,12 @@ class Tabled:
 
 @dataclass(frozen=True)
 class PanelData:
-    """A panel under a schema.
+    """A panel with its schema.
 
     Args:
-        path: the file as it was given.
-        panel: its sequences.
-        schema: what models see of them.
+        path: path of the file, as given.
+        panel: the sequences.
+        schema: columns, cut and units that models use.
     """
 
     kind: ClassVar[str] = "panel"
@@ -61,19 +61,20 @@ class PanelData:
         cut: Cut | None = None,
         **told: Any,
     ) -> Self:
-        """Reads a file, by the schema that stands beside it, if there is one.
+        """Read a file, with the schema file next to it if there is one.
 
         Args:
-            path: of a CSV, Parquet, npz or npy file, of a folder of npy files, or the name of a data set of
+            path: path of a CSV, Parquet, npz or npy file, or of a folder of npy files; or the name of a data set of
                 `dvae.tables.domains`.
-            columns: what its columns are, in place of that schema: one, or the targets in words, see `Told`.
-            cut: how sequences are divided and cut; by default what the schema says, or what suits them.
+            columns: a schema, or the targets as in `Told`; replaces the schema file.
+            cut: how to split and cut sequences; by default from the schema file, otherwise a choice that suits the
+                data.
             **told: further fields of `Told` and of `Cut`.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            TypeError: `cut` that is no `Cut`.
-            ValueError: a file or a schema that cannot be read.
+            FileNotFoundError: if the file does not exist.
+            TypeError: if `cut` is not a `Cut`.
+            ValueError: if the file or the schema is invalid.
         """
         require(Cut | None, cut=cut)
         name = os.fspath(path)
@@ -88,25 +89,25 @@ class PanelData:
 
     @classmethod
     def of(cls, data: Any, columns: Any = None, cut: Cut | None = None, name: str = "panel") -> Self:
-        """A panel in memory, see `Panel.of`; a run that is fitted to it cannot find it again by a path."""
+        """Wrap data in memory, as in `Panel.of`; a run fitted to them cannot reopen them by a path."""
         require(Cut | None, cut=cut)
         panel = Panel.of(data, columns, name)
         return cls(name, panel, PanelSchema.under(panel, cut or suited(panel)))
 
     def on(self, data: Any) -> Self:
-        """Other data, of what `Panel.of` takes, under this schema: the columns, cut and units that models know."""
+        """Return other data, of any type that `Panel.of` accepts, with the columns, cut and units of this schema."""
         return replace(self, panel=Panel.of(data, self.panel.columns, self.panel.name))
 
     def only(self, sequences: Iterable[str]) -> Self:
-        """Some of the sequences, by their names.
+        """Return some of the sequences, by name.
 
         Raises:
-            ValueError: one that is not there.
+            ValueError: if a sequence does not exist.
         """
         return replace(self, panel=self.panel.only(sequences))
 
     def recut(self, **cut: Any) -> Self:
-        """The same, cut otherwise, such as with another horizon; units stay those that models know.
+        """Return the data with another cut, such as another horizon; units do not change.
 
         Args:
             **cut: fields of `Cut`.
@@ -114,11 +115,11 @@ class PanelData:
         return replace(self, schema=replace(self.schema, cut=replace(self.schema.cut, **cut)))
 
     def windows(self, split: str) -> PanelWindows:
-        """The windows of "train", "validation", "test" or "train+validation"; of "all", wherever they are."""
+        """Return the windows of "train", "validation", "test" or "train+validation"; "all" ignores the split."""
         return PanelWindows(self.panel, self.schema, split)
 
     def parts(self) -> dict[str, str]:
-        """For training, validation and test: what windows there are and which are left out, or why there are none."""
+        """Describe the windows of each split and the omitted ones, or state why a split is empty."""
         found = {}
         for split in SPLITS:
             try:
@@ -131,23 +132,23 @@ class PanelData:
         return found
 
     def ahead(self, horizon: int | None = None) -> PanelWindows:
-        """The end of each sequence, and what comes after it, see `dvae.tables.ahead`.
+        """Return windows whose future follows the end of each sequence, as in `dvae.tables.ahead`.
 
         Args:
             horizon: steps of the future; by default those of the schema.
 
         Raises:
-            ValueError: whole sequences, sequences that are too short, or covariates that the future lacks.
+            ValueError: if sequences are not cut, are too short, or have no covariates for the future.
         """
         return ahead(self.panel, self.schema, horizon)
 
     def whole(self) -> PanelWindows:
-        """All sequences, uncut."""
+        """Return all sequences, uncut."""
         return self.recut(observed=None, horizon=None, split="sequence").windows("all")
 
     @property
     def location(self) -> str:
-        """Where the file is, as any process finds it, or the name of a domain."""
+        """Absolute path of the file, or the name of a domain."""
         return self.path if is_domain(self.path) else os.path.abspath(self.path)
 
     @property
@@ -157,28 +158,30 @@ class PanelData:
 
     @property
     def protocol(self) -> Cut:
-        """How sequences are divided and cut."""
+        """How sequences are split and cut."""
         return self.schema.cut
 
     def recorded(self) -> Tabled:
-        """Where it is; `reopened` reads it."""
+        """Return the source of the data, for `reopened`."""
         return Tabled(self.path, self.fingerprint)
 
     @classmethod
     def reopened(cls, source: Tabled, schema: PanelSchema, path: str | os.PathLike[str] | None = None) -> Self:
-        """The panel that was recorded, from there or from another path, whatever it is now, under the run's schema.
+        """Read a recorded panel with the schema of the run, from its path or another one.
+
+        The content may have changed.
 
         Raises:
-            FileNotFoundError, ValueError: see `open`.
+            FileNotFoundError, ValueError: as in `open`.
         """
         name = os.fspath(path or source.path)
         return cls(name, read_panel(name, schema.columns), schema)
 
 
 def suited(panel: Panel) -> Cut:
-    """How a panel is divided where nobody says: few sequences by time, and by sequence where they are many.
+    """Return a default cut: fewer than 10 sequences without a given split are split by time, otherwise by sequence.
 
-    A tenth of the median sequence, and 24 steps at most, is to be forecast, from three times as many.
+    The horizon is a tenth of the median length, at most 24 steps, and three times as many steps are observed.
     """
     lengths = sorted(len(one) for one in panel.series)
     few = len(panel) < 10 and not any(one.split for one in panel.series)

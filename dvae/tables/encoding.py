@@ -1,14 +1,14 @@
-"""What models see of a panel: targets as coordinates of x, covariates as context, in units taken from training data.
+"""Encoding of a panel for models: targets as coordinates of x, covariates as context, with units from training data.
 
-| variable | what | shape |
+| variable | content | shape |
 |---|---|---|
-| x | targets; a category in a coordinate for each class | (B, T, D) |
-| c | covariates, known in the future or ending with the present, without unit; indicators | (B, T, C) |
-| s | covariates with one value a sequence, likewise | (B, S) |
-| d | time since the step before, in median steps, where steps are not evenly spaced | (B, T, 1) |
+| x | targets; a category has one coordinate per class | (B, T, D) |
+| c | standardised covariates known in the future or up to the present; indicators | (B, T, C) |
+| s | standardised covariates with one value per sequence; indicators | (B, S) |
+| d | time since the previous step in median steps, if steps are not evenly spaced | (B, T, 1) |
 
-A covariate that lacks an entry has its last value, or before any the mean of the training data (of a category, no
-class), and its indicator is 0 there; one that ends with the present has its last value after that.
+A missing entry of a covariate repeats the last value, and its indicator is 0. Before any value, the entry is the mean
+of the training data, or no class for a category. A covariate known up to the present repeats its last value after that.
 """
 
 from __future__ import annotations
@@ -38,26 +38,27 @@ from .protocol import Cut
 COVARIATES, STATICS, GAPS = "c", "s", "d"
 """Names of context in batches."""
 EVEN = 1.3
-"""Longest gap over the median, and median over the shortest, up to which steps are evenly spaced: months are."""
+"""Steps are evenly spaced up to this ratio of longest gap to median, and of median to shortest gap; months are."""
 LEAST = 1e-7
-"""Of the deviation of logarithms: below it is what rounding leaves of a constant."""
+"""Standard deviation of logarithms below which values are a constant with rounding errors."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
 LOGARITHMIC = ("positive", "log-normal", "power")
-"""Families that networks read the logarithms of."""
+"""Families whose logarithms networks read."""
 SCALED = (*LOGARITHMIC, *COUNTS)
 
 
 @dataclass(frozen=True)
 class PanelSchema(Schema):
-    """What a model must know of a panel; see the file.
+    """The schema of a panel; the module describes the encoding.
 
     Args:
-        columns: of the table.
-        cut: how it is divided and cut.
-        means, scales: of the columns that have a unit, over the training data.
-        logarithms: of those that are read as such, the least that is, and their mean and deviation.
-        lacking: names of columns that have an indicator: those that lack entries in training, or end with the present.
-        step: median time from one step to the next; 0 where steps are evenly spaced.
+        columns: schema of the table.
+        cut: how sequences are split and cut.
+        means, scales: means and scales of the standardised columns, over the training data.
+        logarithms: for columns read as logarithms, the smallest value, and mean and deviation of the logarithms.
+        lacking: names of columns with an indicator: those with missing training values, or known only up to the
+            present.
+        step: median time between steps; 0 if steps are evenly spaced.
         calendar: kind, time zone and calendar step of the times.
     """
 
@@ -84,7 +85,7 @@ class PanelSchema(Schema):
         if self.step:
             found[GAPS] = 1
         for name, value in (("sizes", found), ("length", self.cut.length), ("observed", self.cut.observed)):
-            object.__setattr__(self, name, value)  # they follow
+            object.__setattr__(self, name, value)  # derived from the other fields
         super().__post_init__()
         covariates = self.columns.of("known", "past", "static")
         if lost := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
@@ -94,7 +95,7 @@ class PanelSchema(Schema):
 
     @classmethod
     def under(cls, panel: Panel, cut: Cut) -> Self:
-        """The schema of a panel, whose units are those of its training sequences."""
+        """Return the schema of a panel, with units from its training sequences."""
         starts = cut.starts(panel, "train")
         ends = [panel.present(panel.series[n]) if cut.length is None else last + cut.length for n, _, last in starts]
         parts = [(panel.series[n], slice(low, end)) for (n, low, _), end in zip(starts, ends, strict=True)]
@@ -133,7 +134,7 @@ class PanelSchema(Schema):
         _warn_of_levels(panel.columns, means, named)
         shares = np.array([means[c.name] for c in panel.columns.targets if c.family == "binary"])
         spread = float(np.sqrt((shares * (1 - shares)).mean())) if len(shares) else 0.0
-        scales |= {c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"}  # one: some are rare
+        scales |= {c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"}  # some are rare
         gaps = np.concatenate(
             [np.diff(one.times[part]) if one.times is not None else np.empty(0) for one, part in parts]
         )
@@ -144,7 +145,7 @@ class PanelSchema(Schema):
 
     @property
     def protocol(self) -> Cut:
-        """How it is divided and cut."""
+        """How sequences are split and cut."""
         return self.cut
 
     @property
@@ -155,19 +156,19 @@ class PanelSchema(Schema):
     @property
     @override
     def view(self) -> View:
-        """The data as they are, and the context of the sequences for whoever reads it."""
+        """The identity, with the context as optional inputs."""
         return Offered(tuple(name for name in self.sizes if name != "x"))
 
     @property
     @override
     def emission(self) -> LawSpec:
-        """The families of the targets: one law where they are alike, else a product."""
+        """Distribution of the targets: a single one if all have the same family, else a product."""
         parts: dict[tuple[str, str], list[int]] = {}
         place = 0
         for column in self.columns.targets:
             places = list(range(place, place + len(column.coordinates)))
             place += len(places)
-            own = column.name if column.family == "category" else ""  # each category is an event of its own
+            own = column.name if column.family == "category" else ""  # each category is a separate event
             parts.setdefault((column.family, own), []).extend(places)
         if len(parts) == 1:
             ((family, _),) = parts
@@ -177,27 +178,27 @@ class PanelSchema(Schema):
     @property
     @override
     def covariates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Covariates and gaps, and what is static."""
+        """Names of covariates and gaps, and of static covariates."""
         local = tuple(name for name in (COVARIATES, GAPS) if name in self.sizes)
         return local, ((STATICS,) if STATICS in self.sizes else ())
 
     @property
     @override
     def indicators(self) -> tuple[str, ...]:
-        """x, where a target lacks entries."""
+        """("x",) if a target has missing values, else ()."""
         return ("x",) if any(column.name in self.lacking for column in self.columns.targets) else ()
 
     @property
     @override
     def together(self) -> Sequence[int]:
-        """The coordinates of a column."""
+        """Index of the column of each coordinate; all 0 if a step is observed or missing as a whole."""
         targets = enumerate(self.columns.targets)
         return [0 if whole(self.columns) else place for place, column in targets for _ in column.coordinates]
 
     @property
     @override
     def units(self) -> Mapping[str, Sequence[Coordinate]]:
-        """Of x; for what is missing stands the mean, or that of the logarithms where these are read."""
+        """Units of x; missing values are replaced by the mean, or by the mean logarithm where logarithms are read."""
         found = []
         for column in self.columns.targets:
             mean, scale = self.means.get(column.name, 0.0), self.scales.get(column.name, 1.0)
@@ -209,15 +210,15 @@ class PanelSchema(Schema):
 
     @cached_property
     def places(self) -> dict[str, int]:
-        """Of the columns in `Series.values`."""
+        """Index of each column in `Series.values`."""
         return {name: place for place, name in enumerate(self.columns.names)}
 
     def targets(self, one: Series) -> np.ndarray:
-        """x (T, D) of a sequence, NaN where missing."""
+        """Return x (T, D) of a sequence, NaN where missing."""
         return self.encoded(one.values)
 
     def encoded(self, values: np.ndarray) -> np.ndarray:
-        """x (..., D) of values (..., C) of the columns, NaN where missing."""
+        """Return x (..., D) from values (..., C) of the columns, NaN where missing."""
         columns = self.columns.targets
         places = [self.places[column.name] for column in columns]
         if all(column.family != "category" for column in columns):
@@ -225,14 +226,14 @@ class PanelSchema(Schema):
         return np.concatenate([_encoded(values[..., n], column) for n, column in zip(places, columns, strict=True)], -1)
 
     def context(self, one: Series) -> np.ndarray:
-        """c (T, C) of a sequence, of which what ends with the present goes on."""
+        """Return c (T, C) of a sequence, with future values of all covariates."""
         return self._filled(one.values, self.columns.of("known", "past"))
 
     def static(self, one: Series) -> np.ndarray:
-        """s (S,) of a sequence.
+        """Return s (S,) of a sequence.
 
         Raises:
-            ValueError: a column that changes within it.
+            ValueError: if a column changes within the sequence.
         """
         columns, values = self.columns.of("static"), one.values[:1].copy()
         for column in columns:
@@ -247,7 +248,7 @@ class PanelSchema(Schema):
         return np.asarray(found)
 
     def unforeseen(self, parts: Sequence[np.ndarray]) -> list[str]:
-        """Covariates that values (T, C) lack, and training data nowhere."""
+        """Return covariates that have missing values in parts (T, C), but not in the training data."""
         found = []
         for column in self.columns.of("known", "static"):
             gone = (np.isnan(part[:, self.places[column.name]]) for part in parts)
@@ -256,13 +257,13 @@ class PanelSchema(Schema):
         return found
 
     def gaps(self, one: Series) -> np.ndarray:
-        """d (T, 1) of a sequence, 1 at its first step."""
+        """Return d (T, 1) of a sequence, 1 at its first step."""
         if one.times is None:
             return np.ones((len(one), 1))
         return np.concatenate([[1.0], np.diff(one.times) / self.step])[:, None]
 
     def _filled(self, values: np.ndarray, columns: Sequence[Column]) -> np.ndarray:
-        """Covariates without unit and without gaps, each with its indicator, if it has one, behind it."""
+        """Return covariates standardised and without missing values, each followed by its indicator, if any."""
         parts = []
         for column in columns:
             own = values[:, self.places[column.name]]
@@ -281,7 +282,7 @@ class PanelSchema(Schema):
 
     @cached_property
     def ending(self) -> tuple[list[int], list[int]]:
-        """Coordinates of c that end with the present, and of their indicators."""
+        """Coordinates of c that are known up to the present, and of their indicators."""
         held: list[int] = []
         indicators, place = [], 0
         for column in self.columns.of("known", "past"):
@@ -294,7 +295,7 @@ class PanelSchema(Schema):
 
     @override
     def config(self) -> dict[str, Any]:
-        """The schema in JSON's types."""
+        """Return the schema as JSON types."""
         own: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
         own |= {"lacking": list(self.lacking), "step": self.step, "calendar": asdict(self.calendar)}
         return {"columns": self.columns.config(), "cut": asdict(self.cut), **own}
@@ -302,16 +303,16 @@ class PanelSchema(Schema):
     @classmethod
     @override
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """The schema that `config` wrote."""
+        """Return the schema that `config` described."""
         own = tuples(config)
         own |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
         own["logarithms"] = tuples(config["logarithms"])
-        own["calendar"] = Calendar(**config.get("calendar", {}))  # older runs keep none
+        own["calendar"] = Calendar(**config.get("calendar", {}))  # older runs have none
         return cls(**own)
 
 
 def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """The least positive value of parts (n, 1), and mean and deviation of the logarithms, of others as of that."""
+    """Return the smallest positive value of parts (n, 1), and mean and deviation of logarithms clipped to it."""
     floor = ColumnSummary.of(np.where(block > 0, block, np.nan) for block in row_blocks(parts)).least.item()
     read = ColumnSummary.of(np.log(block.astype(np.float64).clip(floor)) for block in row_blocks(parts))
     spread = float(np.sqrt(read.variance.item()))
@@ -333,7 +334,7 @@ def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequ
 
 
 def _encoded(values: np.ndarray, column: Column) -> np.ndarray:
-    """A column (...) as coordinates (..., n); NaN where missing."""
+    """Return a column (...) as coordinates (..., n), NaN where missing."""
     if column.family != "category":
         return np.asarray(values[..., None])
     found = np.asarray(values[..., None] == np.arange(len(column.classes)), float)
@@ -342,5 +343,5 @@ def _encoded(values: np.ndarray, column: Column) -> np.ndarray:
 
 
 def whole(columns: Columns) -> bool:
-    """Whether steps are observed whole or not at all."""
+    """Return whether a step is always observed or missing as a whole."""
     return any(column.family in WHOLE_STEPS for column in columns.targets)

@@ -1,4 +1,4 @@
-"""Draws of the future of a panel and of its missing entries, as tables and pictures; and scores of forecasts."""
+"""Draws of the future of a panel and of its missing values, as tables and figures; scores of forecasts."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 QUANTILES = (0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975)
-"""Of the intervals of 50, 80, 90 and 95 %, and the median."""
+"""Quantiles of the 50, 80, 90 and 95 % intervals, and the median."""
 BANDS = {0.95: 0.15, 0.8: 0.3, 0.5: 0.5}
-"""Shade of the intervals that a fan shows."""
+"""Opacity of the prediction bands in figures, by level."""
 FORMATS = (".csv", ".parquet", ".npz")
 FEW = 12
-"""Columns up to which each has a score of its own."""
+"""Maximum number of columns with a score each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +36,11 @@ class PanelForecasts:
 
     Args:
         draws: (K, N, H, D) of the coordinates.
-        past: (N, O, D) that was observed, NaN where missing.
-        truth: (N, H, D) that happened, NaN where nobody knows.
-        columns: coordinate to its unit; of a category, its shares are forecast, in a coordinate for each class.
+        past: (N, O, D), observed values, NaN where missing.
+        truth: (N, H, D), true futures, NaN where unknown.
+        columns: coordinate to its unit; a category has one coordinate per class, with its share.
         keys: (sequence, first step of the future) of each window.
-        times: (N, O + H) of the steps, see `Calendar`; None for steps.
+        times: (N, O + H) of the steps, as in `Calendar`; None for step numbers.
         calendar: kind, time zone and calendar step of the times.
     """
 
@@ -53,9 +53,9 @@ class PanelForecasts:
     calendar: Calendar = NUMBERS
 
     def table(self) -> Any:
-        """A pandas frame with a row for each window, step and coordinate: mean, quantiles, and what happened.
+        """Return a pandas frame with a row for each window, step and coordinate: mean, quantiles and truth.
 
-        Of the quantiles there are those that so many draws have, see `needed`.
+        It includes only quantiles that the number of draws supports (`needed`).
         """
         import pandas as pd
 
@@ -69,25 +69,25 @@ class PanelForecasts:
         return pd.DataFrame({**found, "truth": self.truth.ravel()})
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the table as CSV or Parquet, or the draws and all beside them as npz, whichever the name ends in.
+        """Write the table as CSV or Parquet, or all arrays as npz, by the extension of the path.
 
         Raises:
-            ValueError: another ending, or Parquet without pyarrow.
+            ValueError: if the extension is unknown, or pyarrow is missing for Parquet.
         """
         _save(self, path, draws=self.draws, past=self.past, truth=self.truth)
 
     def plot(self, window: int = 0, columns: Sequence[str] | None = None, most: int = 8) -> Figure:
-        """A fan for each coordinate: intervals of 50, 80 and 95 % and the median, after the past and beside the truth.
+        """Plot prediction bands (50, 80, 95 %) and the median of each coordinate, with the past and the truth.
 
-        Of what is 0 or 1 there is the share of the draws. Intervals that need more draws, see `needed`, are left out.
+        For binary values, the plot shows the share of the draws. Intervals that need more draws are omitted (`needed`).
 
         Args:
-            window: which.
-            columns: which coordinates; the first ones, if not given.
-            most: panels.
+            window: index of the window.
+            columns: names of the coordinates; by default the first ones.
+            most: maximum number of panels.
 
         Raises:
-            ValueError: coordinates that there are not.
+            ValueError: if a coordinate does not exist.
         """
         names = list(self.columns)
         for name in columns or ():
@@ -105,7 +105,7 @@ class PanelForecasts:
             axis.tick_params(labelsize=7)
         for axis in panels[len(chosen) :]:
             axis.set_axis_off()
-        for axis in panels[max(len(chosen) - across, 0) : len(chosen)]:  # below which there is none
+        for axis in panels[max(len(chosen) - across, 0) : len(chosen)]:  # the lowest panel of each column
             axis.tick_params(labelbottom=True)
         known = [axis.get_legend_handles_labels() for axis in panels[: len(chosen)]]
         handles, labels = max(known, key=lambda entry: len(entry[1]))
@@ -114,14 +114,14 @@ class PanelForecasts:
         return figure
 
     def fan(self, axis: Axes, window: int, column: str) -> None:
-        """Draws one coordinate of a window on axes of one's own, as `plot` does on its panels."""
+        """Plot one coordinate of a window on given axes, as `plot` does."""
         place = list(self.columns).index(column)
         observed, horizon = self.past.shape[1], self.draws.shape[2]
         steps: Any = np.arange(observed + horizon) if self.times is None else self.times[window]
         if dated := self.times is not None and self.calendar.kind == "dates":
             steps = self.calendar.shown(steps)
         before, after, draws = steps[:observed], steps[observed:], self.draws[:, window, :, place]
-        if np.isin(self.draws[..., place], (0, 1)).all():  # no fan, but how many
+        if np.isin(self.draws[..., place], (0, 1)).all():  # binary: a share instead of bands
             axis.plot(after, draws.mean(0), "C0", linewidth=1.2)
             axis.set_ylabel("share", fontsize=8)
             axis.set_ylim(-0.05, 1.05)
@@ -145,14 +145,14 @@ class PanelForecasts:
 
 @dataclass(frozen=True, eq=False)
 class PanelImputed:
-    """Draws of what is missing in windows or sequences.
+    """Draws of the missing values of windows or sequences.
 
     Args:
-        draws: (K, N, T, D) of the coordinates, in all of which what was observed is as it was.
+        draws: (K, N, T, D) of the coordinates; observed values are equal in all draws.
         lacking: (N, T, D), True where a coordinate is missing.
         columns: coordinate to its unit.
-        keys: (sequence, first step) of each.
-        times: (N, T) of the steps, see `Calendar`; None for steps.
+        keys: (sequence, first step) of each window.
+        times: (N, T) of the steps, as in `Calendar`; None for step numbers.
         calendar: kind, time zone and calendar step of the times.
     """
 
@@ -164,7 +164,7 @@ class PanelImputed:
     calendar: Calendar = NUMBERS
 
     def table(self) -> Any:
-        """A pandas frame with a row for each missing entry: mean, and quantiles that so many draws have (`needed`)."""
+        """Return a pandas frame with a row for each missing entry: mean, and quantiles as in `PanelForecasts.table`."""
         import pandas as pd
 
         window, step, place = np.nonzero(self.lacking)
@@ -174,54 +174,58 @@ class PanelImputed:
         return pd.DataFrame(found | _columns(self.columns, place) | _quantiles(self.draws[:, window, step, place]))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the table as CSV or Parquet, or the draws and all beside them as npz, whichever the name ends in.
+        """Write the table as CSV or Parquet, or all arrays as npz, by the extension of the path.
 
         Raises:
-            ValueError: another ending, or Parquet without pyarrow.
+            ValueError: if the extension is unknown, or pyarrow is missing for Parquet.
         """
         _save(self, path, filled=self.draws, observed=~self.lacking)
 
 
 def needed(quantile: float) -> int:
-    """The fewest draws of which some lie beyond a quantile: 39 for that of 2.5 %, 1 for the median."""
+    """Return the smallest number of draws that determines a quantile: 39 for 2.5 %, 1 for the median.
+
+    With fewer draws, the quantile lies beyond all of them.
+    """
     return 1 if quantile == 0.5 else reaching(abs(1 - 2 * quantile))
 
 
 def _rows(keys: Sequence[tuple[str, int]], window: np.ndarray, step: np.ndarray) -> dict[str, Any]:
-    """Sequences and steps by windows and steps in these."""
+    """Return table columns with the sequence and step of each window and step."""
     names, first = zip(*keys, strict=True)
     return {"sequence": np.array(names, object)[window], "step": np.array(first)[window] + step}
 
 
 def _columns(columns: Mapping[str, str], place: np.ndarray) -> dict[str, np.ndarray]:
-    """Names and units of coordinates by their places."""
+    """Return table columns with the name and unit of each coordinate."""
     names, units = (np.array(list(each), object) for each in (columns, columns.values()))
     return {"column": names[place], "unit": units[place]}
 
 
 def column_of(quantile: float) -> str:
-    """What a quantile is called in tables."""
+    """Return the name of a quantile in tables."""
     return f"q{1000 * quantile:03.0f}"
 
 
 def _quantiles(draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Mean of draws (K, N), and the quantiles that K draws have."""
+    """Return the mean of draws (K, N), and the quantiles that K draws support."""
     levels = [level for level in QUANTILES if needed(level) <= len(draws)]
     named = dict(zip(map(column_of, levels), _quantile(draws, levels), strict=True))
     return {"mean": draws.mean(0, dtype=np.float64), **named}
 
 
 def _quantile(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
-    """Of draws (K, ...), at mean ranks k / (K + 1): intervals hold what is exchangeable with them at their level.
+    """Return quantiles of draws (K, ...) at mean ranks k / (K + 1).
 
-    As those of `metrics.coverage`; numpy's own run from draw to draw, (k - 1) / (K - 1), and are too narrow.
+    With these ranks, intervals contain exchangeable values at their nominal level, as in `metrics.coverage`. NumPy's
+    default ranks (k - 1) / (K - 1) span only the range of the draws, and its intervals are too narrow.
     """
     found: np.ndarray = np.quantile(draws, levels, axis=0, method="weibull")
     return found
 
 
 def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **arrays: np.ndarray) -> None:
-    """Writes a table, or arrays with what says of which sequences, steps and columns they are."""
+    """Write a table, or arrays with the sequences, steps and columns that they belong to."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         raise ValueError(f"{path} ends in none of {', '.join(FORMATS)}")
@@ -244,9 +248,9 @@ def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **
 
 
 def panel_scores(windows: HeldOutWindows) -> list[Measure]:
-    """Proper scores and calibration, and the CRPS of each column in its unit where there are a few.
+    """Return proper scores and calibration, and, for a few columns, the CRPS of each column in its unit.
 
-    What the command line prints: `dvae.evaluate(model, windows, scores=dvae.tables.panel_scores)`.
+    The command line prints these scores: `dvae.evaluate(model, windows, scores=dvae.tables.panel_scores)`.
     """
     columns = columns_of(windows)
     found = [*calibrated(windows), *(by_column(CRPS, columns) if 1 < len(columns) <= FEW else [])]

@@ -1,4 +1,4 @@
-"""Read a column of a table as float64 numbers, and report every cell that is not one."""
+"""Parse a column of a table as float64 numbers, and report every other cell."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Numbers:
     """A column as numbers.
 
     Args:
-        values: (N,) float64, NaN where a cell is missing or no number.
+        values: (N,) float64, NaN where a cell is missing or not a number.
         wrong: (N,) True where a cell is neither a number nor missing.
-        marks: cells of `MARKS` that are read as missing, with their row and how many there are.
-        ambiguous: a cell whose value depends on the decimal sign, where the column does not show it.
+        marks: cells in `MARKS` that are read as missing, with their first row and their count.
+        ambiguous: a cell whose value depends on the decimal sign, if the column does not determine it.
     """
 
     values: np.ndarray
@@ -50,14 +50,14 @@ class Numbers:
         return not self.wrong.any() and bool((~np.isnan(self.values)).any())
 
     def check(self, column: Any, how: str) -> None:
-        """Raise an error that names a cell that is no number, and what to do.
+        """Raise an error that names a cell that is not a number, and a remedy.
 
         Args:
-            column: that was read.
-            how: another way to settle it.
+            column: the column that was read.
+            how: additional remedy for the message.
 
         Raises:
-            ValueError: cells that are no numbers, or that depend on the decimal sign.
+            ValueError: if cells are not numbers, or depend on the decimal sign.
         """
         if self.ambiguous is not None:
             plain = self.ambiguous.replace(",", "").replace(".", "")
@@ -80,14 +80,14 @@ class Numbers:
 def read_numbers(
     column: Any, na_values: Sequence[str] = (), decimal: str | None = None, hint: str | None = None
 ) -> Numbers:
-    """Read a pandas column as numbers: numbers, Booleans, decimals, and texts of them.
+    """Parse a pandas column as numbers, from numbers, Booleans, decimals and text.
 
     Args:
         column: (N,) of any type.
         na_values: texts or numbers that mark missing values.
         decimal: "." or ",", the decimal sign of texts; None to infer it from the column.
-        hint: decimal sign that the rest of the file shows; "" if it shows none and 1.234 may be 1234; None if dots are
-            decimal signs.
+        hint: decimal sign of the rest of the file; "" if unknown, so that 1.234 may be 1234; None if dots are decimal
+            signs.
     """
     import pandas as pd
 
@@ -104,8 +104,8 @@ def read_numbers(
             plain[np.isin(plain, sentinels)] = np.nan
             return Numbers(plain, np.zeros(len(column), bool), {})
     try:
-        codes, cells = pd.factorize(column.astype(object))  # each different cell is read once
-    except TypeError:  # of lists
+        codes, cells = pd.factorize(column.astype(object))  # parses each distinct cell once
+    except TypeError:  # cells that are lists
         return Numbers(nothing, column.notna().to_numpy(), {})
     cells = [cell.strip() if isinstance(cell, str) else cell for cell in cells]
     absent = np.array([isinstance(cell, str) and (cell.lower() in NA or cell in na_values) for cell in cells], bool)
@@ -116,7 +116,7 @@ def read_numbers(
     found[~(absent | marked)] = own
     wrong = np.isnan(found) & ~absent
     if not np.isnan(own).all():
-        wrong &= ~marked  # without any number, a mark is a text
+        wrong &= ~marked  # a mark is text in a column without numbers
     found[np.isin(found, sentinels)] = np.nan
     said = {}
     for place in np.flatnonzero(marked & ~wrong):
@@ -126,9 +126,9 @@ def read_numbers(
 
 
 def decimal_sign(frame: Any) -> str:
-    """Return the decimal sign that the first rows of a frame of texts show, "" if they show none or both.
+    """Return the decimal sign in the first rows of a frame of texts; "" if they determine none or both.
 
-    A column shows it if all its numbers can be read with one of the signs only.
+    A column determines it if only one of the signs can parse all its numbers.
     """
     shown, rows = set(), max(20, 50_000 // max(frame.shape[1], 1))
     for name in frame:
@@ -140,7 +140,7 @@ def decimal_sign(frame: Any) -> str:
 
 
 def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[np.ndarray, str | None]:
-    """Return the numbers of different cells, NaN for others, and a cell that two decimal signs read differently."""
+    """Return the numbers of distinct cells, NaN for others, and a cell that is ambiguous between the decimal signs."""
     words = [cell for cell in cells if isinstance(cell, str)]
     if words and len(words) == len(cells) and {word.lower() for word in words} <= {"true", "false"}:
         return np.array([word.lower() == "true" for word in words], float), None
@@ -161,17 +161,17 @@ def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[n
 
 
 def _has_large_whole(values: np.ndarray) -> bool:
-    """Whether some number is whole and of three digits or more: 1.000 after 999 is no fraction."""
+    """Return whether some number is an integer of three digits or more: 1.000 after 999 is no fraction."""
     return bool(((np.abs(values) >= 100) & (values == np.trunc(values))).any())
 
 
 def _parsed(cells: list[Any], decimal: str) -> np.ndarray:
-    """Each cell as float64, exactly as Python reads it; NaN where it is no number."""
+    """Parse each cell as float64, exactly as Python does; NaN if it is not a number."""
     return np.array([_number(cell, decimal) for cell in cells], np.float64)
 
 
 def _plain(cells: np.ndarray) -> np.ndarray | None:
-    """Return cells as Python reads them, None where some are no numbers; Python also reads 1_000."""
+    """Return cells as Python parses them, or None if some are not numbers or contain an underscore, as in 1_000."""
     try:
         values = cells.astype(np.float64)
     except (TypeError, ValueError, OverflowError):

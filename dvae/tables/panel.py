@@ -1,15 +1,15 @@
-"""Panel: sequences of several columns, made of whatever holds them.
+"""Panel: sequences of several columns, built from common data structures.
 
 | from | how |
 |---|---|
-| pandas, long | one row for each sequence and step: `Panel.of(frame, columns)`, with `id` and `time`, or in its index |
-| pandas, wide | one row for each step, one column for each sequence: `Panel.wide(frame)` |
-| numpy, torch | (N, T, D), or (T, D) of one sequence |
-| a list of such | sequences of different lengths (T_n, D) |
-| xarray | a `Dataset` whose variables share a dimension of time, and perhaps one of sequences |
+| pandas, long | one row per sequence and step: `Panel.of(frame, columns)`, with `id` and `time`, or in its index |
+| pandas, wide | one row per step, one column per sequence: `Panel.wide(frame)` |
+| numpy, torch | (N, T, D), or (T, D) for one sequence |
+| a list of arrays | sequences of different lengths (T_n, D) |
+| xarray | a `Dataset` whose variables share a time dimension, and optionally a sequence dimension |
 
-All are copied but for arrays that are mapped from a disk (`numpy.memmap`), which may be larger than memory: these stay
-where they are, and are read in blocks and windows.
+All data are copied, except arrays mapped from disk (`numpy.memmap`), which may be larger than memory. These are read in
+blocks and windows.
 """
 
 from __future__ import annotations
@@ -36,10 +36,13 @@ from .proposing import LARGEST, TIMES, Told, is_date
 
 SPLITS = ("train", "validation", "test")
 COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
-"""Families of whole numbers."""
+"""Families of counts."""
 RUN, CHANGES = 4, 5
-"""Rows of an increasing run on average, and changes from one run to another in the order of time for each step back in
-time, above which the runs are recordings whose times overlap. Below, they are rows of one sequence in disorder."""
+"""Thresholds for rows out of time order.
+
+RUN is the mean number of rows in an increasing run; CHANGES is the number of changes between runs in time order, for
+each step back in time. Above both, the runs are recordings with overlapping times; otherwise, one unsorted sequence.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +50,12 @@ class Series:
     """One sequence.
 
     Args:
-        name: that tells it from the others.
-        values: (T, C) of the columns, float64, or any real numbers that are mapped; a category as the index of its
-            class; NaN where missing.
-        times: (T,) of the steps, increasing, see `Calendar`; None for steps 0, 1, …
-        group: that it belongs to.
-        split: "train", "validation" or "test", where the data say it.
+        name: unique name.
+        values: (T, C) of the columns, in float64, or mapped values of any real type; a category is the index of its
+            class, NaN a missing value.
+        times: (T,) of the steps, increasing, as in `Calendar`; None for steps 0, 1, …
+        group: name of its group.
+        split: "train", "validation" or "test", if the data define it.
     """
 
     name: str
@@ -65,7 +68,7 @@ class Series:
         return len(self.values)
 
     def moments(self, start: int, steps: int, calendar: Calendar) -> np.ndarray | None:
-        """Return the times (steps,) from a step on, continued after the end by `Calendar.after`."""
+        """Return the times of `steps` steps from `start` on, continued after the end by `Calendar.after`."""
         if self.times is None:
             return None
         own = self.times[start : start + steps]
@@ -74,18 +77,18 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Sequences of the same columns.
+    """Sequences with the same columns.
 
     Args:
         series: the sequences.
-        columns: what their columns are.
-        name: for titles.
-        calendar: kind, time zone and calendar step of their times.
-        complete: names of mapped sequences, in which nothing can change, that lack no value of a target; found.
+        columns: schema of the columns.
+        name: name for titles.
+        calendar: kind, time zone and calendar step of the times.
+        complete: names of mapped sequences without missing targets, computed once since mapped data are read-only.
 
     Raises:
-        ValueError: sequences that are empty, of other columns, of one name, out of order, or with values that their
-            column cannot have.
+        ValueError: if sequences are empty, have other columns, share a name, are out of order, or have values that are
+            invalid for their column.
     """
 
     series: Sequence[Series]
@@ -114,7 +117,7 @@ class Panel:
         object.__setattr__(self, "complete", self._checked())
 
     def _checked(self) -> frozenset[str]:
-        """Refuses what the family of a column does not have; finds what is complete."""
+        """Check that values are valid for the family of their column; return the names of complete mapped sequences."""
         kinds: dict[tuple[str, int], list[int]] = {}
         for place, column in enumerate(self.columns.columns):
             kinds.setdefault((column.family, len(column.classes)), []).append(place)
@@ -125,7 +128,7 @@ class Panel:
             for places in kinds.values():
                 own, (right, said) = block[:, places], _admitted(self.columns.columns[places[0]])
                 with np.errstate(invalid="ignore", over="ignore"):
-                    seen = right(own.astype(np.float32))  # as models compute
+                    seen = right(own.astype(np.float32))  # in the precision of models
                 wrong = ~(seen & (np.abs(own) < LARGEST)) & ~absent[:, places]
                 if wrong.any():
                     row, nth = np.argwhere(wrong)[0]
@@ -147,7 +150,7 @@ class Panel:
 
     @cached_property
     def _targets(self) -> list[int]:
-        """Places of the columns that are targets."""
+        """Indices of the target columns."""
         return [place for place, column in enumerate(self.columns.columns) if column.role == "target"]
 
     def __len__(self) -> int:
@@ -163,7 +166,7 @@ class Panel:
         return f"Panel({self.name}: {len(self)} sequences of {steps} steps{times}; {', '.join(self.columns.names)})"
 
     def fingerprint(self) -> str:
-        """SHA-256 of what the columns are and what the sequences hold."""
+        """Return the SHA-256 of the columns and the sequences."""
         digest = hashlib.sha256(repr(self.columns).encode())
         for one in self.series:
             digest.update(repr((one.name, one.group, one.split, one.values.shape)).encode())
@@ -174,12 +177,12 @@ class Panel:
 
     @property
     def missing(self) -> bool:
-        """Whether some value of a target is."""
+        """Whether a value of a target is missing."""
         some = (one.values for one in self.series if one.name not in self.complete)
         return any(bool(np.isnan(block[:, self._targets]).any()) for block in row_blocks(some))
 
     def present(self, one: Series) -> int:
-        """Steps of a sequence up to the last one that has a target; rows behind it are of the future."""
+        """Return the number of steps up to the last one with a target; later rows belong to the future."""
         if one.name in self.complete:
             return len(one)
         for rows in reversed([*ranges(one.values)]):
@@ -190,14 +193,14 @@ class Panel:
 
     @property
     def groups(self) -> list[str]:
-        """Names of the groups, in order."""
+        """Sorted names of the groups."""
         return sorted({one.group for one in self.series})
 
     def only(self, names: Iterable[str]) -> Panel:
-        """Some of the sequences.
+        """Return some of the sequences.
 
         Raises:
-            ValueError: one that is not there.
+            ValueError: if a sequence does not exist.
         """
         own, names = {one.name: one for one in self.series}, list(names)
         for name in names:
@@ -207,17 +210,17 @@ class Panel:
 
     @classmethod
     def of(cls, data: Any, columns: Columns | Told | Sequence[str] | None = None, name: str = "panel") -> Panel:
-        """A table of whatever holds one; see the file.
+        """Build a panel from a common data structure.
 
         Args:
             data: a pandas frame in the long form, arrays, a list of arrays, or an xarray `Dataset`.
-            columns: what the columns are: a schema, or targets in words, see `Told`, and the rest as it is proposed; of
-                arrays a schema; names, of real targets; or nothing, for names x0, x1, …
-            name: for titles.
+            columns: a schema, or targets as in `Told`, with the rest inferred. For arrays, a schema, or names of real
+                targets; by default x0, x1, …
+            name: name for titles.
 
         Raises:
-            TypeError: data of another kind.
-            ValueError: columns that the data do not have, or values that are none.
+            TypeError: if the data have another type.
+            ValueError: if the data have no such columns, or values are invalid.
         """
         if isinstance(data, Panel):
             if isinstance(columns, Columns) and columns != data.columns:
@@ -267,13 +270,13 @@ class Panel:
 
     @classmethod
     def wide(cls, data: Any, column: Column | None = None, name: str = "panel", zone: str | None = None) -> Panel:
-        """A table of a pandas frame with one row for each step and one column for each sequence of one variable.
+        """Build a panel from a pandas frame with one row per step and one column per sequence of a single variable.
 
         Args:
-            data: whose index is the time, where it is of numbers, dates or durations.
-            column: what all of them hold; a real target named "value", if not given.
-            name: for titles.
-            zone: time zone of dates in the index, see `Columns`.
+            data: the frame; an index of numbers, dates or durations is the time.
+            column: description of the variable; by default a real target named "value".
+            name: name for titles.
+            zone: time zone of dates in the index, as in `Columns`.
         """
         index, when, calendar = data.index.to_series(name=data.index.name or "index"), None, Calendar()
         if is_number(index) or is_date(index) or is_duration(index):
@@ -284,7 +287,7 @@ class Panel:
         series = []
         for each, held in data.items():
             values = numeric(held, own)
-            known = np.flatnonzero(~np.isnan(values))  # columns may begin and end at different times
+            known = np.flatnonzero(~np.isnan(values))  # columns may start and end at different times
             if len(known):
                 part = slice(known[0], known[-1] + 1)
                 series.append(Series(str(each), values[part, None], None if when is None else when[part]))
@@ -292,10 +295,10 @@ class Panel:
 
 
 def plain_columns(columns: Columns | Told | Sequence[str] | None, size: int) -> Columns:
-    """Columns of arrays: as told, or real targets x0, x1, …
+    """Return columns of arrays: as given, or real targets x0, x1, …
 
     Raises:
-        ValueError: something is told that arrays do not have, such as a time.
+        ValueError: if a given entry does not apply to arrays, such as a time.
     """
     if isinstance(columns, Told):
         if strange := [name for name, value in vars(columns).items() if value and name != "columns"]:
@@ -314,7 +317,7 @@ def plain_columns(columns: Columns | Told | Sequence[str] | None, size: int) -> 
 
 
 def _admitted(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
-    """Which values the family of a column has, NaN left aside, and that in words."""
+    """Return a test for the values of a column's family, except NaN, and its description."""
     tests: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
         "category": (lambda v: _counts(v) & (v < len(column.classes)), "the places of its classes"),
         "binary": (lambda v: (v == 0) | (v == 1), "0 or 1"),
@@ -333,7 +336,7 @@ def _counts(values: np.ndarray) -> np.ndarray:
 
 
 def _of_grid(data: Any, columns: Columns | Told) -> tuple[Any, Columns | Told]:
-    """An xarray as a frame; where nothing is told of them, its dimensions are time, and what parts sequences."""
+    """Return an xarray as a frame; by default one dimension is the time and the others identify sequences."""
     data = data if hasattr(data, "data_vars") else data.to_dataset(name=data.name or "x")
     frame, dims = data.to_dataframe().reset_index(), [str(name) for name in data.dims]
     if isinstance(columns, Told) and dims:
@@ -344,7 +347,7 @@ def _of_grid(data: Any, columns: Columns | Told) -> tuple[Any, Columns | Told]:
 
 
 def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
-    """The sequences of a frame in the long form, and what their times are."""
+    """Return the sequences of a frame in the long form, and their calendar."""
     if lacking := [name for name in columns.needed if name not in frame.columns]:
         known = [str(name) for name in frame.columns]
         raise ValueError(
@@ -391,7 +394,7 @@ def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
 
 
 def _order(keys: Any) -> np.ndarray:
-    """Places of ids (N, K) in order: numbers by size, also those in text, others by their text, missing ones last."""
+    """Return the sorted order of ids (N, K): numbers by size, also in text, then other texts; missing ones last."""
     levels: list[np.ndarray] = []
     for name in keys:
         read, said = read_numbers(keys[name]), texts(keys[name])
@@ -401,10 +404,10 @@ def _order(keys: Any) -> np.ndarray:
 
 
 def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, column: str | None) -> np.ndarray:
-    """Rows of a sequence in the order of their times.
+    """Return the rows of a sequence in time order.
 
     Raises:
-        ValueError: two rows of one time, or recordings whose times overlap, one after the other.
+        ValueError: if two rows have the same time, or consecutive recordings overlap in time.
     """
     if (np.diff(when[rows]) > 0).all():
         return rows
@@ -424,10 +427,10 @@ def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, c
         first, second = sorted(found[np.argmax(twice) :][:2])
         raise ValueError(f"{who} has two rows at {column} {calendar.text(when[first])}, {first} and {second}; {advice}")
     back = np.concatenate([[False, False, False], np.diff(when[rows]) < 0])
-    ends = np.where(back[2:], ~back[1:-1], back[1:-1] & back[:-2])  # of runs of increasing or decreasing times
-    run = np.cumsum(ends)  # number of the run that a row is in
+    ends = np.where(back[2:], ~back[1:-1], back[1:-1] & back[:-2])  # ends of increasing or decreasing runs
+    run = np.cumsum(ends)  # index of the run of each row
     overlap = len(rows) >= RUN * (run[-1] + 1) and (np.diff(run[order]) != 0).sum() > CHANGES * run[-1]
-    if overlap or calendar.kind == "durations":  # clocks pass midnight
+    if overlap or calendar.kind == "durations":  # clocks restart at midnight
         last, row = rows[np.argmax(run) - 1 :][:2]
         raise ValueError(
             f"{who} goes back from {column} {calendar.text(when[last])} in row {last} to {calendar.text(when[row])} in "

@@ -1,4 +1,4 @@
-"""What the columns of a pandas frame hold: numbers, texts or times."""
+"""Parse the columns of a pandas frame as numbers, texts or times."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .columns import Column
 from .numerals import read_numbers
 
 LONGEST = 64
-"""Characters of a date; patterns are tried on none that is longer."""
+"""Maximum characters of a date; longer text is not matched."""
 MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 WANTED = "2024-12-31"
 _DAY = r"(?P<day>\d{1,2})(?:st|nd|rd|th)?"
@@ -40,18 +40,18 @@ WRITTEN = [
         rf"{_WORD}[-/.,\s]{{0,2}}(?P<year>\d{{4}})",
     )
 ]
-"""How dates are written that are not as in ISO 8601, each column in one of these ways."""
+"""Date formats other than ISO 8601; a column has one of these formats."""
 _OFFSET = re.compile(r"[T :]\d\d[\d:.]*\s?(z|utc|gmt|[-+]\d[\d:]{1,4})$", re.IGNORECASE | re.ASCII)
-"""The offset from UTC at the end of a date."""
+"""Offset from UTC at the end of a date."""
 _DURATION = re.compile(r"[-+]?(?:\d{1,6} days?,? ?)?[-+]?\d{1,6}:\d\d:\d\d(?:\.\d{1,9})?|[-+]?\d{1,6} days?", re.ASCII)
 
 
 class Unread(ValueError):
-    """Texts of which some are no dates as the others are.
+    """Some texts of a column are not dates like the others.
 
     Args:
-        cells: of a column.
-        wrong: (N,) True where a cell is no date.
+        cells: cells of the column.
+        wrong: (N,) True where a cell is not a date.
     """
 
     def __init__(self, cells: Any, wrong: np.ndarray):
@@ -63,21 +63,21 @@ class Unread(ValueError):
 
 
 class Undecided(ValueError):
-    """Dates that can be read in several ways, such as with the day or the month first."""
+    """Dates are ambiguous, such as between day first and month first."""
 
 
 def is_number(column: Any) -> bool:
-    """Whether a column is of numbers, or of true and false."""
+    """Return whether a column contains numbers or Booleans."""
     import pandas as pd
 
     return bool(pd.api.types.is_numeric_dtype(column))
 
 
 def tabular(data: Any) -> Any:
-    """A frame whose columns have names, its index among them where that has a name or holds dates.
+    """Return a frame whose columns have names; an index with a name or with dates becomes a column.
 
     Raises:
-        ValueError: two columns of one name.
+        ValueError: if two columns share a name.
     """
     import pandas as pd
 
@@ -85,7 +85,7 @@ def tabular(data: Any) -> Any:
     frame = frame.set_axis([str(name) for name in frame.columns], axis=1)
     columns, levels = [*frame.columns], []
     for name, level in index_levels(data):
-        kept = columns.count(name) == 1 and level.equals(pd.Index(frame[name]))  # by set_index(drop=False)
+        kept = columns.count(name) == 1 and level.equals(pd.Index(frame[name]))  # from set_index(drop=False)
         if not kept:
             levels.append((name, level))
     names = [*(name for name, _ in levels), *columns]
@@ -101,7 +101,7 @@ def tabular(data: Any) -> Any:
 
 
 def index_levels(data: Any) -> list[tuple[str, Any]]:
-    """Return names and values of the index that are columns of a table: several levels, or one with a name or dates."""
+    """Return names and values of index levels that become columns: several levels, or one with a name or dates."""
     import pandas as pd
 
     found = []
@@ -115,21 +115,21 @@ def index_levels(data: Any) -> list[tuple[str, Any]]:
 
 
 def texts(column: Any) -> Any:
-    """The values as texts, missing ones missing: whole numbers are written alike in columns that lack some and not."""
+    """Return the values as text, with missing ones missing; integers look alike with and without missing values."""
     if column.dtype.kind == "f" and (known := column.dropna()).abs().lt(2**53).all() and (known % 1 == 0).all():
         column = column.astype("Int64")
     return column.astype(str).where(column.notna())
 
 
 def dates(column: Any) -> Any:
-    """Dates, in their time zone if they have one.
+    """Parse dates, in their time zone if they have one.
 
-    They are written as in ISO 8601, with a month in English, or in digits of which some tell the day from the month.
-    Dates with several offsets from UTC are in UTC.
+    Accepted formats are ISO 8601, dates with English month names, and digits if some values determine day and month.
+    Dates with several offsets from UTC are converted to UTC.
 
     Raises:
-        Undecided: day, month and year in digits, and nothing that tells which is which, or an offset from UTC for some.
-        TypeError, ValueError: a column that holds something else, or dates that are written in several ways.
+        Undecided: if nothing determines the order of day, month and year, or only some dates have an offset from UTC.
+        TypeError, ValueError: if the column contains other values, or dates in several formats.
     """
     import pandas as pd
 
@@ -163,12 +163,12 @@ def dates(column: Any) -> Any:
 
 
 def _offsets(said: Any) -> Any:
-    """Offsets from UTC of dates as they are written, missing where a date has none."""
+    """Return offsets from UTC in dates as text, missing where a date has none."""
     return said.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
 
 
 def compact(numbers: np.ndarray) -> Any:
-    """Dates of whole numbers that are written as 20241231 or 202412; None where some are not."""
+    """Parse integers such as 20241231 or 202412 as dates; None if some are not dates."""
     import pandas as pd
 
     least, most = (numbers.min(), numbers.max()) if len(numbers) and (numbers % 1 == 0).all() else (0, 0)
@@ -180,7 +180,7 @@ def compact(numbers: np.ndarray) -> Any:
 
 
 def is_duration(column: Any) -> bool:
-    """Whether a column holds durations, or texts of them such as "1 days 02:00:00" or "02:00:00"."""
+    """Return whether a column contains durations, or text such as "1 days 02:00:00" or "02:00:00"."""
     known = column.dropna()
     return column.dtype.kind == "m" or bool(
         len(known) and not is_number(column) and known.astype(str).str.strip().str.fullmatch(_DURATION).all()
@@ -188,7 +188,7 @@ def is_duration(column: Any) -> bool:
 
 
 def _as_iso(said: Any) -> Any:
-    """Texts, of which the first is a date in another way, in that of ISO 8601; others as they are."""
+    """Convert texts to ISO 8601 if the first is a date in another format; otherwise return them unchanged."""
     import pandas as pd
 
     fitting = (way for first in said[:1] if len(first) <= LONGEST for way in WRITTEN if way.fullmatch(first))
@@ -201,7 +201,7 @@ def _as_iso(said: Any) -> Any:
         parts = parts.rename(columns=_order(parts, said[0]))
     if "word" in parts:
         parts["month"] = parts.word.str.lower().map({name: str(place) for place, name in enumerate(MONTHS, 1)})
-        century = parts.year.lt("69").map({True: "20", False: "19"})  # as POSIX has it
+        century = parts.year.lt("69").map({True: "20", False: "19"})  # the POSIX rule
         parts["year"] = parts.year.where(parts.year.str.len() != 2, century + parts.year)
     if "quarter" in parts:
         parts["month"] = (3 * parts.quarter.astype(int) - 2).astype(str)
@@ -219,7 +219,7 @@ def _as_iso(said: Any) -> Any:
 
 
 def _order(parts: Any, example: str) -> dict[str, str]:
-    """Which of two numbers is the day: that above 12."""
+    """Return which of two numbers is the day: a number above 12."""
     first, second = (parts[name].astype(int).max() > 12 for name in ("first", "second"))
     if first and second:
         raise ValueError(f"some begin with the day and others with the month; write dates as {WANTED}")
@@ -238,12 +238,12 @@ def times(
 
     Args:
         column: numbers, dates or durations.
-        zone: time zone of dates; those without an offset from UTC are what its clocks show.
-        sequences: rows of each sequence, whose order tells the first of two equal hours from the second; by default
-            all rows are one.
+        zone: time zone of dates without an offset from UTC.
+        sequences: rows of each sequence; their order distinguishes the two hours when clocks are set back. By default,
+            all rows are one sequence.
 
     Raises:
-        ValueError: something else, or rows without.
+        ValueError: if the values have another type, or a row has no time.
     """
     import pandas as pd
 
@@ -278,10 +278,10 @@ def times(
 
 
 def _localized(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, column: Any) -> Any:
-    """Dates as moments in the zone whose clocks show them.
+    """Return local times as moments in a zone.
 
     Raises:
-        ValueError: an hour that the clocks skip, or show twice where its sequence does not.
+        ValueError: if a time is skipped by a clock change, or occurs twice and its sequence does not resolve it.
     """
     shown_twice = local.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward").isna() & local.notna()
     moments = local.tz_localize(zone, ambiguous=np.ones(len(local), bool), nonexistent="NaT")
@@ -307,16 +307,16 @@ def _localized(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, co
 
 
 def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: str | None = None) -> np.ndarray:
-    """Return the values as numbers, NaN where missing; a category is the index of its class.
+    """Return the values as numbers, NaN if missing; a category is the index of its class.
 
     Args:
         column: (N,) of any type.
-        told: what it holds.
-        na_values: further texts or numbers that mark missing values; one that is a class is that class.
+        told: description of the column.
+        na_values: further texts or numbers that mark missing values; a listed class remains a class.
         decimal: "." or ",", the decimal sign of texts.
 
     Raises:
-        ValueError: values that are none.
+        ValueError: if values are invalid for the column.
     """
     if told.family == "category":
         places = {each: place for place, each in enumerate(told.classes)}
@@ -345,7 +345,7 @@ def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: s
 
 
 def said_of_marks(marks: Mapping[str, tuple[int, int]]) -> str:
-    """Say which cells of a column of numbers are read as missing."""
+    """Describe the cells of a column of numbers that are read as missing."""
     cells = ", ".join(f"{brief(mark)} (row {row}, {count} in all)" for mark, (row, count) in marks.items())
     listed = ", ".join(f'"{mark}"' for mark in marks)
     return f"holds {cells} among numbers, read as missing; na_values = [{listed}] says so without this warning"

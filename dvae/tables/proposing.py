@@ -1,4 +1,4 @@
-"""Proposals: what the columns of a table that nobody described probably are, to be read and corrected by a person."""
+"""Proposals: guesses of each column's type and role, as a schema that you can edit."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from .parsing import (
 )
 
 CLASSES = 20
-"""Most different texts of a category; more are an id, or a text."""
+"""Maximum number of distinct texts of a category; columns with more are ids or free text."""
 SPREAD = 1.5
-"""Variance over mean above which counts vary more than Poisson's."""
+"""Ratio of variance to mean above which counts are overdispersed."""
 LARGEST = 1e30
-"""Of all values; models compute in float32."""
+"""Bound on absolute values, since models compute in float32."""
 TIMES = re.compile(
     r"(^|_)(time|date|datetime|timestamp|day|week|month|quarter|year|hour|minute|second|step|frame|t|ds)(_|$)"
 )
@@ -45,17 +45,17 @@ IDS = re.compile(r"(^|_)(id|unique_id|series|sequence|subject|station|store|item
 ROWS = re.compile(r"no\.?|nr\.?|num|number|row|row_?(id|no|nr|num|number)|index|idx|obs|#", re.IGNORECASE)
 """Names of columns that only number the rows."""
 COVERAGE = 0.6
-"""Share of the steps between its first and its last that a sequence has, where a text tells sequences apart."""
+"""Minimum share of steps between its first and last at which a sequence has a row, if its id is text."""
 MOST_HEADERS = 4
-"""Rows of names at the top of a file."""
+"""Maximum number of header rows in a file."""
 DATE = r"\d{4}|\d\W{1,2}\d|\d[-/. ]?[A-Za-z]{3}"
-"""What every date has somewhere."""
+"""Pattern that every date contains."""
 PART_OF_TIME = re.compile(r"\d{1,3}:\d\d([:.]\d+)*\s?([ap]\.?m\.?)?", re.IGNORECASE)
-"""Clocks, and minutes with seconds, none of which says a date."""
+"""Times of day, and minutes with seconds, which contain no date."""
 QUANTITY = re.compile(r"([^\w\s.,+-]{0,3})\s?[-+−]?[.,]?\d[\d.,'’\s]*([^\d\s]\D{0,11})?")
-"""A number, perhaps with a sign of its unit before or after it."""
+"""A number, optionally with a unit before or after it."""
 NUMBERED = 5
-"""Columns with one name and a number from which a table may have its steps in columns."""
+"""Minimum number of columns, named alike with a number, that suggest a table with one column per step."""
 DATED_NAME = re.compile(
     r"\d{4}([-/.]\d{1,2}){0,2}([T ]\d.*)?|\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{4}[-_ ]?[QM]\d{1,2}|"
     rf"({'|'.join(MONTHS)})[a-z]*[-/ .]?\d{{2,4}}",
@@ -65,19 +65,19 @@ DATED_NAME = re.compile(
 
 @dataclass(frozen=True)
 class Told:
-    """What a person says of columns in words; a column is "name", "name:family" or "name:family:unit".
+    """Roles of columns given by the user; a column is "name", "name:family" or "name:family:unit".
 
     Args:
-        columns: targets; all that are nothing else, if none is named.
-        covariates: known in the future too, as a plan or a calendar.
-        past: covariates that end with the present.
-        static: covariates with one value a sequence.
-        id: columns that tell sequences apart.
+        columns: targets; by default all columns without another role.
+        covariates: covariates known in the future, such as a plan or a calendar.
+        past: covariates known up to the present.
+        static: covariates with one value per sequence.
+        id: columns that identify sequences.
         time: column of dates or numbers, or columns that are joined to one time.
-        group: column that is the same within a sequence.
-        split: column that says "train", "validation" or "test".
+        group: column that is constant within a sequence.
+        split: column with values "train", "validation" or "test".
         zone: time zone of dates, such as "Europe/Berlin".
-        na_values: texts or numbers that mark missing values, beside empty cells and NaN.
+        na_values: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
     """
 
@@ -94,10 +94,10 @@ class Told:
     decimal: str | None = None
 
     def of(self, frame: Any) -> Columns:
-        """Return the schema of a frame; what is not given is proposed, see `proposed`.
+        """Return the schema of a frame; entries that are not given are inferred, as in `proposed`.
 
         Raises:
-            ValueError: columns that the frame does not have, unknown families, or cells that are unclear.
+            ValueError: if columns do not exist, families are unknown, or cells are ambiguous.
         """
         levels, frame = [name for name, _ in index_levels(frame)], tabular(frame)
         if not len(frame):
@@ -162,7 +162,7 @@ class Told:
 def _told(
     name: str, role: Role, family: str, unit: str, values: Any, guess: Column | None, na_values: Collection[str]
 ) -> Column:
-    """A column of which a role, and perhaps family and unit, are told."""
+    """Return a column with a given role, and possibly a given family and unit."""
     family = family or (guess.family if guess else "real")
     if role != "target" and family != "category":
         family = "real"
@@ -176,32 +176,37 @@ def _classes(values: Any, na_values: Collection[str]) -> tuple[str, ...]:
 def proposed(frame: Any) -> Columns:
     """Propose a schema for a pandas frame in the long form.
 
-    The first column of dates, or with the name of a time, is the time. A date and a clock, or year, month, day and
-    hour, are joined where one column leaves several rows at one time. Texts that repeat, and whole numbers with the
-    name of an id, are ids where they leave no two rows at one time. Columns that are constant within each of several
-    sequences are static. All other columns are targets: whole numbers from 0 are counts, two values a binary, few texts
-    a category, numbers above 0 that vary by more than half their mean positive. A warning names the other columns,
-    such as constant ones, which are left out.
+    The rules are:
+
+    - Time: the first column with dates or with the name of a time. A date and a clock, or year, month, day and hour,
+      are joined if one column alone leaves several rows at the same time.
+    - Ids: repeated texts, and integers with the name of an id, if with them no two rows of a sequence have the same
+      time.
+    - Static: columns that are constant within each of several sequences.
+    - Targets: all other columns. Integers from 0 are counts, two values are binary, few texts are a category, and
+      numbers above 0 whose standard deviation exceeds half their mean are positive.
+
+    A warning names the remaining columns, such as constant ones, which are omitted.
 
     Args:
         frame: table.
 
     Raises:
-        ValueError: no column that could be a target, cells that are unclear, or a table that is not in the long form.
+        ValueError: if no column can be a target, cells are ambiguous, or the table is not in the long form.
     """
     return Told().of(frame)
 
 
 class _Proposal:
-    """Id, time, and the family of each column of a frame, as far as they are not given.
+    """The inferred id, time and column families of a frame, without those that are given.
 
     Args:
-        told: what is given.
+        told: roles given by the user.
         frame: table in the long form.
-        levels: names of the columns that are levels of its index.
+        levels: names of columns that are levels of its index.
         times: columns of the time, if given.
         aside: columns with a given role other than data.
-        families: columns with a given role, with their family, "" if none is given.
+        families: given columns with their family, "" if none is given.
     """
 
     def __init__(
@@ -222,9 +227,9 @@ class _Proposal:
             if read.is_numeric and not is_number(frame[name]) and not self._holds_codes(name)
         }
         self.plain = frame.assign(**numerals)
-        """The frame, with numbers for texts that are numbers."""
+        """The frame with numeric texts converted to numbers."""
         self.undecided: dict[str, str] = {}
-        """Columns that could be the time, were their dates decided, with what they hold."""
+        """Columns that could be the time, but with ambiguous dates, and a description of their content."""
         if not told.columns:
             self._refuse_layout(aside)
         free = [name for name in frame if name not in families and name not in aside and not self._numbers_rows(name)]
@@ -254,14 +259,14 @@ class _Proposal:
         self.columns = columns
 
     def _holds_codes(self, name: str) -> bool:
-        """Whether texts are classes or codes, such as 007, although they could be read as numbers."""
+        """Return whether texts are classes or codes, such as 007, although they could be parsed as numbers."""
         values = self.frame[name]
         if str(values.dtype) == "category":
             return True
         return not TIMES.search(name.lower()) and bool(texts(values).str.fullmatch(r"0\d+").any())
 
     def _find_id_and_time(self, free: list[str]) -> None:
-        """Choose the time that leaves the fewest rows of a sequence at the time of another, the first of equal ones."""
+        """Choose the time with the fewest rows of a sequence at the same time; the first one among equals."""
         found = []
         for time in [self.time] if self.time else self._times(free):
             try:
@@ -276,13 +281,13 @@ class _Proposal:
                 break
         if found:
             _, self.id, self.time = min(found, key=lambda each: each[0])
-        elif self.undecided:  # which tell rows apart, in whatever order
+        elif self.undecided:  # ambiguous dates still distinguish rows
             self.id, _ = self._find_id(free, (*self.undecided,), self.frame[next(iter(self.undecided))])
         elif not self.id:
             self.id = tuple(self.levels) or self._ids_in_runs(free)
 
     def _times(self, free: list[str]) -> list[tuple[str, ...]]:
-        """List columns that may be the time, the likeliest first."""
+        """Return columns that may be the time, the most likely first."""
         frame = self.frame
         clocks = [name for name in free if is_clock(frame[name])]
         dated = [name for name in free if name not in clocks and (self._is_time(name) or self._is_compact(name))]
@@ -301,7 +306,7 @@ class _Proposal:
         return [*joint, *((name,) for name in dict.fromkeys((*spans, *named, *levels[-1:])))]
 
     def _find_id(self, free: list[str], time: tuple[str, ...], step: Any) -> tuple[tuple[str, ...], int]:
-        """Return the columns that tell sequences apart, and how many rows then are at the time of another."""
+        """Return the columns that identify sequences, and the number of rows that repeat a time within a sequence."""
         steps = step.to_numpy()
         rows = self.frame.assign(**{" step": steps})
 
@@ -325,7 +330,7 @@ class _Proposal:
                 break
             if twice([*ids, name]) < before:
                 ids.append(name)
-        for name in tuple(ids):  # those before the one that alone suffices
+        for name in tuple(ids):  # drops ids that a later one makes redundant
             fewer = [other for other in ids if other != name]
             ids = ids if twice(fewer) else fewer
         if not all(map(self._is_named_id, ids)) and not self._in_runs(ids) and self._coverage(ids, steps) < COVERAGE:
@@ -333,17 +338,17 @@ class _Proposal:
         return tuple(ids), twice(ids)
 
     def _keys(self, ids: Collection[str]) -> list[Any]:
-        """Return the columns of ids as they are written, as keys to group by."""
+        """Return the original id columns, as keys for grouping."""
         return [self.frame[name].rename(None) for name in ids]
 
     def _is_named_id(self, name: str) -> bool:
-        """Whether whole numbers or texts have the name of an id."""
+        """Return whether a column contains integers or texts and has the name of an id."""
         values = self.plain[name]
         named = IDS.search(name.lower()) is not None or name in self.index
         return named and (not is_number(values) or _is_whole(values))
 
     def _may_be_id(self, name: str) -> bool:
-        """Whether a column holds texts, or codes such as 007, that repeat and say nothing of the time."""
+        """Return whether a column contains repeated texts, or codes such as 007, and no parts of a time."""
         values = self.frame[name]
         different = values.dropna().unique()
         if is_number(self.plain[name]) or len(different) == len(values):
@@ -357,13 +362,13 @@ class _Proposal:
         return tuple(name for name in names if self._is_named_id(name) and self._in_runs([name]))
 
     def _in_runs(self, ids: list[str]) -> bool:
-        """Whether the rows of each sequence are adjacent, and some sequence has several."""
+        """Return whether the rows of each sequence are adjacent, and some sequence has several."""
         codes = self.frame.groupby(self._keys(ids), sort=False, dropna=False, observed=True).ngroup().to_numpy()
         runs = 1 + int((np.diff(codes) != 0).sum())
         return 1 < runs == len(np.unique(codes)) < len(codes)
 
     def _coverage(self, ids: list[str], steps: np.ndarray) -> float:
-        """Return the mean share of steps, between the first and last of a sequence, at which it has a row."""
+        """Return the mean share of steps with a row, from the first to the last step of a sequence."""
         import pandas as pd
 
         moments = pd.Series(steps)
@@ -374,7 +379,7 @@ class _Proposal:
         return len(place) / float((spans["max"] - spans["min"] + 1).sum())
 
     def _is_time(self, name: str) -> bool:
-        """Whether a column holds dates; notes those whose day and month cannot be told apart."""
+        """Return whether a column contains dates; records ambiguous ones in `undecided`."""
         try:
             if is_date(self.plain[name]):
                 return True
@@ -403,14 +408,14 @@ class _Proposal:
         return False
 
     def _is_compact(self, name: str) -> bool:
-        """Whether numbers with the name of a time are dates such as 20241231."""
+        """Return whether numbers with the name of a time are dates such as 20241231."""
         values = self.plain[name]
         if not TIMES.search(name.lower()) or not _is_whole(values) or values.isna().any():
             return False
         return compact(values.to_numpy(np.float64)) is not None
 
     def _numbers_rows(self, name: str) -> bool:
-        """Whether a column numbers the rows, as the index without a name that pandas writes into a CSV."""
+        """Return whether a column numbers the rows, such as an unnamed index that pandas wrote to a CSV."""
         values = self.plain[name]
         if name == "Unnamed: 0":
             return _is_whole(values) and bool(values.is_unique)
@@ -419,7 +424,7 @@ class _Proposal:
         return bool((np.diff(values.to_numpy(np.float64, na_value=np.nan)) == 1).all())
 
     def _refuse_layout(self, aside: Collection[str]) -> None:
-        """Refuse a table with dates as names of columns, or with several rows of names."""
+        """Raise an error for a table with dates as column names, or with several header rows."""
         names = [name for name in self.frame if name not in aside]
         dated = [name for name in names if DATED_NAME.fullmatch(name) and is_number(self.plain[name])]
         if len(dated) > 2 and 2 * len(dated) >= len(names):
@@ -454,7 +459,7 @@ class _Proposal:
                 f"column {name!r} holds complex numbers; give their real and imaginary parts as two columns"
             )
         if family:
-            return None  # nothing is left to guess
+            return None  # the family is given
         if not is_number(values):
             known = self.frame[name].dropna()
             count = int((~np.isnan(read.values)).sum())
@@ -470,7 +475,7 @@ class _Proposal:
         if set(np.unique(numbers)) == {0.0, 1.0}:
             return Column(name, family="binary")
         if not (np.abs(numbers) < LARGEST).all():
-            return Column(name)  # which reading refuses
+            return Column(name)  # reading raises an error
         whole = (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2
         if whole and numbers.std() > RESOLVED * numbers.mean():
             return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
@@ -479,7 +484,7 @@ class _Proposal:
         return Column(name)
 
     def is_constant(self, name: str) -> bool:
-        """Whether all values of a column that are not missing are one number or text, at several rows."""
+        """Return whether all values except missing ones are equal, in at least two rows."""
         read, known = self.numbers[name], self.frame[name].dropna()
         values = known if read.wrong.any() or self._holds_codes(name) else read.values[~np.isnan(read.values)]
         return len(values) > 1 and len(set(values)) == 1
@@ -506,7 +511,7 @@ class _Proposal:
         return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(odd)}{sign}"
 
     def warn(self, columns: Columns, all_named: bool) -> None:
-        """Name what of the frame is not among the columns."""
+        """Warn of columns of the frame that the schema omits."""
         lacking = () if columns.time else self.undecided
         aside = [name for name in self.frame if name not in columns.needed and (all_named or name in lacking)]
         said = [f"{name!r} ({self.reason(name)})" for name in aside]
@@ -518,7 +523,7 @@ class _Proposal:
             self._warn_of_steps_in_columns(columns)
 
     def _warn_of_classes(self, name: str) -> None:
-        """Warn of a proposed category whose classes may be numbers with a unit or among marks."""
+        """Warn of a proposed category whose classes may be numbers with a unit, or marks."""
         if name not in self.columns or self._holds_codes(name):
             return
         classes = self.columns[name].classes
@@ -533,7 +538,7 @@ class _Proposal:
             )
 
     def _warn_of_steps_in_columns(self, columns: Columns) -> None:
-        """Warn of a table without a time whose rows are perhaps sequences, with a column for each step."""
+        """Warn of a table without a time whose rows may be sequences with one column per step."""
         stems = Counter(re.sub(r"\d+$", "", name) for name in columns.names if re.search(r"\d$", name))
         stem, count = max(stems.items(), key=lambda each: each[1], default=("", 0))
         labels = [name for name in self.frame if self._labels_rows(name)]
@@ -548,7 +553,7 @@ class _Proposal:
             )
 
     def _labels_rows(self, name: str) -> bool:
-        """Whether a column holds another text in each row."""
+        """Return whether a column contains a different text in each row."""
         values = self.frame[name]
         if is_number(self.plain[name]) or values.isna().any() or not values.is_unique:
             return False
@@ -556,7 +561,7 @@ class _Proposal:
 
 
 def _first(values: Any) -> str:
-    """Return the first value of a column that is not missing, short."""
+    """Return the first value that is not missing, abbreviated."""
     return brief(str(values.dropna().iloc[0]))
 
 
@@ -566,7 +571,7 @@ def _static(column: Column) -> Column:
 
 
 def _unit(cell: str) -> str | None:
-    """Return the sign of the unit of a number in text, "" if it has none; None for other texts."""
+    """Return the unit of a number in text, "" if it has none, or None for other texts."""
     found = QUANTITY.fullmatch(cell.strip())
     return None if found is None else (found[1] + (found[2] or "")).strip()
 
@@ -576,10 +581,10 @@ def _is_whole(values: Any) -> bool:
 
 
 def is_date(values: Any) -> bool:
-    """Whether a column holds dates, or texts of them.
+    """Return whether a column contains dates, or texts of them.
 
     Raises:
-        Undecided: dates that can be read in several ways.
+        Undecided: if dates are ambiguous.
     """
     import pandas as pd
 
@@ -594,7 +599,7 @@ def is_date(values: Any) -> bool:
     for part in (some, known):
         try:
             return bool(dates(part).notna().all())
-        except Undecided as error:  # by some, where others may tell
+        except Undecided as error:  # other cells may resolve it
             undecided = error
         except (TypeError, ValueError):
             return False

@@ -1,4 +1,4 @@
-"""How sequences of a table are divided and cut into windows."""
+"""Splits of sequences, and how they are cut into windows."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from .panel import Panel
 
 @dataclass(frozen=True)
 class Cut:
-    """How sequences become windows for training, validation and test.
+    """How sequences are split and cut into windows for training, validation and test.
 
     Args:
-        observed: O, steps that a forecast is given; None for whole sequences, of which there are bounds, no forecasts.
-        horizon: H, steps to be forecast.
-        stride: steps from the start of one test window to the next; None for the horizon, so that no step is forecast
-            twice.
-        split: what is divided: "sequence", each as a whole; "time", the last steps of every sequence; "group", all
-            sequences of a group. Sequences that say their split are where they say.
-        validation, test: shares of them.
-        seed: of the division of sequences or groups.
-        season: period of the data in steps, such as 7 of days, which the reference "seasonal" repeats.
+        observed: O, observed steps of a forecast; None for whole sequences, which have bounds but no forecasts.
+        horizon: H, steps to forecast.
+        stride: steps between the starts of test windows; None for the horizon, which forecasts no step twice.
+        split: unit of the split: "sequence" for whole sequences, "time" for the last steps of every sequence, "group"
+            for all sequences of a group. If the data define the split of each sequence, it is used instead.
+        validation: share for validation.
+        test: share for test.
+        seed: random seed of the split by sequence or group.
+        season: period of the data in steps, such as 7 for days; the reference forecast "seasonal" repeats it.
 
     Raises:
-        ValueError: steps without a horizon, or the other way round; shares that leave nothing to train on.
+        ValueError: if only one of `observed` and `horizon` is given, `split` is "time" without them, the season exceeds
+            `observed`, or no share remains for training.
     """
 
     observed: Frames | None = None
@@ -62,14 +63,15 @@ class Cut:
 
     @property
     def name(self) -> str:
-        """For titles."""
+        """Name for titles."""
         return "whole sequences" if self.length is None else f"{self.observed} + {self.horizon} steps"
 
     def starts(self, panel: Panel, split: str) -> list[tuple[int, int, int]]:
-        """(sequence, first start, last start) of the windows of a split, or (sequence, 0, 0) of whole ones.
+        """Return (sequence, first start, last start) of the windows of a split, or (sequence, 0, 0) of whole sequences.
 
-        By time, a window is in the split in which its future is; what it observes may lie before. "all" is of all
-        sequences, wherever they are, and "last" of the end of each, rows without targets included.
+        With a split by time, a window belongs to the split of its future; its observed steps may lie earlier. "all"
+        includes all sequences regardless of their split. "last" is the end of each sequence, including rows without
+        targets.
         """
         found = []
         for place, low, high in self.spans(panel, split):
@@ -80,7 +82,7 @@ class Cut:
         return found
 
     def spans(self, panel: Panel, split: str) -> list[tuple[int, int, int]]:
-        """(sequence, first step, step behind the last) of what windows of a split are cut from, long enough or not."""
+        """Return (sequence, first step, end) of the steps of a split, even if they are too short for a window."""
         found = []
         everywhere = split in ("all", "last")
         parts = None if self.split == "time" or everywhere else self._parts(panel)
@@ -94,7 +96,7 @@ class Cut:
         return found
 
     def _between(self, total: int, split: str) -> tuple[int, int]:
-        """First and last step of the windows of a sequence of so many that is divided by time."""
+        """Return first step and end of a split by time, for a sequence of this length."""
         assert self.observed is not None
         first, second = (round(total * (1 - share)) for share in (self.validation + self.test, self.test))
         bounds = {"train": (0, first), "validation": (first - self.observed, second)}
@@ -103,7 +105,7 @@ class Cut:
         return max(low, 0), high
 
     def _parts(self, panel: Panel) -> list[str]:
-        """The split of every sequence."""
+        """Return the split of every sequence."""
         units = [one.group if self.split == "group" else one.name for one in panel.series]
         said = {unit: one.split for unit, one in zip(units, panel.series, strict=True) if one.split}
         if said and len({one.split == "" for one in panel.series}) > 1:

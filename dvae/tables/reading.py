@@ -1,9 +1,9 @@
-"""Files of tables: CSV, Parquet, npz and npy, and the schema that stands beside them.
+"""Files of tables: CSV, Parquet, npz and npy, with a schema file next to them.
 
-An npy file, or a folder of them, is mapped: it may be larger than memory. All others are read.
+An npy file, or a folder of npy files, is memory-mapped and may be larger than memory. Other files are read completely.
 
-A schema beside `riders.csv` is `riders.toml`, or `schema.toml` in the same folder: columns, see `dvae.tables.columns`,
-and how sequences are divided and cut:
+The schema of `riders.csv` is `riders.toml`, or `schema.toml` in the same folder. It describes the columns
+(`dvae.tables.columns`) and how sequences are split and cut:
 
     [cut]
     observed = 48
@@ -42,13 +42,13 @@ from .proposing import Told
 from .protocol import Cut
 
 SEPARATORS = {".csv": ",;\t|", ".tsv": "\t"}
-"""What may stand between entries, the likeliest first: spreadsheets write what their country does."""
+"""Possible separators, the most likely first; spreadsheets use the separator of their locale."""
 DECLARED = re.compile(rb'"?sep=([,;:|\t ])"?\r?\n', re.IGNORECASE)
-"""A first line that names the separator."""
+"""A first line that declares the separator."""
 BLANK = re.compile(rb"\n[ \t]*\r?\n|\r\r(?!\n)")
 SUFFIXES = (*SEPARATORS, ".parquet", ".npz")
 LARGEST = 2 * 10**9
-"""Bytes of a file, or of what it holds."""
+"""Maximum bytes of a file, and of its content."""
 MOST_FILES = 100_000
 LARGEST_SCHEMA = 10**6
 LARGEST_HEADER = 2**20
@@ -57,12 +57,12 @@ LARGEST_HEADER = 2**20
 def read_frame(path: str | os.PathLike[str]) -> Any:
     """Read a CSV, TSV, Parquet or npz file as a pandas frame; cells of CSV and TSV are text, empty ones missing.
 
-    An npz holds an array (N, T, D), or (T, D) of one sequence, named "x" or alone, and perhaps "lengths" (N,); its
-    columns are x0, x1, … beside "sequence" and "step".
+    An npz contains an array (N, T, D), or (T, D) of one sequence, named "x" or as the only one, and optionally
+    "lengths" (N,). Its columns are x0, x1, …, "sequence" and "step".
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: no table, or one of another kind or size.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is not a table, or exceeds a limit.
     """
     place = Path(path)
     suffix = place.suffix.lower()
@@ -75,12 +75,12 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
         return _parquet(content) if suffix == ".parquet" else _separated(content, SEPARATORS[suffix])
     except ImportError as error:
         raise ValueError(f"{place} is Parquet, which needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
-    except Exception as error:  # of parsers, which fail in many ways
+    except Exception as error:  # parsers raise many types
         raise ValueError(f"{place} cannot be read as {suffix[1:].upper()}: {str(error)[:300]}") from error
 
 
 def _separated(content: bytes, separators: str) -> Any:
-    """Read a CSV as a frame of text, whose types are decided after its roles; refuse rows longer than the header."""
+    """Read a CSV as a frame of text, to be parsed once roles are known; rows longer than the header raise an error."""
     import pandas as pd
 
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -127,17 +127,17 @@ def _separated(content: bytes, separators: str) -> Any:
 
 
 def _cells(content: bytes, separator: str) -> Iterator[tuple[int, int]]:
-    """Yield the number of the last line of each row, and how many cells it has, from the header on."""
+    """Yield the last line number and the number of cells of each row, from the header on."""
     lines = TextIOWrapper(BytesIO(content), "utf-8", "replace", newline="")
     declared = DECLARED.match(content)
     first = bool(declared) + _comments(content[declared.end() if declared else 0 :])
     rows = csv.reader(islice(lines, first, None), delimiter=separator)
-    with suppress(csv.Error):  # of a cell that is too long
+    with suppress(csv.Error):  # a cell is too long
         yield from ((first + rows.line_num, len(row)) for row in rows if len(row) > 1 or "".join(row).strip())
 
 
 def _longer_row(content: bytes, separator: str) -> str:
-    """Return an error that names the first row with more cells than the header; "" where there is none."""
+    """Return an error message for the first row with more cells than the header; "" if none has."""
     rows = _cells(content, separator)
     first, width = next(rows, (0, 0))
     return next(
@@ -166,7 +166,7 @@ def _warn_of_shorter_rows(content: bytes, separator: str) -> None:
 
 
 def _without_empty_end(frame: Any, content: bytes) -> Any:
-    """Leave out rows at the end that hold nothing, as spreadsheets write them, and warn of lines that are skipped."""
+    """Drop empty rows at the end, as spreadsheets write them, and warn of skipped lines."""
     if frame.shape[1] == 1 and BLANK.search(content.strip()):
         warnings.warn(
             "empty lines between the values of a single column are skipped; write NaN where a value is missing",
@@ -185,20 +185,20 @@ def _rows(head: str, separator: str) -> Iterator[list[str]]:
 
 
 def _header(head: str, separator: str) -> list[str]:
-    """The first row that is neither empty nor a comment."""
-    with suppress(csv.Error):  # of a field that has no end, where this is no separator
+    """Return the first row that is neither empty nor a comment."""
+    with suppress(csv.Error):  # an unterminated field, with a wrong separator
         return next((row for row in _rows(head, separator) if row and not row[0].lstrip().startswith("#")), [])
     return []
 
 
 def _comments(content: bytes) -> int:
-    """How many lines before the header begin with #."""
+    """Return the number of lines before the header that start with #."""
     lines = iter(content[:LARGEST_SCHEMA].splitlines())
     return sum(1 for _ in takewhile(lambda line: line.lstrip().startswith(b"#"), lines))
 
 
 def _parquet(content: bytes) -> Any:
-    """The frame of a Parquet file: its flat columns, and an index that pandas kept, if it has a name."""
+    """Return a Parquet file as a frame, with its flat columns and, if named, the index that pandas stored."""
     import pyarrow
     from pyarrow import compute, parquet
 
@@ -208,14 +208,14 @@ def _parquet(content: bytes) -> Any:
     if columns > MOST:
         raise ValueError(f"it has {columns} columns; at most {MOST} are read")
     sizes = [held.metadata.row_group(n).total_byte_size for n in range(held.metadata.num_row_groups)]
-    _refuse_large(max(sum(sizes), 8 * rows * columns))  # what repeats takes no room in a file
+    _refuse_large(max(sum(sizes), 8 * rows * columns))  # repeated values are compressed
     flat = [each for each in held.schema_arrow if not kinds.is_nested(each.type)]
     if nested := [each.name for each in held.schema_arrow if kinds.is_nested(each.type)]:
         warnings.warn(f"columns of lists or records are left out: {', '.join(nested)}", stacklevel=2)
     words = [each.name for each in flat if kinds.is_string(each.type) or kinds.is_large_string(each.type)]
     names = [each.name for each in flat if not re.fullmatch(r"__index_level_\d+__", each.name)]
     table = parquet.ParquetFile(BytesIO(content), read_dictionary=words).read(names, use_threads=False)
-    table.validate(full=True)  # texts are texts
+    table.validate(full=True)  # checks that texts are valid
     for place, each in enumerate(table.schema):
         column = table.column(place)
         if kinds.is_dictionary(each.type) and kinds.is_string(each.type.value_type):
@@ -234,7 +234,7 @@ def _refuse_large(size: int) -> None:
 
 
 def _of_arrays(place: Path, content: bytes) -> Any:
-    """The frame of an npz."""
+    """Return an npz as a frame."""
     import pandas as pd
 
     arrays = _arrays(place, content)
@@ -259,15 +259,15 @@ def _of_arrays(place: Path, content: bytes) -> Any:
 
 
 def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = None) -> Panel:
-    """The sequences of a file, or of one of `dvae.tables.domains`.
+    """Return the sequences of a file, or of a data set of `dvae.tables.domains`.
 
     Args:
-        path: of the file, of a folder of npy files, or the name of the domain.
-        columns: what its columns are, or what is told of them; the rest is proposed.
+        path: path of a file or of a folder of npy files, or name of a data set.
+        columns: a schema, or roles given by the user; the rest is inferred.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: no table, or columns that it does not have.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is not a table or does not have the columns.
     """
     name = os.fspath(path)
     if is_domain(name):
@@ -281,15 +281,15 @@ def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = No
 
 
 def is_of_arrays(path: str | os.PathLike[str]) -> bool:
-    """Whether a path is that of an npy file, or of a folder of them."""
+    """Return whether a path is an npy file or a folder."""
     return Path(path).suffix.lower() == ".npy" or Path(path).is_dir()
 
 
 def _of_mapped(place: Path, columns: Columns | Told | None) -> Panel:
-    """The sequences of npy files: (steps, columns), or (sequences, steps, columns).
+    """Return the sequences of npy files with shape (steps, columns) or (sequences, steps, columns).
 
-    Those of a folder are called after their files; train.npy, or what lies in a subfolder train, is of that split, and
-    so on.
+    Sequences of a folder have the names of their files. The file train.npy and files in the subfolder train belong to
+    that split; other splits work alike.
     """
     found = [("", place.stem, place)]
     if place.is_dir():
@@ -324,7 +324,7 @@ def _files(place: Path) -> Iterator[Path]:
 
 
 def is_domain(name: str) -> bool:
-    """Whether a path is no file but a name of `dvae.tables.domains`."""
+    """Return whether a path is a name of `dvae.tables.domains` and not an existing file."""
     return name in DOMAINS and not Path(name).exists()
 
 
@@ -349,7 +349,7 @@ def _arrays(place: Path, content: bytes) -> dict[str, np.ndarray]:
 
 
 def _check_header(name: str, member: Any) -> None:
-    """Refuses an array of more numbers than are read, before room is made for it."""
+    """Check the size of an array before memory is allocated."""
     reads = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(member)
     if version not in reads:
@@ -360,10 +360,10 @@ def _check_header(name: str, member: Any) -> None:
 
 
 def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | Told | None, Cut | None]:
-    """What the schema beside a file says, None where there is none.
+    """Return the content of the schema file next to a file, or None for each missing part.
 
     Raises:
-        ValueError: a schema that cannot be read, saying where.
+        ValueError: if the schema is invalid; the message names its file.
     """
     place = Path(path)
     inside = [place / "schema.toml"] if place.is_dir() else []
@@ -377,7 +377,7 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | Told | None, 
 
 
 def read_schema(text: str) -> tuple[Columns | Told | None, Cut | None]:
-    """Return columns and cut of a schema, None for a missing part; `Told` in place of columns if it lists none."""
+    """Return columns and cut of a schema, None for a missing part. Without a list of columns, they are a `Told`."""
     told = parsed(text)
     cut = told.pop("cut", None)
     if cut is not None:
@@ -392,7 +392,7 @@ def read_schema(text: str) -> tuple[Columns | Told | None, Cut | None]:
 
 
 def written_schema(columns: Columns, cut: Cut) -> str:
-    """A schema as a file to be edited."""
+    """Return a schema as an editable TOML file."""
     told = {name: value for name, value in asdict(cut).items() if value != getattr(Cut, name)}
     lines = [
         "[cut]",

@@ -1,4 +1,4 @@
-"""Windows of a panel: training batches, and held-out windows to be judged on; or whole sequences of any length."""
+"""Windows of a panel: training batches, held-out windows for evaluation, or whole sequences of any length."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from .panel import Panel
 from .protocol import Cut
 
 GROUPED = 8
-"""Windows of a group in a batch for training."""
+"""Windows per group in a training batch."""
 AT_ONCE = 64
-"""Windows that are forecast or filled at once."""
+"""Windows that are forecast or imputed at once."""
 NAMED = 10
-"""Sequences without a window that are named."""
+"""Maximum number of sequences without a window that messages name."""
 
 
 Split = Literal["train", "validation", "test", "train+validation", "all", "last"]
@@ -44,24 +44,24 @@ def _require_model(model: Any) -> None:
 
 
 class PanelWindows:
-    """The windows of one split; a `Source`, and `HeldOutWindows` where forecasts have a horizon.
+    """The windows of one split; a `Source`, and `HeldOutWindows` if forecasts have a horizon.
 
-    Targets are read and encoded as windows are cut, from where they lie; covariates are held ready in memory.
+    Targets are read and encoded when windows are cut; covariates are precomputed in memory.
 
     Args:
         panel: the sequences.
-        schema: what models see of them.
+        schema: columns, cut and units.
         split: "train", "validation", "test" or "train+validation"; "all", or "last" for the end of each sequence.
 
     Raises:
-        ValueError: an unknown split, or one without windows.
+        ValueError: if the split is unknown or has no windows.
     """
 
     def __init__(self, panel: Panel, schema: PanelSchema, split: str):
         require(Split, split=split)
         self.panel, self.schema, self.split = panel, schema, split
         self._ranges = schema.cut.starts(panel, split)
-        if schema.columns.group:  # those of a group are drawn together
+        if schema.columns.group:  # windows of a group are drawn together
             self._ranges.sort(key=lambda each: panel.series[each[0]].group)
         shortest = schema.cut.length or 1
         cut_from = schema.cut.spans(panel, split)
@@ -105,12 +105,12 @@ class PanelWindows:
 
     @property
     def length(self) -> int | None:
-        """T, steps of a window; None of whole sequences."""
+        """T, steps of a window; None for whole sequences."""
         return self.schema.cut.length
 
     @property
     def left_out(self) -> str:
-        """What is not among the listed windows, in words; empty where all is."""
+        """Description of omitted sequences and windows; empty if none are omitted."""
         parts = [self.too_short] if self.skipped else []
         if self.untold:
             parts.append(f"{self.untold} windows, in whose past or future no target was observed")
@@ -118,7 +118,7 @@ class PanelWindows:
 
     @property
     def too_short(self) -> str:
-        """Names and numbers of steps of the sequences that are too short for a window; empty if there are none."""
+        """Names and lengths of the sequences that are too short for a window; empty if none are."""
         named = [f"{name}: {steps}" for name, steps in islice(self.skipped.items(), NAMED)]
         more = f" and {len(self.skipped) - NAMED} more" if len(self.skipped) > NAMED else ""
         said = f"{len(self.skipped)} sequences, which have fewer than {self.length} steps there"
@@ -126,12 +126,12 @@ class PanelWindows:
 
     @property
     def untold(self) -> int:
-        """Windows that are not listed, as no target was observed in their past or future."""
+        """Number of windows that are not listed, since no target was observed in their past or future."""
         return int(self._counts.sum()) - len(self._listed()[0])
 
     @property
     def protocol(self) -> Cut:
-        """How they are cut."""
+        """How the windows are cut."""
         return self.schema.cut
 
     def __len__(self) -> int:
@@ -154,7 +154,7 @@ class PanelWindows:
 
     @property
     def clusters(self) -> list[tuple[str, str, int]]:
-        """The same by groups, where the data have some: sequences of a group are no independent evidence."""
+        """Keys by group instead of sequence, if the data have groups, whose sequences are not independent evidence."""
         if not self.schema.columns.group:
             return self.keys
         groups = [self.panel.series[self._ranges[place][0]].group for place in self._windows[0].tolist()]
@@ -162,7 +162,7 @@ class PanelWindows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Columns with their units, means and scales, for the record."""
+        """Columns with their units, means and scales, stored with results."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}
         coordinates = self.schema.units["x"]
         said: dict[str, Any] = {
@@ -176,17 +176,17 @@ class PanelWindows:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the data, how they are cut, and which part these windows are."""
-        schema = {name: own for name, own in self.schema.config().items() if name != "calendar"}  # which changes no x
+        """SHA-256 of the data, their cut, and the split."""
+        schema = {name: own for name, own in self.schema.config().items() if name != "calendar"}  # does not affect x
         digest = hashlib.sha256(f"{self.panel.fingerprint()}({schema!r}, {self.split!r}, ".encode())
         hash_list(digest, self._keys())
         digest.update(b")")
         return digest.hexdigest()
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Windows drawn with replacement, every start alike; of whole sequences, different ones.
+        """Draw windows with replacement, with equal probability of each start; whole sequences without replacement.
 
-        In a panel with groups they are of so few groups that each has several.
+        In a panel with groups, a batch has few groups, with several windows each.
         """
         if self.schema.columns.group:
             return self._cut(*self._of_groups(batch_size, generator))
@@ -199,7 +199,7 @@ class PanelWindows:
         return self._cut(found, low + (where * (last - low + 1)).long())
 
     def _of_groups(self, batch_size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Range and first step of windows of some groups, drawn as often as they have windows."""
+        """Return range and first step of windows of some groups, drawn in proportion to their number of windows."""
         names = [self.panel.series[place].group for place, _, _ in self._ranges]
         below = torch.cat([self._weights.new_zeros(1), self._weights])
         first = torch.tensor([n for n, name in enumerate(names) if n == 0 or names[n - 1] != name])
@@ -213,33 +213,36 @@ class PanelWindows:
         return found, low + (where * (last - low + 1)).long()
 
     def some(self, places: Sequence[int]) -> Self:
-        """Some of the listed windows."""
+        """Return some of the listed windows."""
         found = copy(self)
         which, starts = self._windows
         found._windows = which[list(places)], starts[list(places)]
         return found
 
     def all(self) -> Batch:
-        """The listed windows, as `keys` has them."""
+        """Return the listed windows, in the order of `keys`."""
         return self._cut(*self._windows)
 
     def batches(self, batch_size: int) -> Iterator[Any]:
-        """The listed windows, so many at a time; all at first where they are not of one length, or of groups."""
+        """Return an iterator over batches of the listed windows.
+
+        Windows of several lengths or of groups are loaded at once.
+        """
         if self.length is None or self.schema.columns.group:
             return Sequences(self.all()).batches(batch_size)
         parts = (part.split(batch_size) for part in self._windows)
         return (self._cut(which, starts) for which, starts in zip(*parts, strict=True))
 
     def forecast(self, model: DynamicalVAE, samples: int = 100, seed: int = 0) -> PanelForecasts:
-        """Draws of the futures of the listed windows, each from what it observes and the covariates that are known.
+        """Draw futures of the listed windows, given their observed steps and known covariates.
 
         Args:
-            model: as it was fitted, to the same schema.
-            samples: K, of each window.
-            seed: of the draws.
+            model: model fitted to the same schema.
+            samples: K, draws of each window.
+            seed: random seed of the draws.
 
         Raises:
-            ValueError: whole sequences, which have no future.
+            ValueError: if the windows are whole sequences, which have no future.
         """
         _require_model(model)
         require(Count, samples=samples)
@@ -260,16 +263,16 @@ class PanelWindows:
         return PanelForecasts(np.concatenate(parts, 1, dtype=np.float64), *beside, *self.times(observed + horizon))
 
     def impute(self, model: DynamicalVAE, samples: int = 100, seed: int = 0, particles: int = 1) -> PanelImputed:
-        """The listed windows with draws where entries of targets are missing.
+        """Draw the missing targets of the listed windows.
 
         Args:
-            model: as it was fitted, to the same schema.
-            samples: K, fillings of each.
-            seed: of the draws.
-            particles: draws for each filling, of which it is chosen by what was observed, see `DynamicalVAE.impute`.
+            model: model fitted to the same schema.
+            samples: K, draws of each window.
+            seed: random seed of the draws.
+            particles: candidates for each draw, weighted by the observed entries, as in `DynamicalVAE.impute`.
 
         Raises:
-            ValueError: nothing is missing.
+            ValueError: if no values are missing.
         """
         _require_model(model)
         require(Count, samples=samples, particles=particles)
@@ -302,7 +305,7 @@ class PanelWindows:
 
     @property
     def _stride(self) -> int:
-        """Steps between listed windows: of the test as the protocol says, of all others half a horizon."""
+        """Steps between listed windows: as the protocol defines for test windows, else half a horizon."""
         how = self.schema.cut
         if how.horizon is None:
             return 1
@@ -310,7 +313,7 @@ class PanelWindows:
 
     @property
     def _counts(self) -> Tensor:
-        """How many windows lie in each range, so far apart."""
+        """Number of windows in each range, at this stride."""
         return (self._last - self._low) // self._stride + 1
 
     @cached_property
@@ -330,11 +333,11 @@ class PanelWindows:
         known = torch.cat([torch.zeros(1).long(), torch.from_numpy(some).cumsum(0)])
         first = self._first[which] + starts
         start, now, end = known[first], known[first + (self.schema.cut.observed or 0)], known[first + self.length]
-        told = (now > start) & (end > now)  # of what it observes something was, and something of its future
+        told = (now > start) & (end > now)  # with an observed target in past and future
         return which[told], starts[told]
 
     def _cut(self, which: Tensor, starts: Tensor) -> Batch:
-        """The windows of ranges that start at these steps of their sequences."""
+        """Return the windows that start at these steps of their ranges."""
         lengths = self._lengths[which] if self.length is None else self.length
         x = torch.from_numpy(self.schema.encoded(cut(self._values, which, starts, lengths).numpy())).double()
         batch = Batch(x=x)
@@ -355,7 +358,11 @@ class PanelWindows:
         return batch
 
     def _grouped(self, which: list[int], starts: list[int]) -> list[int]:
-        """The group of each window: with those that have the same present, or one would tell another's future."""
+        """Return the group of each window.
+
+        Outside training, only windows with the same present share a group. Otherwise one window could reveal the future
+        of another.
+        """
         observed, found, known = self.schema.cut.observed, [], dict[Any, int]()
         for place, start in zip(which, starts, strict=True):
             one = self.panel.series[self._ranges[place][0]]
@@ -368,7 +375,7 @@ class PanelWindows:
 
 
 def held(context: Tensor, observed: int, schema: PanelSchema) -> Tensor:
-    """Covariates (B, T, C) as they are known at the present: those that end with it keep their last value."""
+    """Return covariates (B, T, C) as known at the present: those of role "past" repeat their last value."""
     values, indicators = schema.ending
     if values:
         context[:, observed:, values] = context[:, observed - 1 : observed, values]

@@ -1,14 +1,14 @@
-"""Domains: real data by name, each taken from a package that somebody else publishes, and nothing of them is kept here.
+"""Domains: real data sets by name, each read from a package that others publish; none of the data is distributed here.
 
-| name | from | of |
+| name | source | content |
 |---|---|---|
-| chorales | music21 | 382 chorales by Bach, 88 keys, a step a quarter note |
+| chorales | music21 | 382 chorales by Bach, 88 keys, one step per quarter note |
 | speech | Debian's asterisk-core-sounds-en-wav | power spectra of 22 minutes of one speaker |
 | japanese-vowels | aeon | 640 utterances of two vowels by 9 speakers |
 | basic-motions | aeon | 80 recordings of a wrist in 4 activities |
 | macrodata | statsmodels | the economy of the United States by quarter, 1959 to 2009 |
 
-Motion has files of its own, and a simulator, in `dvae.motion`.
+Motion data come from files or a simulator, in `dvae.motion`.
 
 >>> panel = dvae.tables.domains.domain("chorales")  # doctest: +SKIP
 """
@@ -26,11 +26,11 @@ from ..panel import Panel
 
 @dataclass(frozen=True)
 class Domain:
-    """Where a domain comes from.
+    """The source of a data set.
 
     Args:
         place: "module:function" that loads it.
-        said: what it is, in a sentence.
+        said: description in one sentence.
     """
 
     place: str
@@ -54,19 +54,19 @@ DOMAINS: dict[str, Domain] = {
         "dvae.tables.domains.series:macrodata", "The economy of the United States by quarter, 1959 to 2009, 8 rates."
     ),
 }
-"""Domains by name."""
+"""Data sets by name."""
 
 
 def domain(name: str, **options: Any) -> Panel:
-    """A domain by its name.
+    """Load a data set by name.
 
     Args:
         name: one of `DOMAINS`.
-        options: of the function that loads it.
+        options: options of the function that loads it.
 
     Raises:
-        ValueError: an unknown name.
-        ImportError: the package that it comes from is not installed; the message says how to.
+        ValueError: if the name is unknown.
+        ImportError: if the package with the data is not installed; the message gives the command.
     """
     if name == "motion":
         raise ValueError("motion has files of its own: dvae.motion.read_motion, or dvae.motion.simulate")

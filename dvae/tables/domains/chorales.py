@@ -1,20 +1,20 @@
-"""Chorales: settings in four parts by J. S. Bach as rolls of 88 keys, a step a quarter note, from music21's corpus.
+"""Chorales: settings in four parts by J. S. Bach as rolls of 88 keys, one step per quarter note, from music21's corpus.
 
-The benchmark of Boulanger-Lewandowski, Bengio and Vincent (2012, arXiv 1206.6392), "JSB chorales", has 382 settings,
-brought to C major or C minor, with the keys that are down at every quarter note: 229 for training, 76 for validation
-and 77 for test, of those by Allan and Williams (2005). Its files do not say which setting is which, so that its split
-cannot be made. This one has the same sizes; which settings are in it, and where, is by the SHA-256 of their names in
-music21. Figures on the two are alike, and do not compare to a tenth of a nat.
+The benchmark "JSB chorales" of Boulanger-Lewandowski, Bengio and Vincent (2012, arXiv 1206.6392) has 382 settings,
+transposed to C major or C minor. It stores the keys that are down at every quarter note. Its split has 229 settings for
+training, 76 for validation and 77 for test, and follows Allan and Williams (2005). Its files do not identify the
+settings, and the split cannot be reproduced. This data set has the same sizes; the SHA-256 of the names in music21
+selects the settings and their split. Scores on the two are similar, but not comparable to a tenth of a nat.
 
-Of the settings that music21 has by Bach, left out are those that
+The following of Bach's settings in music21 are omitted:
 
-* have other voices than one soprano, alto, tenor and bass (instruments beside these are not read), or a beat that is no
-  quarter or half note;
-* share two thirds of their chord changes with one that is kept, in whatever key: Bach used some twice, and music21 has
-  some in two editions. The benchmark may have such pairs on both sides of its split;
-* have the largest SHA-256, beyond 382.
+* settings with other voices than one soprano, alto, tenor and bass (instruments in addition to these are ignored), or
+  with a beat other than a quarter or half note;
+* settings that share two thirds of their chord changes with one that is kept, in any key: Bach used some twice, and
+  music21 has some in two editions. The benchmark may have such pairs on both sides of its split;
+* the settings with the largest SHA-256, beyond 382.
 
-Steps without any voice are left out too, which are interludes of instruments and rests at the end.
+Steps without any voice are omitted too: interludes of instruments and rests at the end.
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ CLASSES = ("C", "C#", "D", "D#", "E", "F", "F#", "G", "G#", "A", "A#", "B")
 NAMES = tuple(f"{CLASSES[key % 12]}{key // 12 - 1}" for key in KEYS)
 SIZES = {"train": 229, "validation": 76, "test": 77}
 SHARED = 2 / 3
-"""Of its chord changes, from which on a setting is one that is there already."""
+"""Share of chord changes from which on a setting counts as a duplicate."""
 MOST = 2**23
-"""Bytes that the cache can rightly have; it has a twentieth."""
+"""Maximum bytes of the cache; its actual size is a twentieth."""
 PROFILES = (
     (17.7661, 0.145624, 14.9265, 0.160186, 19.8049, 11.3587, 0.291248, 22.062, 0.145624, 8.15494, 0.232998, 4.95122),
     (18.2648, 0.737619, 14.0499, 16.8599, 0.702494, 14.4362, 0.702494, 18.6161, 4.56621, 1.93186, 7.37619, 1.75623),
 )
-"""How often a major and a minor key have each degree, in hundredths (Aarden 2003; Essen folksongs)."""
+"""Frequencies of the degrees in a major and a minor key, in hundredths (Aarden 2003; Essen folksongs)."""
 
 
 def chorales(transposed: bool = True, cache: Path | None = None) -> Panel:
-    """Bach's chorales.
+    """Load Bach's chorales.
 
-    Reading all settings takes music21 half a minute, once: pitches are kept in the user's cache.
+    The first call parses all settings with music21, which takes half a minute. Pitches are then cached.
 
     Args:
-        transposed: bring all to C major or C minor, as in the benchmark; by at most six semitones.
-        cache: folder for the pitches; that of the user for this library, if not given.
+        transposed: transpose all settings to C major or C minor by at most six semitones, as in the benchmark.
+        cache: folder for the pitches; by default the user's cache of this library.
 
     Raises:
-        ImportError: music21 is not installed.
-        ValueError: the cache holds something else, or music21's corpus fewer settings.
+        ImportError: if music21 is not installed.
+        ValueError: if the cache has other content, or music21's corpus has too few settings.
     """
     folder("music21", "chorales")
     pooch = optional("pooch", "chorales")
@@ -86,21 +86,21 @@ def _panel(settings: Mapping[str, np.ndarray], transposed: bool) -> Panel:
 
 
 def roll(voices: np.ndarray) -> np.ndarray:
-    """The keys that are down: (T, 88) of 0 and 1, from MIDI numbers (T, 4), 0 where a voice rests."""
+    """Return the keys that are down, (T, 88) of 0 and 1, from MIDI numbers (T, 4), 0 where a voice rests."""
     found: np.ndarray = (voices[:, :, None] == np.array(KEYS)).any(1).astype(float)
     return found
 
 
 def to_c(voices: np.ndarray) -> np.ndarray:
-    """The voices (T, 4) brought to C major or C minor, at most six semitones away."""
+    """Return the voices (T, 4) transposed to C major or C minor, by at most six semitones."""
     up = -tonic(voices) % 12
     return np.where(voices > 0, voices + (up if up < 6 else up - 12), 0)
 
 
 def tonic(voices: np.ndarray) -> int:
-    """The pitch class, from C, of the key whose profile has the highest correlation with how often pitches sound.
+    """Return the tonic's pitch class, from C: the key whose profile has the highest correlation with the pitch counts.
 
-    Krumhansl and Schmuckler's rule (Krumhansl 1990), with the profiles of Aarden (2003).
+    This is the rule of Krumhansl and Schmuckler (Krumhansl 1990), with the profiles of Aarden (2003).
 
     Args:
         voices: MIDI numbers (T, 4), 0 where a voice rests.
@@ -111,7 +111,7 @@ def tonic(voices: np.ndarray) -> int:
 
 
 def different(settings: Mapping[str, np.ndarray]) -> list[str]:
-    """Names of the settings that no earlier one in the order of names repeats."""
+    """Return the names of the settings that do not repeat an earlier one, in the order of names."""
     kept: dict[str, set[Any]] = {}
     for name in sorted(settings):
         own = changes(settings[name])
@@ -121,14 +121,14 @@ def different(settings: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def changes(voices: np.ndarray) -> set[tuple[int, ...]]:
-    """The steps of the bass with the chords above it before and behind, the same in all keys."""
+    """Return the steps of the bass, each with the chords above it before and after; independent of the key."""
     full = voices[(voices > 0).all(1)]
     bass, above = full[:, 3:], full[:, :3] - full[:, 3:]
     return set(map(tuple, np.hstack([np.diff(bass, axis=0), above[:-1], above[1:]]).tolist()))
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """What the cache holds."""
+    """Return the validated content of the cache."""
     try:
         found = {name: np.asarray(voices, np.int64) for name, voices in json.loads(files.read(path, MOST)).items()}
         if all(v.ndim == 2 and v.shape[1] == 4 and np.isin(v, (0, *KEYS)).all() for v in found.values()):
@@ -139,7 +139,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _settings() -> dict[str, np.ndarray]:
-    """MIDI numbers (T, 4) at every quarter note of all settings with four voices in music21's corpus, by name."""
+    """Return MIDI numbers (T, 4) per quarter note of all settings with four voices in music21's corpus, by name."""
     from music21 import converter, corpus
 
     found = {}
@@ -155,15 +155,15 @@ def _settings() -> dict[str, np.ndarray]:
 
 
 def _notes(part: Any) -> list[tuple[float, float, int]]:
-    """Beginning and length of each note of a part, in quarter notes, and its MIDI number."""
+    """Return start and length of each note of a part, in quarter notes, and its MIDI number."""
     return [(float(note.offset), float(note.quarterLength), note.pitches[-1].midi) for note in part.flatten().notes]
 
 
 def quarters(voices: Sequence[Sequence[tuple[float, float, int]]]) -> np.ndarray:
-    """What sounds at every quarter note: (T, V) MIDI numbers, 0 where a voice rests.
+    """Return the pitches at every quarter note, (T, V) MIDI numbers, 0 where a voice rests.
 
     Args:
-        voices: of each its notes, as beginning, length and MIDI number.
+        voices: notes of each voice, as start, length and MIDI number.
     """
     ends = [start + length for notes in voices for start, length, _ in notes]
     found = np.zeros((int(np.ceil(max(ends, default=0))), len(voices)), np.int64)

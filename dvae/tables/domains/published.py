@@ -1,4 +1,4 @@
-"""Published: what installed packages hold, and where a sequence goes that they put in no part."""
+"""Data in installed packages, and a reproducible split for sequences without one."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 
 def folder(package: str, extra: str) -> Path:
-    """Where a package is installed; it is not imported, which can take seconds.
+    """Return the folder of an installed package, without importing it, which can take seconds.
 
     Args:
-        package: its name.
-        extra: ours that installs it.
+        package: name of the package.
+        extra: extra of this library that installs it.
 
     Raises:
-        ImportError: it is not installed.
+        ImportError: if the package is not installed.
     """
     found = find_spec(package)
     if found is None or not found.submodule_search_locations:
@@ -24,5 +24,5 @@ def folder(package: str, extra: str) -> Path:
 
 
 def lot(name: str) -> int:
-    """A number that a name draws, below 2^256: the same everywhere, and without regard to what the name says."""
+    """Return a pseudo-random number below 2^256 from a name, identical on every machine."""
     return int.from_bytes(hashlib.sha256(name.encode()).digest())

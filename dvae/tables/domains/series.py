@@ -1,8 +1,8 @@
-"""Series: panels of numbers from the packages aeon and statsmodels, whose files are read and which are not imported.
+"""Time series from the files of the packages aeon and statsmodels, which are not imported.
 
-`pip install --no-deps aeon statsmodels` is enough. JapaneseVowels is Kudo, Toyama and Shimbo's (1999), BasicMotions
-was recorded by students with smart watches; both are in the archive of Bagnall et al. (2018, arXiv 1811.00075), with
-its parts for training and test. Macrodata are of the Federal Reserve Bank of St. Louis, as in statsmodels.
+`pip install --no-deps aeon statsmodels` is sufficient. JapaneseVowels is by Kudo, Toyama and Shimbo (1999), and
+students recorded BasicMotions with smart watches. Both are in the archive of Bagnall et al. (2018, arXiv 1811.00075),
+with its split into training and test. Macrodata is from the Federal Reserve Bank of St. Louis, as in statsmodels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..panel import Panel, Series
 from .published import folder
 
 MOST = 2**24
-"""Bytes of a file of sequences."""
+"""Maximum bytes of a file of sequences."""
 RATES = {
     "gdp": "realgdp",
     "consumption": "realcons",
@@ -27,44 +27,46 @@ RATES = {
     "government": "realgovt",
     "income": "realdpi",
 }
-"""Columns of growth, and of what."""
+"""Names of growth columns and their sources in the file."""
 LEVELS = {"inflation": "infl", "bills": "tbilrate", "unemployment": "unemp"}
-"""Columns that are in per cent as they stand."""
+"""Columns already in per cent, and their names in the file."""
 
 
 def japanese_vowels() -> Panel:
-    """JapaneseVowels: 640 utterances of /ae/ by nine speakers, which are the groups.
+    """Load JapaneseVowels: 640 utterances of /ae/ by nine speakers, which are the groups.
 
-    12 cepstral coefficients of linear prediction, 7 to 29 frames. 270 for training and 370 for test as published; of
-    the 30 for training by each speaker every fifth is for validation.
+    Each utterance has 12 cepstral coefficients of linear prediction and 7 to 29 frames. The published split has 270 for
+    training and 370 for test. Of the 30 training utterances of each speaker, every fifth is used for validation.
 
     Raises:
-        ImportError: aeon is not installed.
+        ImportError: if aeon is not installed.
     """
     return _archived("JapaneseVowels", [f"cepstrum {number}" for number in range(1, 13)])
 
 
 def basic_motions() -> Panel:
-    """BasicMotions: 80 recordings of a wrist in four activities, which are the groups.
+    """Load BasicMotions: 80 recordings of a wrist in four activities, which are the groups.
 
-    Three axes each of an accelerometer and a gyroscope, 100 steps in 10 seconds. 40 for training and 40 for test as
-    published; of the ten for training of each activity every fifth is for validation.
+    Each recording has three axes each of an accelerometer and a gyroscope, and 100 steps in 10 seconds. The published
+    split has 40 for training and 40 for test. Of the ten training recordings of each activity, every fifth is used for
+    validation.
 
     Raises:
-        ImportError: aeon is not installed.
+        ImportError: if aeon is not installed.
     """
     return _archived("BasicMotions", [f"{what} {axis}" for what in ("accelerometer", "gyroscope") for axis in "xyz"])
 
 
 def macrodata() -> Panel:
-    """Macrodata: the economy of the United States by quarter, 1959 to 2009, as one sequence of 202 steps.
+    """Load Macrodata: the economy of the United States by quarter, 1959 to 2009, as one sequence of 202 steps.
 
-    Growth of real gross domestic product, consumption, private investment, government's expenditure and disposable
-    income over the quarter before, as 100 times the difference of logarithms; inflation in per cent a year, the rate of
-    three-month treasury bills and unemployment in per cent. Nothing is said of a split, which is by time.
+    Growth over the previous quarter is 100 times the difference of logarithms. Its columns are real gross domestic
+    product, consumption, private investment, government expenditure and disposable income. Inflation is in per cent per
+    year; the rate of three-month treasury bills and unemployment are in per cent. The data define no split; split them
+    by time.
 
     Raises:
-        ImportError: statsmodels is not installed.
+        ImportError: if statsmodels is not installed.
     """
     path = folder("statsmodels", "series") / "datasets" / "macrodata" / "macrodata.csv"
     rows = list(csv.DictReader(files.read(path, MOST).decode().splitlines()))
@@ -79,7 +81,7 @@ def macrodata() -> Panel:
 
 
 def _archived(name: str, columns: list[str]) -> Panel:
-    """A problem of the archive; of those for training in each class every fifth is for validation."""
+    """Load a data set of the archive; every fifth training sequence of each class is used for validation."""
     place = folder("aeon", "series") / "datasets" / "data" / name
     series, seen = [], dict[str, int]()
     for split in ("train", "test"):
@@ -91,7 +93,7 @@ def _archived(name: str, columns: list[str]) -> Panel:
 
 
 def read_ts(path: Path) -> Iterator[tuple[np.ndarray, str]]:
-    """Sequences (T, D) and their class, from a file of the archive: dimensions between colons, the class at the end."""
+    """Yield sequences (T, D) and their class from a file, where colons separate dimensions and the class."""
     for line in files.read(path, MOST).decode().splitlines():
         if line.strip() and line[0] not in "#@":
             *dimensions, label = line.strip().split(":")

@@ -1,13 +1,13 @@
 """Speech: power spectra of recorded prompts, from Debian's package asterisk-core-sounds-en-wav (CC BY-SA 3.0).
 
-568 files of 8 kHz, spoken by Allison Smith. Spectra are made as in the benchmark of Bie, Girin, Leglaive, Hueber and
-Alameda-Pineda (2021, arXiv 2106.06500), of the review's speech models (Girin et al. 2021, arXiv 2008.12595): a signal
-is divided by its largest absolute value, windows are halves of a sine, 32 ms long and 16 ms apart, and what is more
-than 30 dB below the loudest frame is cut from beginning and end. At 8 kHz these are 129 bands, where theirs, at 16 kHz,
-are 257. To each power that of rounding to 16 bits is added, below which spectra tell nothing.
+The data are 568 files at 8 kHz, spoken by Allison Smith. Spectra follow the benchmark of Bie, Girin, Leglaive, Hueber
+and Alameda-Pineda (2021, arXiv 2106.06500) for the speech models of the review (Girin et al. 2021, arXiv 2008.12595). A
+signal is divided by its largest absolute value. Windows are half a sine, 32 ms long and 16 ms apart. Frames more than
+30 dB below the loudest one are cut from beginning and end. At 8 kHz the spectra have 129 bands; the benchmark, at 16
+kHz, has 257. The power of rounding to 16 bits is added to each power, since spectra contain no information below it.
 
-An estimate of the power becomes sound again with the phase that was observed (`resynthesised`), and is judged by the
-scale-invariant signal-to-distortion ratio (`si_sdr`; Le Roux, Wisdom, Erdogan and Hershey 2019, arXiv 1811.02508).
+`resynthesised` turns an estimate of the power into sound, with the phase of the observed signal. `si_sdr` evaluates it
+by the scale-invariant signal-to-distortion ratio (Le Roux, Wisdom, Erdogan and Hershey 2019, arXiv 1811.02508).
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from .published import lot
 
 PLACE = Path("/usr/share/asterisk/sounds/en_US_f_Allison")
 RATE, WINDOW, HOP = 8000, 256, 128
-"""Samples: in a second, in a window, from one window to the next."""
+"""Samples per second, per window, and from one window to the next."""
 FLOOR = WINDOW / 2 * 2.0**-30 / 12
-"""Power of rounding to 16 bits in every band, of signals up to 1."""
+"""Power of rounding to 16 bits in every band, for signals up to 1."""
 QUIET = 30.0
-"""Decibels below the loudest frame, from which on beginning and end are silence."""
+"""Decibels below the loudest frame at which the beginning and the end count as silence."""
 SILENT = 0.01
-"""Largest absolute value of recordings of silence, which are left out; that of speech is up to 1."""
+"""Largest absolute value of recordings of silence, which are omitted; speech reaches values up to 1."""
 TENTHS = {0: "validation", 1: "test"}
-"""Part of the recordings whose lot ends in this digit; all others are for training."""
+"""Split of the recordings whose `lot` ends in this digit; all others are for training."""
 
 
 def speech(folder: str | Path = PLACE) -> Panel:
-    """Power spectra (T, 129) of recordings, a frame every 16 ms.
+    """Return power spectra (T, 129) of recordings, one frame every 16 ms.
 
     Args:
-        folder: of the wav files, searched with all below it.
+        folder: folder of the wav files, searched recursively.
 
     Raises:
-        FileNotFoundError: there are none.
-        ValueError: a file of another kind than mono, 16 bits, 8 kHz.
+        FileNotFoundError: if the folder has no wav files.
+        ValueError: if a file is not mono with 16 bits and 8 kHz.
     """
     series = [
         Series(name, power(samples), split=TENTHS.get(lot(name) % 10, "train"))
@@ -55,7 +55,7 @@ def speech(folder: str | Path = PLACE) -> Panel:
 
 
 def recordings(folder: str | Path = PLACE) -> dict[str, np.ndarray]:
-    """Signals (samples,) by name, between -1 and 1, without the silence around them; see `speech`."""
+    """Return signals (samples,) by name, between -1 and 1, without the silence around them, as in `speech`."""
     paths = sorted(Path(folder).rglob("*.wav"))
     if not paths:
         raise FileNotFoundError(
@@ -75,7 +75,7 @@ def recordings(folder: str | Path = PLACE) -> dict[str, np.ndarray]:
 
 
 def voiced(samples: np.ndarray) -> np.ndarray:
-    """A signal without the frames before the first and behind the last that is not quiet."""
+    """Return a signal without the quiet frames at its beginning and end."""
     loud = 10 * np.log10(power(samples).sum(1))
     first, last = np.flatnonzero(loud > loud.max() - QUIET)[[0, -1]]
     return samples[max(first - 1, 0) * HOP : (last + 1) * HOP]
@@ -86,28 +86,28 @@ def _transform() -> signal.ShortTimeFFT:
 
 
 def spectrum(samples: np.ndarray) -> np.ndarray:
-    """The complex spectrum (T, 129) of a signal (samples,) of a window's length at least."""
+    """Return the complex spectrum (T, 129) of a signal (samples,), at least as long as a window."""
     found: np.ndarray = _transform().stft(samples).T
     return found
 
 
 def power(samples: np.ndarray) -> np.ndarray:
-    """Squared magnitudes (T, 129) of the spectrum of a signal, above `FLOOR`."""
+    """Return squared magnitudes (T, 129) of the spectrum of a signal, plus `FLOOR`."""
     found: np.ndarray = np.abs(spectrum(samples)) ** 2 + FLOOR
     return found
 
 
 def sound(spectrum: np.ndarray, samples: int) -> np.ndarray:
-    """The signal (samples,) of a complex spectrum (T, 129)."""
+    """Return the signal (samples,) of a complex spectrum (T, 129)."""
     found: np.ndarray = _transform().istft(np.asarray(spectrum).T, k1=samples)
     return found
 
 
 def resynthesised(estimate: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """The signal (samples,) of a power (T, 129) with the phase of an observed signal.
+    """Return the signal (samples,) of a power (T, 129) with the phase of an observed signal.
 
     Raises:
-        ValueError: a power of another shape than that of the signal's spectrum.
+        ValueError: if the shapes of the power and of the signal's spectrum differ.
     """
     observed = spectrum(samples)
     if estimate.shape != observed.shape:
@@ -116,14 +116,14 @@ def resynthesised(estimate: np.ndarray, samples: np.ndarray) -> np.ndarray:
 
 
 def si_sdr(reference: np.ndarray, estimate: np.ndarray) -> float:
-    """Scale-invariant signal-to-distortion ratio in decibels, of an estimate (samples,) of a signal (samples,).
+    """Return the scale-invariant signal-to-distortion ratio of an estimate (samples,), in decibels.
 
         10 log10 ‖a s‖² / ‖a s - ŝ‖²,    a = <ŝ, s> / ‖s‖²
 
-    Le Roux et al. 2019, equation 3; infinite where the estimate is a multiple of the signal.
+    This is equation 3 of Le Roux et al. 2019; it is infinite if the estimate is a multiple of the signal.
 
     Raises:
-        ValueError: different lengths, or a signal of zeros.
+        ValueError: if lengths differ, or the signal is all zeros.
     """
     if reference.shape != estimate.shape or not reference.any():
         raise ValueError(f"expected two signals of one length, not silent; got {reference.shape} and {estimate.shape}")
