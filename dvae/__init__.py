@@ -10,7 +10,7 @@
 >>> dvae.audit(model.generative, model.inference).missing
 {'z': ('z_{<t}',)}
 
-Torch takes seconds to import, so that what is named here, and every subpackage, is imported when it is first used.
+Public names and subpackages are imported at first use, because importing torch takes seconds.
 """
 
 import sys
@@ -20,7 +20,7 @@ from .lazy import importing
 
 __version__ = "0.1.0"
 
-if sys.flags.optimize > 1:  # Pyro fills in its docstrings as it is imported
+if sys.flags.optimize > 1:  # Pyro edits its own docstrings at import
     raise ImportError("dvae needs Pyro, which needs docstrings: run python without -OO (PYTHONOPTIMIZE=2); -O is fine")
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ _PLACES = {
 }
 
 
-if not TYPE_CHECKING:  # which knows them all
+if not TYPE_CHECKING:  # type checkers read the imports above
     __getattr__ = importing(__name__, _PLACES)
 
 

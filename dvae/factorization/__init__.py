@@ -1,4 +1,4 @@
-"""Factorizations: equations, their masks and graphs, audits and faithful guides."""
+"""Factorizations: equations, masks, graphs, audits and faithful guides."""
 
 from typing import TYPE_CHECKING
 

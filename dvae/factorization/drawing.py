@@ -1,4 +1,4 @@
-"""Pictures of graphs, unrolled or of one step: time from left to right, latents open, data shaded, context squares."""
+"""Figures of graphs, unrolled or of one step: time from left to right, latents open, data shaded, context squares."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.patches import Patch
 
 Node = tuple[str, int | None]
-"""A variable at a step, or a static one."""
+"""A variable at a step, or a static variable with step None."""
 Edge = tuple[Node, Node]
 
 RADIUS = 0.3
@@ -23,19 +23,19 @@ EDGE: dict[str, Any] = {"color": "0.35", "linestyle": "-", "linewidth": 0.9}
 MISSING: dict[str, Any] = {"color": "#c0392b", "linestyle": "--", "linewidth": 1.3}
 REDUNDANT: dict[str, Any] = {"color": "0.6", "linestyle": ":", "linewidth": 1.2}
 LEAST = 1e-3
-"""Share of the highest price below which an arrow is drawn as one that costs nothing."""
+"""Share of the highest KL gap below which an edge is drawn dotted, as if its gap were zero."""
 
 
 def draw_dag(
     dag: nx.DiGraph, ax: Axes | None = None, missing: Iterable[Edge] = (), redundant: Iterable[Edge] = ()
 ) -> Axes:
-    """Draws an unrolled graph: time left to right, latents open, data shaded, context squares.
+    """Draw an unrolled graph: time left to right, latents open, data shaded, context squares.
 
     Args:
-        dag: nodes (name, t), (name, None) with attribute `kind`, as `Factorization.dag` makes them.
+        dag: graph of `Factorization.dag`, with nodes (name, t) or (name, None) and attribute `kind`.
         ax: matplotlib axes; a new figure if None.
-        missing: arrows to add, dashed red.
-        redundant: arrows of the graph to show dotted grey.
+        missing: edges to add, dashed red.
+        redundant: edges of the graph to show dotted grey.
     """
     import matplotlib.pyplot as plt
 
@@ -65,14 +65,15 @@ def draw_slice(
     top: float = 0.0,
     unsure: Collection[tuple[Any, Any]] = (),
 ) -> Axes:
-    """Draws what one step reads, past to the left and future to the right, each arrow as thick as its price.
+    """Draw what one step reads, with the past on the left, the future on the right, and edge widths by KL gap.
 
     Args:
-        graph: as `Factorization.slice` makes it.
-        prices: of its edges, which are written beside them. One of 0 or less is dotted; an edge without is thin.
+        graph: graph of `Factorization.slice`.
+        prices: KL gap of each edge, printed at the edge. A gap of about 0 or less is dotted; an edge without one is
+            thin.
         ax: matplotlib axes.
-        top: what the thickest arrow costs, by default the highest of these prices.
-        unsure: edges to draw pale.
+        top: KL gap of the widest edge; at least the highest of `prices`.
+        unsure: edges to draw in a lighter colour.
     """
     place = _slice_layout(graph)
     patches = {
@@ -96,7 +97,7 @@ def draw_slice(
 
 
 def _circled(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch:
-    """A node with what it is called."""
+    """Draw a node with its label."""
     from matplotlib.patches import Circle, Rectangle
 
     (x, y), side = xy, 2 * RADIUS
@@ -109,7 +110,7 @@ def _circled(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch
 def _arrow(
     ax: Axes, edge: tuple[Any, Any], place: Mapping[Any, Any], patches: Mapping[Any, Patch], style: dict[str, Any]
 ) -> float:
-    """An arrow between two nodes; how it bends."""
+    """Draw an edge between two nodes and return its curvature."""
     from matplotlib.patches import FancyArrowPatch
 
     source, target = edge
@@ -129,7 +130,7 @@ def _finished(ax: Axes) -> Axes:
 
 
 def _layout(dag: nx.DiGraph) -> dict[Node, tuple[float, float]]:
-    """Static nodes on top, then a row per local variable, data last; shifted rows part their arrows."""
+    """Place static nodes on top, then one row per local variable, data last; shifted rows separate their edges."""
     T = max((t for _, t in dag if t is not None), default=1)
     static = [node for node in dag if node[1] is None]
     last = {name for name, t in dag if dag.nodes[name, t].get("kind") == "data"}
@@ -144,7 +145,7 @@ def _layout(dag: nx.DiGraph) -> dict[Node, tuple[float, float]]:
 
 
 def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
-    """Static nodes on top, then a row per local variable, data last; what is further from now further out."""
+    """Place static nodes on top, then one row per local variable, data last; past and future at the sides."""
     local = {name: graph.nodes[name, sub]["kind"] == "data" for name, sub in graph if sub is not None}
     rows = {name: row for row, name in enumerate(sorted(local, key=local.__getitem__), start=1)}
     place: dict[Any, tuple[float, float]] = {}
@@ -161,7 +162,7 @@ def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
 
 
 def _bend(source: Any, target: Any, place: Mapping[Any, tuple[float, float]]) -> float:
-    """The least curvature with which an arrow passes no other node; outwards along the first and last row."""
+    """Return the least curvature at which an edge avoids all other nodes; edges in outer rows bend outwards."""
     start, end = np.array(place[source]), np.array(place[target])
     others = np.array([xy for node, xy in place.items() if node not in (source, target)]).reshape(-1, 2)
     (dx, dy), along = end - start, np.linspace(0, 1, 60)[:, None]

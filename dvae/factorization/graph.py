@@ -1,8 +1,8 @@
-"""Factorizations as graphs: is a guide rich enough for its model, and what do both look like.
+"""Factorizations as graphs: audit whether a guide can represent the exact posterior, and draw both.
 
-The exact posterior of a latent, given what the guide has drawn before it and all that is given, depends on its Markov
-boundary among them (`dvae.factorization.inversion`). A guide that cannot read all of it pays in the bound, however
-large its networks are.
+The exact posterior of a latent, given the data and the latents that the guide has already drawn, depends on its Markov
+boundary among them (`dvae.factorization.inversion`). If a guide cannot read the whole boundary, its bound is not tight,
+however large its networks are.
 """
 
 from __future__ import annotations
@@ -29,32 +29,33 @@ if TYPE_CHECKING:
 def analytic_kl(
     generative: Factorization, inference: Factorization, hidden: Iterable[str] = (), steps: int | None = None
 ) -> dict[str, bool]:
-    """For which latents the bound may use the analytic KL(q(z_t | ...) || p(z_t | ...)).
+    """Return for which latents the bound may use the analytic KL(q(z_t | ...) || p(z_t | ...)).
 
-    That form holds the parents of z_t in the model fixed while it averages over z_t, so it is right exactly
-    where no such parent is a descendant of z_t in the guide. A backward guide q(z_t | z_{>t}, ...) for
-    p(z_t | z_{t-1}) draws z_{t-1} from z_t: the analytic form would be biased, and the log-ratio has to be
-    averaged instead. In place of hidden data the model reads its own mean, a function of that mean's parents: these
-    are then parents of z_t too.
+    The analytic form fixes the parents of z_t in the model and averages over z_t. It is therefore unbiased exactly if
+    no such parent is a descendant of z_t in the guide. A backward guide q(z_t | z_{>t}, ...) for p(z_t | z_{t-1}) draws
+    z_{t-1} from z_t, so the analytic form would be biased and the log-ratio is averaged instead.
+
+    The model replaces hidden data by its own mean, a function of the parents of that mean. These parents then count as
+    parents of z_t too.
 
     Args:
         generative, inference: p and q.
-        hidden: names of the data of which some entries are the model's own means (missing, or fed).
-        steps: T of the run. None for the answer that holds at every length; with masks of the user's own, at 16.
+        hidden: names of the data with entries replaced by the model's own means (missing, or scheduled sampling).
+        steps: T of the run. If None, the answer holds at every length; with custom masks, at T = 16.
 
     Returns:
-        {latent: True where the analytic form is unbiased}, in the order in which the guide draws them.
+        {latent: True if the analytic form is unbiased}, in the guide's drawing order.
     """
     relations, hidden = _relations(generative, inference), frozenset(hidden)
     if any(relation.intervals is None for relation in relations):
         T = steps or 16
     else:
         reach = sum(relation.lag for relation in relations)
-        T = 3 + (reach**2 if hidden else reach)  # lags that add up again and again meet within their product
+        T = 3 + (reach**2 if hidden else reach)  # repeated sums of lags meet within the product of the lags
         T = min(T, steps or T)
     model, guide = generative.dag(T), inference.dag(T)
     bits = {node: 1 << place for place, node in enumerate({**model.nodes, **guide.nodes})}
-    reads: dict[Node, int] = {}  # sets of nodes, as the bits of a number
+    reads: dict[Node, int] = {}  # sets of nodes, as the bits of an integer
     for node in nx.topological_sort(model):
         parents = model.pred[node]
         reads[node] = reduce(or_, (bits[p] | (reads[p] if p[0] in hidden else 0) for p in parents), 0)
@@ -74,7 +75,7 @@ def _relations(*factorizations: Factorization) -> list[Relation]:
 
 
 class _Tabled:
-    """What prints as lines of text, and in a notebook as a table, with a sentence."""
+    """A result that prints as lines of text and, in a notebook, as an HTML table with a caption."""
 
     header: ClassVar[tuple[str, ...]]
     rows: Any
@@ -94,18 +95,18 @@ class _Tabled:
 
 @dataclass(frozen=True)
 class Audit(_Tabled):
-    """What a guide reads, against what the exact posterior depends on.
+    """Comparison of what a guide reads with what the exact posterior depends on.
 
     Args:
         generative: the model.
         inference: the guide.
         observed: names of the observed variables.
-        missing_parents: for each latent, what the exact posterior depends on and the guide factor cannot see.
+        missing_parents: for each latent, what the exact posterior depends on and the guide factor does not read.
             The bound cannot be tight.
-        redundant_parents: for each latent, what the guide factor reads though the latent is independent of it
-            given the rest of what that factor reads. Harmless: nothing is lost by dropping it.
-        steps: the one length T that it holds for, where a mask is the user's own and may be another at every length;
-            None where it holds for all.
+        redundant_parents: for each latent, what the guide factor reads although the latent is independent of it
+            given the other parents. Dropping it loses nothing.
+        steps: the only length T for which the audit holds if there are custom masks, which may differ between lengths;
+            None if it holds for all lengths.
         summed: names of latents that are summed out.
 
     Example:
@@ -126,22 +127,22 @@ class Audit(_Tabled):
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
-        """{latent: relations as text}, such as `{"z": ("z_{<t}",)}`; only latents that miss something."""
+        """{latent: relations as text}, such as `{"z": ("z_{<t}",)}`, for latents with missing parents."""
         return _terms(self.missing_parents)
 
     @property
     def redundant(self) -> dict[str, tuple[str, ...]]:
-        """{latent: relations as text}; only latents whose factor reads something redundant."""
+        """{latent: relations as text}, for latents with redundant parents."""
         return _terms(self.redundant_parents)
 
     @property
     def exact(self) -> bool:
-        """True if nothing is missing: with a rich enough family the bound can reach the evidence."""
+        """True if nothing is missing: with a flexible enough family the bound can equal the evidence."""
         return not self.missing
 
     @property
     def rows(self) -> list[tuple[str, str, str]]:
-        """(guide factor, missing, redundant) as text, in the order in which the guide draws."""
+        """Rows (guide factor, missing, redundant) as text, in the guide's drawing order."""
         names = [name for block in self.inference.blocks for name in block.names]
         return [
             (
@@ -154,7 +155,7 @@ class Audit(_Tabled):
 
     @property
     def verdict(self) -> str:
-        """Whether the guide misses something, and which of its parents no variable of the pair explains."""
+        """A sentence: whether the guide misses something, and which of its variables the model does not contain."""
         known = {*self.generative.variables, *self.generative.context}
         alone = [name for name in self.inference.context if name not in known]
         said = f"; {', '.join(alone)} in the guide has no factor and is context that the data give" if alone else ""
@@ -165,7 +166,7 @@ class Audit(_Tabled):
         return f"not exact{where}: {found}{said}"
 
     def table(self) -> Table:
-        """A rich table with one row per guide factor."""
+        """Return a rich table with one row per guide factor."""
         from rich.table import Table
         from rich.text import Text
 
@@ -178,15 +179,15 @@ class Audit(_Tabled):
 
     @property
     def repaired(self) -> Factorization:
-        """The guide that reads what this one misses and not what is redundant, in the same order (see `faithful`).
+        """The guide with the missing and without the redundant parents, in the same drawing order; see `faithful`.
 
         Raises:
-            ValueError: a mask of the user's own in the model.
+            ValueError: the model contains a custom mask.
         """
         return faithful(self.generative, self.observed, self.inference.blocks, self.summed)
 
     def draw(self, T: int = 3, ax: Axes | None = None) -> Axes:
-        """Draws the guide over T steps: missing arrows dashed red, redundant ones dotted grey."""
+        """Draw the guide over T steps: missing edges dashed red, redundant edges dotted grey."""
         dag = self.inference.dag(T, self.observed)
         redundant = self._edges(self.redundant_parents, T)
         missing = self._edges(self.missing_parents, T)
@@ -211,27 +212,29 @@ def audit(
     observed: Iterable[str] = ("x",),
     summed: Iterable[str] = (),
 ) -> Audit:
-    """Compares what each factor of a guide reads with what the exact posterior factor depends on.
+    """Compare what each factor of a guide reads with what the exact posterior factor depends on.
 
-    The exact factor is p(latent | latents the guide has drawn before, all data and context); a variable that
-    the guide draws at all steps at once counts as drawn forward in time. Relations are read off `steps`
-    inner steps of the unrolled graphs, away from the first and the last, where there is no past or no future
-    to depend on; steps is widened where a relation reaches further. A pattern that is periodic in time (a lag
-    of 2 without one of 1) is listed as far as seen.
+    The exact factor is p(latent | latents the guide has already drawn, all data and context). A variable that the guide
+    draws at all steps at once counts as drawn forward in time.
 
-    A mask of the user's own is known at one length at a time, and may single out some steps: the graphs are then
-    compared at all of exactly `steps` steps, and the audit says so.
+    The audit unrolls both graphs and compares `steps` inner steps. It excludes the first and last steps, which have no
+    past or no future to depend on. More steps are compared if a relation has a longer lag. A pattern that is periodic
+    in time (a lag of 2 without a lag of 1) is listed only within these steps.
+
+    A custom mask is known only at a given length and may treat some steps differently. The graphs are then compared at
+    all of exactly `steps` steps, and the verdict reports this length.
 
     Args:
         generative: p, a factorization or its text.
-        inference: q, "" where nothing is latent; the prior if None.
-        steps: number of inner steps compared, 5 if None; with masks of the user's own T, the length that they will
-            be used at, 16 if None.
+        inference: q, a factorization or its text; "" without latents; the prior if None.
+        steps: number of inner steps compared, 5 if None. With custom masks, the length T at which they will be used,
+            16 if None.
         observed: names of the observed variables.
-        summed: names of latents that are summed out (`Discrete`), which the posterior of the others does not wait for.
+        summed: names of latents that are summed out (`Discrete`); the posterior of the others is not conditioned on
+            them.
 
     Raises:
-        ValueError: the two do not fit each other (see `dvae.factorization.notation.check_pair`).
+        ValueError: the guide does not fit the model, as defined by `dvae.factorization.notation.check_pair`.
 
     >>> dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})").missing
     {'z': ('z_{t-1}',)}
@@ -269,7 +272,7 @@ def audit(
     for child in latents:
         for name in local:
             lacking = view.offsets(lacks, child, name)
-            # An offset used anywhere is not redundant: near the edges of a chain any reading may be idle.
+            # An offset that any step needs is not redundant: near the ends of a chain every offset may be unused.
             unused = view.offsets(read.pred, child, name) & ~view.offsets(uses, child, name)
             for found, offsets in ((missing, lacking), (redundant, unused)):
                 if offsets.any():
@@ -282,14 +285,14 @@ def audit(
 
 @dataclass(frozen=True)
 class Derived:
-    """A guide that misses nothing, as `faithful` derives it.
+    """A guide that misses nothing, derived by `faithful`.
 
     Args:
-        order: in which it draws.
+        order: drawing order of the latents.
         inference: the guide.
-        arrows: of its graph unrolled, how much it reads.
-        looped: latents that it draws step by step; the others are drawn at all steps at once.
-        sampled: latents whose KL has no closed form under this guide, so that the bound has the noise of their draws.
+        arrows: number of edges of its unrolled graph.
+        looped: latents that are drawn step by step; the others are drawn at all steps at once.
+        sampled: latents whose KL has no closed form under this guide, so that the bound contains sampling noise.
     """
 
     order: Order
@@ -301,12 +304,12 @@ class Derived:
 
 @dataclass(frozen=True)
 class Alternatives(_Tabled):
-    """The guides of a model that miss nothing, the one with the fewest arrows first; those without a loop before it.
+    """The guides of a model that miss nothing. Guides without a loop are first, then those with the fewest edges.
 
     Attributes:
         generative: the model.
-        guides: what there is to choose from.
-        steps: T of the graphs whose arrows were counted.
+        guides: the guides to choose from.
+        steps: T of the graphs whose edges were counted.
 
     Example:
         >>> found = dvae.alternatives("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")
@@ -322,7 +325,7 @@ class Alternatives(_Tabled):
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
-        """(guide, order, arrows, latents in a loop, latents whose KL is averaged over draws) as text."""
+        """Rows (guide, order, edges, latents drawn in a loop, latents whose KL is averaged over draws) as text."""
         return [
             (
                 each.inference.text,
@@ -336,11 +339,11 @@ class Alternatives(_Tabled):
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """A caption for the table."""
         return f"each reads what the posterior depends on in its order (see `faithful`); arrows of {self.steps} steps"
 
     def table(self) -> Table:
-        """A rich table with one row per guide."""
+        """Return a rich table with one row per guide."""
         from rich.table import Table
         from rich.text import Text
 
@@ -361,16 +364,16 @@ class Alternatives(_Tabled):
 def alternatives(
     generative: Factorization | str, observed: Iterable[str] = ("x",), steps: int = 10, summed: Iterable[str] = ()
 ) -> Alternatives:
-    """All guides that `faithful` derives, one for each order of drawing; one for those that have the same.
+    """Return all guides that `faithful` derives, one for each drawing order, without duplicates.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
-        steps: T at which arrows are counted.
-        summed: see `faithful`.
+        steps: T at which edges are counted.
+        summed: names of latents that are summed out, as in `faithful`.
 
     Raises:
-        ValueError: as `faithful`; a model without latents.
+        ValueError: `steps` is less than 1, the model has no latents, or `faithful` raises it.
 
     Example:
         >>> print(dvae.alternatives("p(z_t | z_{t-1}) p(x_t | z_t)"))

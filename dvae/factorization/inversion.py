@@ -1,11 +1,13 @@
-"""Faithful inversion: the guide that a model's own graph asks for, in a stated order of drawing.
+"""Faithful inversion: derive a guide from the graph of a model, for a given drawing order.
 
-Latents that are drawn one after the other have the posterior prod_i p(v_i | v_{<i}, data). Each factor depends on its
-Markov boundary among what is given there, and on nothing else; d-separation is a compositional graphoid, so that this
-boundary is unique: v is in it where it is not separated from v_i by all the rest (Pearl, 1988). A guide that reads
-exactly that misses nothing, and every arrow of it is needed; another order has another such guide (Webb, Golinski,
-Zinkov, Siddharth, Rainforth, Teh and Wood, 2018, arXiv 1712.00287). Boundaries are found in the graph unrolled over
-time, by the moral-graph criterion (Lauritzen, Dawid, Larsen and Leimer, 1990), and folded back into relations.
+The posterior of latents that are drawn one after the other is prod_i p(v_i | v_{<i}, data). Each factor depends only on
+its Markov boundary among the given variables. d-separation is a compositional graphoid, so this boundary is unique: it
+contains v if v is not d-separated from v_i by all other given variables (Pearl, 1988).
+
+A guide that reads exactly the boundary misses nothing, and all of its edges are necessary. Each order has its own such
+guide (Webb, Golinski, Zinkov, Siddharth, Rainforth, Teh and Wood, 2018, arXiv 1712.00287). Boundaries are computed in
+the graph unrolled over time, by the moral-graph criterion (Lauritzen, Dawid, Larsen and Leimer, 1990), and converted
+back into relations.
 """
 
 from __future__ import annotations
@@ -24,13 +26,13 @@ from .notation import Block, Factor, Factorization, Parent, unrolled
 from .relations import ALL, MaskFunction, Relation
 
 FAITHFUL = "faithful"
-"""In the place of a guide's equations: the one that `faithful` derives."""
+"""Value in place of a guide's equations that selects the guide derived by `faithful`."""
 Order = tuple[Block, ...]
-"""Blocks of latents as they are drawn, each at all of its steps before the next one."""
+"""Blocks of latents in drawing order; each block is drawn at all of its steps before the next one."""
 
 
 class MarkovBoundaries:
-    """The Markov boundaries of the nodes of a graph, whose sets of nodes are the bits of integers here.
+    """The Markov boundaries of the nodes of a graph; sets of nodes are stored as the bits of integers.
 
     Args:
         dag: directed acyclic graph, edges from parent to child.
@@ -45,10 +47,11 @@ class MarkovBoundaries:
     def of(self, node: Node, given: AbstractSet[Node]) -> set[Node]:
         """Return the smallest part of `given` that makes `node` independent of the rest of `given`.
 
-        u is in it exactly when node and u are not d-separated by the others. What is not given is integrated out.
+        The boundary contains u exactly if `node` and u are not d-separated by the other given nodes. Other nodes are
+        integrated out.
 
         Args:
-            node: a node that is not in given.
+            node: a node that is not in `given`.
             given: nodes whose values are known.
         """
         start, known = self.bits[node], self._joined(given)
@@ -59,7 +62,7 @@ class MarkovBoundaries:
                 above |= self.parents[place]
             frontier = above & ~kept
             kept |= frontier
-        # In the moral graph of these a child and its parents, a family, are neighbours; given nodes stop a path.
+        # In the moral graph of these nodes, a child and its parents (a family) are neighbours. Given nodes block paths.
         boundary, families, walked, frontier = 0, 0, start, start
         while frontier:
             reached = frontier
@@ -87,12 +90,12 @@ def _places(bits: int) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Unrolled:
-    """Variables over the inner steps of a graph, with as many on either side that count for nothing.
+    """Variables over the inner steps of an unrolled graph, between margins that are excluded from the result.
 
     Args:
-        local: name to whether there is one value a step.
-        width: inner steps.
-        margin: steps on either side.
+        local: {name: whether the variable has one value per step}.
+        width: number of inner steps.
+        margin: number of steps on either side.
     """
 
     local: Mapping[str, bool]
@@ -101,27 +104,27 @@ class Unrolled:
 
     @property
     def length(self) -> int:
-        """T."""
+        """T, the number of steps with both margins."""
         return self.width + 2 * self.margin
 
     def nodes(self, name: str) -> list[Node]:
-        """Of a variable."""
+        """Return the nodes of a variable."""
         return unrolled(name, self.local[name], self.length)
 
     def inner(self, name: str) -> list[Node]:
-        """Of a variable, those that count; that of a static one does."""
+        """Return the nodes of a variable at the inner steps; the only node of a static variable."""
         return self.nodes(name)[self.margin : self.margin + self.width] or self.nodes(name)
 
     def drawn(self, order: Sequence[Block]) -> Iterator[Node]:
-        """Latents one after the other; those of a block that is drawn at all steps at once, forward in time."""
+        """Yield the latent nodes in drawing order; a block drawn at all steps at once is yielded forward in time."""
         for block in order:
             for step in zip(*(self.nodes(name)[:: block.direction or 1] for name in block.names), strict=True):
                 yield from step
 
     def offsets(self, edges: Mapping[Node, Iterable[Node]], child: str, parent: str) -> np.ndarray:
-        """Whether an inner step of the child has an inner one of the parent at offset s - t = -(W-1), ..., W-1.
+        """Return whether an inner step of the child reads the parent at each offset s - t = -(W-1), ..., W-1.
 
-        (1,), whether there is any at all, where one of the two is static.
+        If one of the two is static, the result has shape (1,): whether there is any edge.
         """
         rows, columns = map(self.inner, (child, parent))
         arrows = np.array([[column in edges[row] for column in columns] for row in rows])
@@ -130,7 +133,7 @@ class Unrolled:
         return np.array([arrows.diagonal(offset).any() for offset in range(1 - self.width, self.width)])
 
     def parent(self, child: str, name: str, offsets: np.ndarray) -> Parent:
-        """What reads these offsets; one that reaches the last offset in view has no end."""
+        """Return a parent with these offsets; a relation that includes the last offset in view is unbounded."""
         relation = ALL if self.local[name] else None
         if self.in_time(child, name):
             far = self.width - 1
@@ -139,7 +142,7 @@ class Unrolled:
         return Parent(name, self.local[name], relation)
 
     def in_time(self, child: str, parent: str) -> bool:
-        """Whether the arrows between two variables have offsets."""
+        """Return whether the edges between two variables have offsets, which requires that both are local."""
         return self.local[child] and self.local[parent]
 
 
@@ -149,23 +152,23 @@ def faithful(
     order: Sequence[Block] | None = None,
     summed: Iterable[str] = (),
 ) -> Factorization:
-    """The smallest guide that misses nothing of what the exact posterior depends on, drawn in this order.
+    """Return the smallest guide that contains every dependency of the exact posterior in this drawing order.
 
-    Without one of its arrows it could not be exact, with one exception: a pattern that is periodic in time (a lag of 2
-    without one of 1) has no end in this notation, and far away, beyond twice the sum of the model's lags for each
-    latent, the guide reads all steps, more than it needs.
+    Every edge is necessary for exactness, with one exception. A pattern that is periodic in time (a lag of 2 without a
+    lag of 1) cannot be written in this notation. Beyond twice the sum of the model's lags for each latent, the guide
+    then reads all steps, which is more than it needs.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
-        order: of the latents, see `orders`; by default static ones first, then step by step forward in time, within a
-            step as the model draws them.
+        order: drawing order, such as one of `orders`. By default, static latents are first, then local ones step by
+            step forward in time, within a step in the order of the model.
         summed: names of latents that are summed out (`Discrete`), which no guide draws.
 
     Raises:
-        ValueError: an observed variable that the model lacks; an order that is not of its latents, each once, or mixes
-            static and local ones; a mask of the user's own, which is known at one length alone.
-        TypeError: an order of something else than blocks.
+        ValueError: an observed variable is not in the model; the order does not contain each latent once, or mixes
+            static and local latents in a block; the model has a custom mask, which is known only at a given length.
+        TypeError: the order contains something else than blocks.
 
     >>> print(dvae.faithful("p(z_t | z_{t-1}) p(x_t | z_t)").text)
     q(z_t | z_{t-1}, x_{>=t})
@@ -200,9 +203,9 @@ def faithful(
 
     def factor(child: str) -> Factor:
         found = []
-        for name in sorted(names, key=lambda name: not view.local[name]):  # static parents last, as papers write them
+        for name in sorted(names, key=lambda name: not view.local[name]):  # static parents last, as in papers
             offsets = view.offsets(needs, child, name)
-            if view.in_time(child, name):  # what is so far away comes again and again
+            if view.in_time(child, name):  # a dependency this far away repeats periodically
                 far = np.flatnonzero(offsets) - (view.width - 1)
                 for side in (-1, 1):
                     if (beyond := far[side * far > 2 * reach]).size:
@@ -219,15 +222,15 @@ def faithful(
 def orders(
     generative: Factorization | str, observed: Iterable[str] = ("x",), summed: Iterable[str] = ()
 ) -> Iterator[Order]:
-    """In which latents may be drawn: static ones first or last, the others forward or backward in time.
+    """Yield the drawing orders of the latents: static ones first or last, the others forward or backward in time.
 
-    Several local latents are drawn together, step by step, in every order within a step, or one at all of its steps
-    after the other.
+    Several local latents are either drawn together step by step, in every order within a step, or one after the other,
+    each at all of its steps.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
-        summed: see `faithful`.
+        summed: names of latents that are summed out, as in `faithful`.
 
     >>> [spelled(order) for order in orders("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")]
     ['w, z forward', 'w, z backward', 'z forward, w', 'z backward, w']
@@ -246,13 +249,13 @@ def orders(
 
 
 def spelled(order: Sequence[Block]) -> str:
-    """An order in words."""
+    """Return an order in words."""
     ways = {1: " forward", -1: " backward", 0: ""}
     return ", ".join(" with ".join(block.names) + ways[block.direction] for block in order)
 
 
 def _latents(generative: Factorization, observed: tuple[str, ...], summed: tuple[str, ...]) -> list[str]:
-    """As the model draws them, but for what is summed out."""
+    """Return the latents in the model's drawing order, without latents that are summed out."""
     for name in (*observed, *summed):
         generative.factor(name)
     return [name for block in generative.blocks for name in block.names if name not in (*observed, *summed)]
@@ -265,15 +268,15 @@ def guide(
     masks: Mapping[str, Relation | MaskFunction] | None = None,
     summed: Iterable[str] = (),
 ) -> Factorization:
-    """The guide that is meant.
+    """Return the guide that an argument describes.
 
     Args:
         generative: the model.
-        inference: a factorization or its text; "faithful" for the one that `faithful` derives, None for the prior, or
-            "" where nothing is latent.
+        inference: a factorization or its text; "faithful" for the guide that `faithful` derives, None for the prior, ""
+            without latents.
         observed: names of the observed variables.
-        masks: see `Factorization.parse`.
-        summed: see `faithful`.
+        masks: custom relations, as in `Factorization.parse`.
+        summed: names of latents that are summed out, as in `faithful`.
 
     Raises:
         NotationError, ValueError, TypeError: as in `Factorization.parse` and `faithful`.

@@ -1,4 +1,4 @@
-r"""Equations as a paper writes them, parsed into factorizations: who reads whom, and at which time steps.
+r"""Parse equations as papers write them into factorizations: which variables a factor reads, and at which time steps.
 
     p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)
 
@@ -11,8 +11,8 @@ autoencoders: a comprehensive review* (arXiv 2008.12595).
     relation := t | {t-k} | {t+k} | {<t} | {<=t} | {>t} | {>=t} | {a:b} | {1:T} | {a name given in masks}
                 where a is 1, t, t-k or t+k and b is T, t, t-k or t+k
 
-LaTeX spellings (\mid, \leq, \geq, \prod_t) are understood, and fonts (\mathbf{z}_t) ignored. A parent without a
-factor of its own is *context*: given, never drawn.
+The parser understands LaTeX spellings (\mid, \leq, \geq, \prod_t) and ignores fonts (\mathbf{z}_t). A parent without
+a factor is *context*: it is given and never drawn.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ FONT = r"\\(?:math(?:bf|rm|it|sf)|boldsymbol|bm)(?![a-z])\s*"
 
 @dataclass(frozen=True)
 class Parent:
-    """A variable that a factor reads: local with a relation in time, or static with none."""
+    """A variable that a factor reads: a local variable with a relation in time, or a static variable without one."""
 
     name: str
     local: bool
@@ -56,7 +56,7 @@ class Parent:
 
     @property
     def pieces(self) -> tuple[tuple[str, str | None], ...]:
-        """(name, subscript) as written, such as `(("x", "<t"), ("x", ">t"))`; None if static."""
+        """Pairs (name, subscript) as written, such as `(("x", "<t"), ("x", ">t"))`; subscript None if static."""
         if self.relation is None:
             return ((self.name, None),)
         return tuple((self.name, part.name[1:-1]) for part in self.relation.parts)
@@ -80,11 +80,11 @@ class Factor:
     parents: tuple[Parent, ...] = ()
 
     def parent(self, name: str) -> Parent | None:
-        """The parent of that name, or None where the factor does not read it."""
+        """Return the parent with this name, or None if the factor does not read it."""
         return next((parent for parent in self.parents if parent.name == name), None)
 
     def mask(self, parent: str, T: int) -> np.ndarray:
-        """Which steps of a parent each step reads, (T or 1, T or 1); see `Factorization.mask`."""
+        """Return which steps of a parent each step reads, a bool array (T or 1, T or 1), as in `Factorization.mask`."""
         reads = self.parent(parent)
         if reads is None:
             raise ValueError(f"{self} does not read {parent}")
@@ -100,7 +100,7 @@ class Factor:
         return mask
 
     def edges(self, T: int) -> list[tuple[Node, Node]]:
-        """The arrows (parent, child) of the graph unrolled over T steps; see `Factorization.dag`."""
+        """Return the edges (parent, child) of the graph unrolled over T steps, as in `Factorization.dag`."""
         found, children = [], unrolled(self.child, self.local, T)
         for parent in self.parents:
             parents = unrolled(parent.name, parent.local, T)
@@ -108,7 +108,7 @@ class Factor:
         return found
 
     def render(self, variable: Callable[[str, str | None], str], bar: str = " | ") -> str:
-        """The factor as text, each variable written by `variable(name, subscript)`."""
+        """Return the factor as text; `variable(name, subscript)` formats each variable."""
         child = variable(self.child, "t" if self.local else None)
         given = ", ".join(variable(*piece) for parent in self.parents for piece in parent.pieces)
         return f"{self.kind}({child}{bar + given if given else ''})"
@@ -122,9 +122,9 @@ class Block:
     """Variables that are drawn together.
 
     Args:
-        names: in the order in which they are drawn within a step.
-        direction: 0 all steps at once (always a single variable); +1 step by step forward in time, -1
-            backward.
+        names: variables in drawing order within a step.
+        direction: 0 for all steps at once (always a single variable), +1 for step by step forward in time,
+            -1 for backward.
     """
 
     names: tuple[str, ...]
@@ -159,14 +159,15 @@ def _html(name: str, subscript: str | None) -> str:
 class Factorization:
     """A joint distribution over sequences, as a product of conditional distributions.
 
-    Made by `parse`. Construction checks that it can be drawn: a variable that reads what is drawn after
-    it is refused, with the cycle. The order in which factors are written matters only as a tie-break.
+    Create it with `parse`. Construction checks that the variables can be drawn in some order. It raises an error, which
+    shows the cycle, if a variable reads another that is drawn after it. The written order of the factors only breaks
+    ties.
 
     >>> print(dvae.Factorization.parse("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)"))
     p(x_{1:T}, z_{1:T}, w) = p(w) ∏_t p(z_t | z_{t-1}, w) p(x_t | z_t)
 
     Raises:
-        ValueError: a cycle, both time directions in one loop, or a bad custom mask.
+        ValueError: the factors form a cycle, one loop needs both time directions, or a custom mask is invalid.
     """
 
     kind: Literal["p", "q"]
@@ -182,17 +183,17 @@ class Factorization:
     def parse(
         cls, text: str | Factorization, masks: Mapping[str, Relation | MaskFunction] | None = None
     ) -> Factorization:
-        """Reads equations such as `"p(z_t | z_{t-1}) p(x_t | z_t)"`.
+        """Parse equations such as `"p(z_t | z_{t-1}) p(x_t | z_t)"`.
 
         Args:
-            text: the factors, all p or all q; what is a factorization already is returned.
-            masks: relations of the user's own: `masks={"band": function}` gives `z_{band}` its meaning,
-                where function(T) is a bool array (T, T), rows t, columns s; or a Relation.
+            text: factors, all p or all q; a `Factorization` is returned unchanged.
+            masks: custom relations; `masks={"band": function}` defines `z_{band}`, where function(T) returns a bool
+                array (T, T) with rows t and columns s. Values may also be `Relation` objects.
 
         Raises:
-            NotationError: the text cannot be read; the message shows the column.
-            ValueError: it can be read but not drawn (see the class).
-            TypeError: not text at all.
+            NotationError: the text cannot be parsed; the message shows the column.
+            ValueError: the text is valid, but the variables cannot be drawn (see the class).
+            TypeError: `text` is neither a string nor a `Factorization`.
         """
         if isinstance(text, Factorization):
             return text
@@ -200,43 +201,44 @@ class Factorization:
             raise TypeError(f'equations are text such as "p(z_t | z_{{t-1}}) p(x_t | z_t)", got {text!r}')
         return cls(*_Reader(text, masks or {}).factorization())
 
-    # what there is -----------------------------------------------------------------------------------------
+    # variables and parents ---------------------------------------------------------------------------------
 
     @cached_property
     def variables(self) -> tuple[str, ...]:
-        """Names with a factor, in written order."""
+        """Names of the variables with a factor, in written order."""
         return tuple(factor.child for factor in self.factors)
 
     @cached_property
     def context(self) -> tuple[str, ...]:
-        """Names that are read but have no factor, in order of appearance. A guide's include the data."""
+        """Names that are read but have no factor, in order of appearance. In a guide they include the data."""
         parents = (parent.name for factor in self.factors for parent in factor.parents)
         return tuple(name for name in dict.fromkeys(parents) if name not in self.variables)
 
     def factor(self, name: str) -> Factor:
-        """The factor of a variable; ValueError where it has none."""
+        """Return the factor of a variable; raise ValueError if it has none."""
         for factor in self.factors:
             if factor.child == name:
                 return factor
         raise ValueError(f"no factor for {name!r} in {self.text!r}; there are factors for {_names(self.variables)}")
 
     def prior_guide(self, observed: Iterable[str] = ("x",)) -> Factorization:
-        """The prior as a guide: the factors of the latents, as q. Without latents it has no factor.
+        """Return the prior as a guide: the factors of the latents, written as q. It has no factors without latents.
 
         Args:
-            observed: names of what has no factor in it, and of what is summed out.
+            observed: names of the variables to leave out: observed variables and latents that are summed out.
         """
         observed = tuple(observed)
         return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
 
     def given(self, local: Iterable[str], static: Iterable[str], but: Collection[str] = ()) -> Factorization:
-        """The same with context that factors read too: those of local variables at t, those of static latents nothing.
+        """Return the factorization with additional context that its factors read.
 
-        A static variable of a guide reads all steps of local context.
+        Factors of local variables read local context at t; factors of static variables read all its steps. Static
+        variables without parents read none.
 
         Args:
             local, static: names of the context.
-            but: factors that read none, such as "p(z)".
+            but: factors that do not read it, such as "p(z)".
         """
         factors = []
         for factor in self.factors:
@@ -250,7 +252,7 @@ class Factorization:
         return replace(self, factors=tuple(factors))
 
     def local(self, name: str) -> bool:
-        """True for a variable with one value per time step, False for one per sequence."""
+        """Return True for a variable with one value per time step, False for one value per sequence."""
         if name not in self._locality:
             raise ValueError(f"no variable {name!r} in {self.text!r}; there are {_names(self._locality)}")
         return self._locality[name]
@@ -268,12 +270,12 @@ class Factorization:
         return {part.name[1:-1]: part.function for part in parts if part.function is not None}
 
     def mask(self, child: str, parent: str, T: int) -> np.ndarray:
-        """Which steps of the parent (columns) each step of the child (rows) may read.
+        """Return which steps of the parent (columns) each step of the child (rows) may read.
 
         Returns:
-            Bool array (T or 1, T or 1): T for a local variable, 1 for a static one, so a local child of a
-            local parent has (T, T), of a static parent (T, 1), and a static child of a local parent (1, T).
-            All False where the child does not read that variable.
+            Bool array (T or 1, T or 1): T for a local variable, 1 for a static one. The shape is (T, T) for a local
+            child and parent, (T, 1) for a static parent and (1, T) for a static child of a local parent. All entries
+            are False if the child does not read the parent.
         """
         factor = self.factor(child)
         if factor.parent(parent) is None:
@@ -282,10 +284,10 @@ class Factorization:
 
     @property
     def arrows(self) -> tuple[tuple[str, Parent], ...]:
-        """(child, parent) for all that is read, the past, the same step and the future apart.
+        """The dependencies (child, parent), with the past, the same step and the future as separate edges.
 
-        Of q(z_t | x_{1:T}, w) these are x_{<t}, x_t, x_{>t} and w. What a static variable reads is one arrow, and so is
-        a mask of the user's own.
+        For q(z_t | x_{1:T}, w) the parents are x_{<t}, x_t, x_{>t} and w. A parent of a static variable is a single
+        edge, and so is a custom mask.
         """
 
         def sides(factor: Factor, read: Relation | None) -> Iterable[Relation | None]:
@@ -301,14 +303,14 @@ class Factorization:
         )
 
     def arrow(self, child: str, parent: Parent) -> str:
-        """One of its `arrows` in words, such as "x_{<t} to z_t"."""
+        """Return one of the `arrows` in words, such as "x_{<t} to z_t"."""
         return f"{parent} to {_plain(child, 't' if self.local(child) else None)}"
 
     def without(self, child: str, parent: Parent) -> Factorization:
-        """The same less one of its `arrows`.
+        """Return the factorization without one of its `arrows`.
 
         Raises:
-            ValueError: an arrow that it does not have.
+            ValueError: the factorization does not contain this edge.
         """
         factor = self.factor(child)
         if (child, parent) not in self.arrows:
@@ -324,14 +326,15 @@ class Factorization:
         fewer = replace(factor, parents=tuple(read for read in reads if read is not None))
         return replace(self, factors=tuple(fewer if each is factor else each for each in self.factors))
 
-    # how it is drawn ---------------------------------------------------------------------------------------
+    # sampling order ----------------------------------------------------------------------------------------
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
-        """Blocks of variables in an order in which they can be drawn; written order breaks ties.
+        """Blocks of variables in a valid drawing order; the written order breaks ties.
 
-        A block is a strongly connected set of variables (v leads to u if u reads v at any step): drawn in one
-        loop over time, or all steps at once for a variable that does not feed back into itself.
+        A block is a strongly connected component of the graph with an edge from v to u if u reads v at any step. Its
+        variables are drawn in one loop over time. A variable that does not depend on its own values is drawn at all
+        steps at once.
         """
         reads = nx.DiGraph()
         reads.add_nodes_from(self.variables)
@@ -351,7 +354,7 @@ class Factorization:
                 raise self._undrawable(factor, parent, f"{parent.name} is drawn from {factor.child}")
             where[factor.child, parent.name] = parent.relation.directions
         seen = frozenset().union(*where.values())
-        # A generative model runs forward, so that it can forecast; only a guide may run backward in time.
+        # A generative model runs forward because it must be able to forecast; only a guide may run backward.
         direction: Literal[-1, 1] = -1 if self.kind == "q" and 1 in seen and -1 not in seen else 1
         for factor, parent in reads:
             if direction in where[factor.child, parent.name]:
@@ -372,14 +375,14 @@ class Factorization:
         return Block(names, direction)
 
     def _blame(self, now: nx.DiGraph) -> tuple[Factor, Parent]:
-        """One read of a cycle within a step: a variable's own, else a range such as {<=t}, else the first."""
+        """Choose the dependency of a cycle to report: a self-loop, else a range such as {<=t}, else the first."""
         cycle = set(next(nx.simple_cycles(now)))
         reads = [(f, p) for f in self.factors for p in f.parents if {f.child, p.name} <= cycle]
         reads = [(f, p) for f, p in reads if now.has_edge(p.name, f.child)]
         return min(reads, key=lambda read: (read[0].child != read[1].name, read[1].relation == NOW))
 
     def _undrawable(self, factor: Factor, parent: Parent, why: str, direction: int = 0) -> ValueError:
-        """The refusal: factor, parent, reason, shortest cycle and, for a local parent, the likely meaning."""
+        """Return the error: factor, parent, reason, shortest cycle and, for a local parent, the likely intention."""
         message = f"{factor} reads {parent}, but {why}"
         if cycle := self._cycle(factor.child, parent.name):
             message += f" (cycle {' -> '.join(_node(*node) for node in cycle)})"
@@ -392,7 +395,7 @@ class Factorization:
         return ValueError(message)
 
     def _cycle(self, child: str, parent: str) -> list[Node]:
-        """The shortest cycle through child reading parent in the unrolled graph, from step 2; or []."""
+        """Return the shortest unrolled cycle with child reading parent, preferably from step 2; [] without a cycle."""
         relations = [p.relation for f in self.factors for p in f.parents if p.relation is not None]
         dag = self.dag(max((11 if r.intervals is None else 3 + r.lag for r in relations), default=3))
         found: list[list[Node]] = []
@@ -402,12 +405,12 @@ class Factorization:
         return min(found, key=lambda path: (len(path), abs((path[0][1] or 2) - 2)), default=[])
 
     def dag(self, T: int, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
-        """The graph unrolled over T steps, edges from parent to child.
+        """Return the graph unrolled over T steps, with edges from parent to child.
 
         Returns:
-            networkx.DiGraph with nodes (name, t), t = 1, ..., T, and (name, None) for static variables. The
-            node attribute `kind` is "data" for observed variables, "latent" for others with a factor, else
-            "context".
+            networkx.DiGraph with nodes (name, t), t = 1, ..., T, and (name, None) for static variables. The node
+            attribute `kind` is "data" for observed variables, "latent" for other variables with a factor, and "context"
+            otherwise.
         """
         dag, observed = nx.DiGraph(), tuple(observed)
         for name in (*self.context, *self.variables):
@@ -418,12 +421,12 @@ class Factorization:
         return dag
 
     def slice(self, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
-        """The graph of one step: an edge for each of `arrows`, from what is read at its steps to the variable at t.
+        """Return the graph of one step, with an edge from the parent to the variable at t for each of `arrows`.
 
         Returns:
             networkx.DiGraph with nodes (name, subscript), such as ("x", "<t") and ("z", "t"), and (name, None) for
-            static variables, in the order of the arrows. Their attributes are `kind`, as in `dag`, `label` in LaTeX,
-            and `side`: -1 for the past and for all steps, 0 for t, 1 for the future; of edges, `arrow`.
+            static variables, in the order of `arrows`. Node attributes are `kind`, as in `dag`, `label` in LaTeX, and
+            `side`: -1 for the past and for all steps, 0 for t, 1 for the future. The edge attribute is `arrow`.
         """
         graph, observed = nx.DiGraph(), tuple(observed)
 
@@ -442,11 +445,11 @@ class Factorization:
             graph.add_edge(*reads, arrow=(child, parent))
         return graph
 
-    # how it looks ------------------------------------------------------------------------------------------
+    # text and figures --------------------------------------------------------------------------------------
 
     @property
     def text(self) -> str:
-        """The factors in written order and canonical spelling; `parse` reads it back."""
+        """The factors in written order and canonical spelling; `parse` accepts it."""
         return " ".join(map(str, self.factors))
 
     def _joint(self, variable: Callable[[str, str | None], str], bar: str, product: str) -> str:
@@ -470,15 +473,15 @@ class Factorization:
         return f"<span>{self._joint(_html, ' | ', '∏<sub><i>t</i></sub>')}</span>"
 
     def draw(self, T: int = 3, ax: Axes | None = None, observed: Iterable[str] = ("x",)) -> Axes:
-        """Draws the graphical model unrolled over T steps, time left to right.
+        """Draw the graphical model unrolled over T steps, with time from left to right.
 
-        Latents are open circles, data shaded, context squares. Returns the matplotlib axes.
+        Latents are open circles, data shaded circles, context squares. Returns the matplotlib axes.
         """
         return draw_dag(self.dag(T, observed), ax=ax)
 
 
 def unrolled(name: str, local: bool, T: int) -> list[Node]:
-    """The nodes of a variable over T steps."""
+    """Return the nodes of a variable over T steps."""
     return [(name, t) for t in range(1, T + 1)] if local else [(name, None)]
 
 
@@ -490,11 +493,11 @@ def _names(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
-# ---------------------------------------------------------------------------------------------------- reading
+# ---------------------------------------------------------------------------------------------------- parsing
 
 
 class _Reader:
-    """A recursive-descent reader of the grammar above, which knows its column."""
+    """A recursive-descent parser of the grammar above that tracks the column for error messages."""
 
     SPACE = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad)*")
     BETWEEN = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad|[*·,]|\\cdot|(?:∏|\\prod)(?:_\{t(?:=1\}\^\{?T)?\}|_t)?)*")
@@ -520,7 +523,7 @@ class _Reader:
         raise NotationError(f"{message}\n    {line}\n    {' ' * (at - start)}^")
 
     def take(self, pattern: str | re.Pattern[str]) -> re.Match[str] | None:
-        """Skips spaces, then matches the pattern and moves behind it; None where it is not there."""
+        """Skip spaces, then consume and return a match of the pattern; return None if it does not match."""
         space = self.SPACE.match(self.text, self.at)
         self.at = space.end() if space else self.at
         match = re.compile(pattern).match(self.text, self.at)
@@ -635,20 +638,20 @@ def check_pair(
     sizes: Mapping[str, int] | None = None,
     summed: Collection[str] = (),
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Checks that a guide fits a generative model.
+    """Check that a guide fits a generative model.
 
     Args:
         generative: p over latents and observed variables.
         inference: q over the latents, given the data.
         observed: names of the observed variables.
         sizes: dimension of every variable, context included; not checked if None.
-        summed: names of latents that are summed out, which the guide neither draws nor reads.
+        summed: names of latents that are summed out, which the guide may neither draw nor read.
 
     Returns:
-        Names (latents, observed, context): latents in the order in which the guide draws them.
+        Names (latents, observed, context), with latents in the guide's drawing order.
 
     Raises:
-        ValueError: naming what does not fit, and what to write.
+        ValueError: the guide or `sizes` do not fit the model; the message names the variable and the correction.
     """
     observed = tuple(observed)
     if generative.kind != "p" or inference.kind != "q":

@@ -1,4 +1,4 @@
-"""Relations in time: which steps of a parent a child may read, as text, as masks, and composed."""
+"""Relations in time: which steps of a parent a child may read, as text and as masks, with set operations."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ MaskFunction = Callable[[int], np.ndarray]
 
 KNOWN_RELATIONS = "t, {t-1}, {t+1}, {t-k}, {t-a:t+b}, {<t}, {<=t}, {>t}, {>=t}, {1:t}, {t:T}, {1:T}"
 FARTHER = (16, 32, 64)
-"""Lengths at which the direction of a custom mask is looked up, after 2 to 8; every run checks it at its own."""
+"""Further lengths, after 2 to 8, at which the direction of a custom mask is inferred; every run checks it at its own T.
+"""
 
 
 class NotationError(ValueError):
-    """An equation that cannot be read; the message shows the text with a caret under the column."""
+    """An equation that cannot be parsed; the message shows the text with a caret under the column."""
 
 
 @dataclass(frozen=True)
 class Relation:
-    """Which steps s of a parent the child at step t may read: offsets s - t, or a mask of the user's own.
+    """Which steps s of a parent the child at step t may read: offsets s - t, or a custom mask.
 
-    Relations compose: `a | b` (either), `a & b` (both), `~a` (the other steps).
+    Relations support set operations: `a | b` (union), `a & b` (intersection), `~a` (complement).
 
     Args:
-        name: as it stands in an equation, such as `"{<t}"`.
+        name: spelling in an equation, such as `"{<t}"`.
         intervals: sorted disjoint intervals of offsets s - t, both ends included and possibly infinite:
-            `{t-1}` is `((-1, -1),)`, `{<t}` is `((-inf, -1),)`. None for a mask of the user's own.
-        function: for a mask of the user's own, T -> bool array (T, T), rows t, columns s. (1, T) means the
-            same row for every t, and is the only shape a static child can have.
+            `{t-1}` is `((-1, -1),)`, `{<t}` is `((-inf, -1),)`. None for a custom mask.
+        function: custom mask, T -> bool array (T, T) with rows t and columns s. An array (1, T) is the same row for
+            every t, and the only valid shape for a static child.
 
     >>> str(Relation.parse("<t") | Relation.parse("t"))
     '{<=t}'
@@ -45,7 +46,7 @@ class Relation:
 
     @classmethod
     def of(cls, intervals: Iterable[Interval]) -> Relation:
-        """The relation with these offset intervals, merged, sorted and named."""
+        """Return the relation with these offset intervals, merged, sorted and named."""
         merged: list[Interval] = []
         for low, high in sorted(intervals):
             if merged and low <= merged[-1][1] + 1:
@@ -56,12 +57,12 @@ class Relation:
 
     @classmethod
     def custom(cls, name: str, function: MaskFunction) -> Relation:
-        """A mask of the user's own: function(T) -> bool array (T, T), shown as `{name}`."""
+        """Return a custom mask, printed as `{name}`: function(T) returns a bool array (T, T)."""
         return cls("{" + name + "}", None, function)
 
     @classmethod
     def parse(cls, text: str) -> Relation:
-        """The relation of a subscript, given without braces; ValueError for one the grammar lacks."""
+        """Return the relation of a subscript without braces; raise ValueError if it is not in the grammar."""
         for sign, spelling in {"<=": r"\\leq?", ">=": r"\\geq?", "<": r"\\lt", ">": r"\\gt"}.items():
             text = re.sub(rf"(?:{spelling})(?![a-z])", sign, text)
         for sign, spelling in {"<=": "≤", ">=": "≥", "-": "\N{MINUS SIGN}"}.items():
@@ -87,7 +88,7 @@ class Relation:
 
     @property
     def parts(self) -> tuple[Relation, ...]:
-        """The relations, each writable as one subscript, whose union this is."""
+        """Relations whose union is this one, each with a spelling as a single subscript."""
         if self.intervals is not None:
             return tuple(Relation.of([interval]) for interval in self.intervals)
         if isinstance(self.function, _Composed) and self.function.operation is np.logical_or:
@@ -96,16 +97,16 @@ class Relation:
 
     @property
     def pointwise(self) -> bool:
-        """True where it reads a fixed number of steps, as t, {t-1} and {t-2:t} do; False for custom masks."""
+        """True if it reads a fixed number of steps, such as t, {t-1} and {t-2:t}; False for custom masks."""
         ends = [end for interval in self.intervals or [(0, math.inf)] for end in interval]
         return all(map(math.isfinite, ends))
 
     @property
     def lag(self) -> int:
-        """The largest finite distance in its definition: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}.
+        """The largest finite distance in the definition: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}.
 
         Raises:
-            ValueError: a custom mask, whose reach may depend on T.
+            ValueError: the relation is a custom mask, whose lag may depend on T.
         """
         if self.intervals is None:
             raise ValueError(f"the custom mask {self} has no lag: what it reads is known at a given length only")
@@ -113,31 +114,31 @@ class Relation:
 
     @property
     def directions(self) -> frozenset[int]:
-        """Where it reads: -1 the past, 0 the same step, +1 the future; custom masks are tried at some lengths."""
+        """The directions it reads: -1 past, 0 same step, +1 future. Custom masks are evaluated at several lengths."""
         if self.intervals is not None:
             reads = {-1: (-math.inf, -1), 0: (0, 0), 1: (1, math.inf)}
             return frozenset(k for k, side in reads.items() if (self & Relation.of([side])).intervals)
         offsets = [np.subtract(*np.nonzero(self.mask(T).T)) for T in range(2, 9)]
-        with suppress(Exception):  # a mask may be made for short sequences alone
+        with suppress(Exception):  # a custom mask may support short sequences only
             offsets += [np.subtract(*np.nonzero(self.mask(T).T)) for T in FARTHER]
         return frozenset(int(sign) for sign in np.sign(np.concatenate(offsets)))
 
     def reads(self, offset: int, T: int) -> bool:
-        """Whether the child reads the parent so many steps away wherever there is such a step of T."""
+        """Return whether the child reads the parent at this offset for all t with t + offset within 1, ..., T."""
         if self.intervals is not None:
             return any(low <= offset <= high for low, high in self.intervals)
         return bool(self.mask(T).diagonal(offset).all())
 
     def mask(self, T: int) -> np.ndarray:
-        """Bool array (T, T): M[t, s] is True where the child at t may read the parent at s (counted from 0).
+        """Return a bool array (T, T): M[t, s] is True if the child at t may read the parent at s (counted from 0).
 
         Raises:
-            ValueError: a custom function returns anything but a bool array (T, T) or (1, T).
+            ValueError: a custom function returns something else than a bool array (T, T) or (1, T).
         """
         return np.broadcast_to(self.rows(T), (T, T)).copy()
 
     def rows(self, T: int) -> np.ndarray:
-        """`mask`, or its one row (1, T) where a custom function gives the same for every t."""
+        """Return `mask`, or its single row (1, T) if a custom function returns the same row for every t."""
         if self.intervals is not None:
             offset = np.arange(T)[None, :] - np.arange(T)[:, None]
             allowed = [(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]]
@@ -176,7 +177,7 @@ class Relation:
 
 @dataclass(frozen=True)
 class _Composed:
-    """Custom masks under a logical operation; a value, so that relations built the same way are equal."""
+    """A logical operation on custom masks. A dataclass, so that relations built the same way compare equal."""
 
     operation: Callable[..., np.ndarray]
     operands: tuple[Relation, ...]
