@@ -1,4 +1,4 @@
-"""Constants of programs on the device where they are used: brought there once, not at every step."""
+"""Cached constant tensors, copied to a device once instead of at every step."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from torch import Tensor
 
 
 @lru_cache(maxsize=4096)
-@torch.inference_mode(False)  # so that gradients may be taken through them, whoever asked first
+@torch.inference_mode(False)  # a constant first requested in inference mode must still work under autograd
 def _made(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor(values, dtype=dtype, device=device)
 
 
 def constant(values: Any, like: Tensor) -> Tensor:
-    """These numbers, nested tuples of them, of the type and on the device of a tensor; not to be written to."""
+    """Return numbers, or nested tuples of them, with the dtype and device of `like`. Do not modify the tensor."""
     return _made(values, like.dtype, like.device)
 
 
 def indices(values: Any, like: Tensor) -> Tensor:
-    """These places along an axis, for `index_select`, on the device of a tensor."""
+    """Return indices along an axis, for `index_select`, on the device of `like`."""
     return _made(tuple(values), torch.long, like.device)
 
 
-@lru_cache(maxsize=32)  # of a long series each is large
+@lru_cache(maxsize=32)  # small, because the mask of a long series is large
 @torch.inference_mode(False)
 def visible(relation: Any, length: int, device: torch.device) -> Tensor:
-    """The mask (T, T) of a relation; not to be written to."""
+    """Return the mask (T, T) of a relation. Do not modify it in place."""
     return torch.as_tensor(relation.mask(length), device=device)

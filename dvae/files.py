@@ -1,8 +1,8 @@
-"""Files that somebody else may have laid: only plain ones are opened, up to a bound, and ours are written whole.
+"""Safe file access: open only plain files of bounded size, and replace files atomically.
 
-A folder that was copied from elsewhere may hold links to files of ours, FIFOs and devices, whose content never ends or
-never comes, and files that are larger than memory. So what lies in a run directory is opened here and nowhere else. The
-path of the folder itself is what the user typed, and may be a link.
+A folder copied from elsewhere may contain links to the user's files, FIFOs and devices that never return or never end,
+and files larger than memory. All files in a run directory are therefore opened through this module. The path of the
+folder itself is given by the user and may be a link.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
-# neither follows a link at the end of the path nor waits for the other end of a FIFO; Windows has no such flags
+# do not follow a link at the end of the path, and do not wait for the other end of a FIFO; not available on Windows
 _PLAIN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -29,20 +29,20 @@ _TEMPORARY = re.compile(rf"\.new-{_HOST}-(\d{{1,9}})-\w+")
 
 
 class FileRefused(ValueError):
-    """A path that is no plain file, or one that is larger than it can rightly be."""
+    """Error for a path that is not a plain file, or for a file larger than the allowed size."""
 
 
 def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bool = False) -> BinaryIO:
-    """Open a plain file, unbuffered, without ever cutting it short.
+    """Open a plain file, unbuffered and without truncating it.
 
     Args:
-        path: the file.
-        flags: of `os.open`.
-        links: follow a link, for a path that the user typed.
+        path: path of the file.
+        flags: flags of `os.open`.
+        links: whether to follow a link, for a path given by the user.
 
     Raises:
-        FileRefused: a link, a directory, a FIFO, a socket or a device.
-        OSError: there is no such file, or it cannot be opened.
+        FileRefused: the path is a link, a directory, a FIFO, a socket or a device.
+        OSError: the file does not exist or cannot be opened.
     """
     path = Path(path)
     if not links and path.is_symlink():
@@ -60,18 +60,18 @@ def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bo
 
 
 def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
-    """The content of a plain file of at most `most` bytes.
+    """Return the content of a plain file of at most `most` bytes.
 
     Raises:
-        FileRefused: no plain file, or a larger one.
-        OSError: there is no such file, or it cannot be read.
+        FileRefused: the path is not a plain file, or the file is larger.
+        OSError: the file does not exist or cannot be read.
     """
     with open_plain(path, links=links) as file, naming(path):
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise FileRefused(f"{path} has {size} bytes, and can rightly have {most} at most")
         parts, left = [], most + 1
-        while left and (part := file.read(min(left, 1 << 24))):  # what it holds now, which may differ from its size
+        while left and (part := file.read(min(left, 1 << 24))):  # the file may have grown or shrunk since fstat
             parts.append(part)
             left -= len(part)
     if not left:
@@ -80,13 +80,13 @@ def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
 
 
 def write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a new file in place of whatever has this name, and force it to the disk.
+    """Write a new file, replacing any existing one, and flush it to disk.
 
     Raises:
-        OSError: it cannot be written; the error names it, and nothing of it is left.
+        OSError: the file cannot be written; the error names the path, and no partial file remains.
     """
     path = Path(path)
-    path.unlink(missing_ok=True)  # a link, not where it leads
+    path.unlink(missing_ok=True)  # removes a link itself, not its target
     with open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file, naming(path):
         try:
             put(file, content)
@@ -97,7 +97,7 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def put(file: BinaryIO, content: bytes) -> None:
-    """Write everything to an unbuffered file, which may take it piece by piece."""
+    """Write all content to an unbuffered file, which may accept it in several parts."""
     left = memoryview(content)
     while left:
         left = left[file.write(left) :]
@@ -105,11 +105,11 @@ def put(file: BinaryIO, content: bytes) -> None:
 
 @contextmanager
 def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A file to write to, which takes the place of an older one, or of a link, once it is whole; its folder is made.
+    """Open a temporary file that replaces the file or link at `path` on success; create the folder if needed.
 
     Raises:
         FileRefused: the path is a directory, a FIFO or a device.
-        OSError: it cannot be written; the error names it.
+        OSError: the file cannot be written; the error names the path.
     """
     path = Path(path)
     if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
@@ -130,7 +130,7 @@ def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Make a folder and those above it; if what follows fails, remove those that were made and are empty."""
+    """Create a folder and its parents; if the block fails, remove the created folders that are empty."""
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -143,12 +143,12 @@ def made(folder: Path) -> Iterator[None]:
 
 
 def temporary() -> str:
-    """Return the start of the names of this process's temporary files, which names the process."""
+    """Return the prefix of this process's temporary files, which contains the host name and the process id."""
     return f".new-{_HOST}-{os.getpid()}-"
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files and folders that processes of this machine left in a folder when they were killed."""
+    """Remove temporary files and folders that killed processes of this machine left in a folder."""
     with suppress(OSError):
         for path in [Path(entry) for entry in os.scandir(folder) if entry.name.startswith(".")]:
             if (found := _TEMPORARY.fullmatch(path.name)) and not _is_running(int(found[1])):
@@ -158,11 +158,11 @@ def remove_leftovers(folder: Path) -> None:
                     path.unlink(missing_ok=True)
 
 
-_remove_leftovers = cache(remove_leftovers)  # once per folder, which may receive many thousands of files
+_remove_leftovers = cache(remove_leftovers)  # once per folder, since many thousands of files may be written to it
 
 
 def _is_running(process: int) -> bool:
-    if os.name == "nt":  # there, os.kill(process, 0) sends a signal
+    if os.name == "nt":  # on Windows, os.kill(process, 0) sends a signal
         return True
     try:
         os.kill(process, 0)
@@ -173,11 +173,11 @@ def _is_running(process: int) -> bool:
 
 @contextmanager
 def naming(path: str | os.PathLike[str], temporary: Path | None = None) -> Iterator[None]:
-    """What fails within it for want of space, rights or a sound disk says which file it was about.
+    """Add the path to an OSError raised in the block, such as for a full disk, missing permissions or a disk error.
 
     Args:
-        path: the file, or a folder of files.
-        temporary: what it is called until it is whole.
+        path: a file, or a folder of files.
+        temporary: temporary name of `path` until it is complete.
     """
     try:
         yield
@@ -186,6 +186,6 @@ def naming(path: str | os.PathLike[str], temporary: Path | None = None) -> Itera
             if temporary is None or not Path(os.fsdecode(error.filename)).is_relative_to(temporary):
                 raise
             path = Path(path) / Path(os.fsdecode(error.filename)).relative_to(temporary)
-        if error.errno is None:  # of a library
+        if error.errno is None:  # raised by a library
             raise OSError(f"{path}: {error}") from error
         raise OSError(error.errno, error.strerror, os.fspath(path)) from error

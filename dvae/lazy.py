@@ -1,4 +1,4 @@
-"""Modules that are imported when they are first used (PEP 562), and those of optional packages."""
+"""Lazy imports: modules that are imported at first use (PEP 562), and modules of optional packages."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from .turns import no_fork
 
 
 def importing(package: str, places: Mapping[str, str] | None = None) -> Callable[[str], Any]:
-    """The `__getattr__` of a package: its modules by name, and what is shown of them.
+    """Return a `__getattr__` for a package that imports its modules and public names at first use.
 
     Args:
-        package: its name.
-        places: name to the module within the package that has it.
+        package: name of the package.
+        places: {public name: module of the package that defines it}.
     """
 
     def find(name: str) -> Any:
@@ -37,7 +37,7 @@ def optional(module: str, extra: str) -> Any:
     """Import a module of an optional package.
 
     Raises:
-        ImportError: it is not installed; the message has the command that installs it.
+        ImportError: the package is not installed; the message contains the install command.
     """
     try:
         return import_module(module)

@@ -1,12 +1,12 @@
-"""Options are fields of frozen dataclasses, whose types say what they can be: `check` holds every value to its type.
+"""Validate options: fields of frozen dataclasses whose types define the allowed values.
 
     width: Size = 64                                       at least 1 and at most 16384
     keep: Share = 0.15                                     between 0 and 1
     noise: Annotated[float, Range(0, 1, below=True)] = 0   at least 0 and below 1
     loss: Literal["evidence", "best-of-many"] = ...        one of these
 
-Options are also read from the files of a run, which may be anybody's: a width of a million or 40 processes are refused
-before anything is made of them.
+Options are also read from the files of a run, which may come from an untrusted source. `check` therefore rejects values
+such as a width of a million or 40 processes before anything is allocated.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 LONGEST = 10_000
-"""Characters of a text, entries of a tuple or mapping."""
+"""Maximum number of characters of a string, and of entries of a tuple of strings or of a mapping."""
 DEEPEST = 64
-"""Layers: entries of a tuple of numbers."""
+"""Maximum number of layers: entries of a tuple of numbers."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """The values of a number.
+    """A range of allowed numbers.
 
     Args:
-        least, most: its ends.
-        above, below: whether the one or the other is left out. Infinity is always.
+        least, most: ends of the range.
+        above, below: whether to exclude the lower or upper end. Infinite ends are always excluded.
     """
 
     least: float = -inf
@@ -56,29 +56,29 @@ class Range:
 
 
 Count = Annotated[int, Range(1, 10**9)]
-"""Of steps, draws or frames."""
+"""A number of steps, draws or frames."""
 Delay = Annotated[int, Range(0, 10**9)]
-"""Steps, possibly none."""
+"""A number of steps, possibly zero."""
 Frames = Annotated[int, Range(1, 200_000)]
-"""Steps of a sequence."""
+"""The length of a sequence in steps."""
 Size = Annotated[int, Range(1, 16384)]
-"""Of a variable, a layer or a state."""
+"""The dimension of a variable, a layer or a state."""
 Extra = Annotated[int, Range(0, 16384)]
-"""Of a variable or layer that may be left out."""
+"""The dimension of a variable or layer that can be omitted."""
 Layers = Annotated[int, Range(1, DEEPEST)]
 Share = Annotated[float, Range(0, 1)]
-"""A share or probability."""
+"""A fraction or probability."""
 Amount = Annotated[float, Range(0)]
-"""Such as a weight, which is finite."""
+"""A finite non-negative number, such as a weight."""
 Positive = Annotated[float, Range(0, above=True)]
 
 
 def check(options: Any) -> None:
-    """Refuses a dataclass with a value that is not of its field's type, or out of its range.
+    """Check that every field of a dataclass has its declared type and range.
 
     Raises:
-        TypeError: another type.
-        ValueError: out of range, or an unknown name, with the nearest known one.
+        TypeError: a value has another type.
+        ValueError: a value is out of range or not an allowed name; the message suggests the nearest name.
     """
     kind: Any = type(options)
     for name, hint in _hints(kind).items():
@@ -87,10 +87,10 @@ def check(options: Any) -> None:
 
 
 def require(hint: Any, **values: Any) -> None:
-    """Refuse arguments that are not of a type or out of its range.
+    """Check that arguments have a given type and range.
 
     Raises:
-        TypeError, ValueError: see `check`.
+        TypeError, ValueError: as in `check`.
     """
     for name, value in values.items():
         if (error := problem(name, value, hint)) is not None:
@@ -98,7 +98,7 @@ def require(hint: Any, **values: Any) -> None:
 
 
 def problem(name: str, value: Any, hint: Any) -> Exception | None:
-    """What is wrong with a value; None if it is of the type."""
+    """Return the error for a value that does not match its type, or None if it does."""
     origin, arguments = get_origin(hint), get_args(hint)
     given = f"{name} is {reprlib.repr(value)}"
     if origin is Annotated:
@@ -130,7 +130,7 @@ def problem(name: str, value: Any, hint: Any) -> Exception | None:
         whole = isinstance(value, Integral) and abs(int(value)) > sys.float_info.max
         return ValueError(f"{given}; it must be a number that a float holds") if whole or value != value else None
     kind = origin or hint
-    if getattr(kind, "_is_protocol", False):  # which most objects meet without being of its type
+    if getattr(kind, "_is_protocol", False):  # not checked: unrelated objects may match its structure
         return None
     if isinstance(kind, type) and kind is not Any and not isinstance(value, kind):
         return TypeError(f"{given}; it must be {'true or false' if kind is bool else 'of type ' + kind.__name__}")
@@ -144,12 +144,12 @@ def problem(name: str, value: Any, hint: Any) -> Exception | None:
 
 
 def tuples(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as JSON gives them back, with tuples in place of its lists."""
+    """Convert lists to tuples in options read from JSON."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
 
 
 def flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every option of a nested configuration, named with dots."""
+    """Yield every option of a nested configuration with its dotted name."""
     for name, value in options.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{name}.")
@@ -158,7 +158,7 @@ def flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """The known name that is meant, in words; empty where none is near."""
+    """Return " (did you mean ...?)" with the most similar known name, or "" if no name is similar."""
     close = difflib.get_close_matches(name[:LONGEST], list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
@@ -189,7 +189,7 @@ def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Except
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    """Types by field; none where a type's name means nothing outside of the file that has it."""
+    """Return the types of the fields; {} if a type name cannot be resolved outside its own file."""
     try:
         hints = get_type_hints(kind, include_extras=True)
     except NameError:

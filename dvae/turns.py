@@ -1,15 +1,15 @@
-"""Threads take turns: Pyro's stack of handlers and torch's random state are one for the whole process.
+"""Serialise threads, because Pyro's handler stack and torch's random state are global to the process.
 
-Two programs that ran at once would land on each other's stack, and draw from each other's random numbers. So `alone`
-is held while a model is built or a program runs: in `DynamicalVAE.running`, in the terms of a bound, in a step of
-`SVI`, and in `seeded`, which also sets and restores the random state. Threads wait for each other that
-long, not for a whole fit. Processes run side by side (`dvae.runs.sweep`). When a process forks while another thread
-holds the lock, the child starts with a free lock and without that thread's handlers.
+Two programs running at the same time would share one handler stack and one stream of random numbers. Building a model
+and running a program therefore hold the lock `alone`: in `DynamicalVAE.running`, in the terms of a bound, in a step of
+`SVI`, and in `seeded`, which also sets and restores the random state. Threads wait for one such step, not for a
+whole fit. Processes are independent (`dvae.runs.sweep`). If a process forks while another thread holds the lock, the
+child starts with a free lock and an empty handler stack.
 """
 
 from __future__ import annotations
 
-import logging  # noqa: F401  its fork hook, registered first, takes its lock after `no_fork`: imports make loggers
+import logging  # noqa: F401  register its fork hook first: it must lock after `no_fork`, since imports create loggers
 import os
 import re
 import threading
@@ -18,11 +18,11 @@ from contextlib import ContextDecorator, contextmanager
 from typing import Any
 
 SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
-"""The table that Pyro appends to an error that passes a program."""
+"""The table that Pyro appends to an error raised inside a program."""
 
 
 class _Alone(ContextDecorator):
-    """A lock that a thread which holds it may take again; around a block or a function."""
+    """A reentrant lock, usable as a context manager or a decorator."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -36,7 +36,7 @@ class _Alone(ContextDecorator):
             error.args = (SHAPES.sub("", error.args[0]), *error.args[1:])
 
     def _leave_to_the_parent(self) -> None:
-        """Forget the thread that held the lock, which a forked child does not have."""
+        """Replace a lock held by a thread of the parent process, which does not exist in a forked child."""
         if self._lock.acquire(blocking=False):
             self._lock.release()
             return
@@ -51,11 +51,11 @@ alone = _Alone()
 
 @contextmanager
 def seeded(seed: int | None, device: Any = None) -> Iterator[None]:
-    """Draw from a seed, or without one go on from the present state; restore torch's random state at the end.
+    """Set torch's random seed for a block, or keep the current state if it is None; restore the state at the end.
 
     Args:
-        seed: of torch's random numbers.
-        device: a `torch.device` whose random state is restored too, if it is a GPU.
+        seed: seed of torch's random numbers.
+        device: a `torch.device` whose random state is also restored if it is a GPU.
     """
     import torch
 
@@ -66,7 +66,7 @@ def seeded(seed: int | None, device: Any = None) -> Iterator[None]:
 
 
 no_fork = threading.RLock()
-"""A lock held during imports: a child that is forked during one would wait for the lock of the module for ever."""
+"""A lock held during imports: a child forked during an import would wait forever for the lock of the module."""
 if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(before=no_fork.acquire, after_in_parent=no_fork.release, after_in_child=no_fork.release)
     os.register_at_fork(after_in_child=alone._leave_to_the_parent)

@@ -1,4 +1,4 @@
-"""Laws: distributions of a variable given features, and what they are made of.
+"""Conditional distributions of a variable given features, and the parts they are built from.
 
 >>> laws = {"p(x)": dvae.distributions.StudentT(df=4), "p(w)": dvae.distributions.Mixture(components=3)}
 >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, laws=laws)

@@ -1,9 +1,9 @@
-"""The one contract of laws: a description, built for a shape, is a module that turns features into a distribution.
+"""The interface of conditional distributions: a specification, built for a shape, maps features to a distribution.
 
-    LawSpec.build(Shape) -> Law        Law(features) -> parameters        Law.distribution(parameters) -> of Pyro
+    LawSpec.build(Shape) -> Law        Law(features) -> parameters        Law.distribution(parameters) -> Pyro's
 
-The parameters are plain tensors, so that a loop over time handles no distribution objects. A law without features, of a
-variable without parents, has parameters of its own: priors are laws like any other.
+The parameters are plain tensors, so a loop over time creates no distribution objects. For a variable without parents,
+the module has no features and learns the parameters itself; priors therefore use the same interface.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ Parameters = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class Shape:
-    """What a law is built for.
+    """The variable and features that a conditional distribution is built for.
 
     Args:
-        size: D, of the variable.
-        features: H, of what the network gives; 0 of a model's variable without parents.
-        local: one value per step, not per sequence.
-        name: of the variable.
+        size: D, dimension of the variable.
+        features: H, number of features from the network; 0 for a model variable without parents.
+        local: True for one value per step, False for one per sequence.
+        name: name of the variable.
         data: names of the data variables.
-        guide: of a static latent without parents its q(w | ...), a `Conditional`, for priors that are made of it.
+        guide: the `Conditional` q(w | ...) of a static latent without parents, for priors that are defined by it.
     """
 
     size: int
@@ -43,41 +43,43 @@ class Shape:
 
 
 class Law(nn.Module):
-    """Features to the distribution of one variable.
+    """A module that maps features to the conditional distribution of one variable.
 
-    A new law gives `forward` and `distribution`. It declares `support`, `event_dim`, `discrete` and `reparameterised`
-    where they differ from those of independent normals.
+    Subclasses implement `forward` and `distribution`. They declare `support`, `event_dim`, `discrete` and
+    `reparameterised` if these differ from independent normals.
 
     Args:
-        residual: share of the variable's own previous value that its location keeps, so that features give the rest:
-            1 (True) for an offset. Below 1 a free run forgets where it was, and cannot drift without bound. A
-            residual law starts near that share, with weights a hundredth of the usual.
+        residual: share of the variable's previous value that is added to the location; the features provide the rest.
+            With 1 (True) the features are an offset. Below 1, a free-running forecast forgets its start and cannot
+            drift without bound. The initial weights of a residual location are a hundredth of their usual size.
 
     Raises:
-        ValueError: a share that is not between 0 and 1.
+        ValueError: `residual` is not between 0 and 1.
     """
 
     support: Any = constraints.real
-    """Constraint of torch on the values of a step; None if it depends on the parameters."""
+    """torch's constraint on the values of a step; None if it depends on the parameters."""
     event_dim: int = 0
-    """1 if all coordinates of a step are one event, 0 if each has its own density."""
+    """1 if all coordinates of a step are one event, 0 if each coordinate has its own density."""
     discrete: bool = False
     """Whether values are discrete."""
     reparameterised: bool = True
-    """Whether draws have a gradient."""
+    """Whether gradients flow through draws."""
     deterministic: ClassVar[bool] = False
-    """Whether the variable is a function of its parents, without a density."""
+    """Whether the variable is a function of its parents and has no density."""
     error_weight: bool = False
-    """Whether the scale is the weight of a squared error and no spread of the data, so that forecasts show the mean."""
+    """Whether the scale is the weight of a squared error, not the spread of the data; forecasts then show the mean."""
     location_scale: bool = False
-    """Whether `in_units` can put the parameters into another unit: a location and a scale, or a scale alone, as a rate.
-    Probabilities cannot be."""
+    """Whether `in_units` can convert the parameters to another unit.
+
+    This requires a location and a scale, or a scale alone such as a rate; probabilities cannot be converted.
+    """
     centred: bool | Sequence[bool] = False
-    """Whether `in_units` adds the mean, so that it can do without one on values less their mean; or of each coordinate
-    whether it does."""
+    """Whether `in_units` adds the mean, so that the network can work with values minus their mean; or a flag for each
+    coordinate.
+    """
     events: Sequence[Sequence[int]] = ()
-    """Coordinates that are one event each, so that they are observed together or not at all, where a value has several
-    such events."""
+    """Groups of coordinates that are one event each, if there are several; observed completely or not at all."""
 
     def __init__(self, residual: float = False):
         super().__init__()
@@ -87,11 +89,11 @@ class Law(nn.Module):
 
     @property
     def called(self) -> str:
-        """Name of the distribution, in messages."""
+        """Name of the distribution in messages."""
         return type(self).__name__.removesuffix("Law")
 
     def inside(self, size: int) -> Tensor | None:
-        """Return a value (D,) with a positive density, for entries that were not observed; None if 0 has one."""
+        """Return a value (D,) with positive density to fill unobserved entries; None if 0 has positive density."""
         if self.support is None or is_real(self.support):
             return None
         if not self.support.is_discrete:
@@ -100,7 +102,10 @@ class Law(nn.Module):
         return None if self.support.check(zero).all() else functional.one_hot(torch.tensor(0), size).to(zero)
 
     def projection(self, features: int, out: int, locations: int) -> Any:
-        """Features to `out` parameters, of which the first so many are locations; without features, learned ones."""
+        """Return a layer from features to `out` parameters, the first `locations` of them locations.
+
+        Without features, the parameters are learned.
+        """
         if not features:
             return Unconditional(out)
         layer = nn.Linear(features, out)
@@ -111,77 +116,77 @@ class Law(nn.Module):
         return layer
 
     def moved(self, loc: Tensor, previous: Tensor | None) -> Tensor:
-        """The location from what the features give and the variable's own previous value."""
+        """Return the location: the output of the features plus `residual` times the previous value."""
         return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """Parameters, (..., P) each, from features and the variable's own previous value, where it is residual.
+        """Return the parameters, (..., P) each, from features and, if residual, the variable's previous value.
 
         Args:
-            features: (B, T, H) at all steps or at T steps from `t` on, or (B, H) of a static variable or at step `t`.
+            features: (B, T, H) at all steps or at T steps from `t` on; (B, H) for a static variable or at step `t`.
             previous: (B, T, D) or (B, D).
-            t: the step, in a loop over time, or the first of several.
+            t: the step in a loop over time, or the first of several steps.
         """
         raise NotImplementedError
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """The distribution of a value (..., D).
+        """Return the distribution of a value (..., D).
 
-        Either with a density for each coordinate (batch (..., D), no event), or with one for all that a step has
-        (batch (...), event (D,)).
+        It has either one density per coordinate (batch (..., D), no event) or one density per step (batch (...), event
+        (D,)).
         """
         raise NotImplementedError
 
     def mean(self, parameters: Parameters) -> Tensor:
-        """The mean (..., D), which the model reads where data are missing, and shows where they are not drawn.
+        """Return the mean (..., D). The model uses it for missing data and for forecasts that are not drawn.
 
-        Of a categorical variable it is the probabilities; here, the first of the parameters.
+        For a categorical variable it contains the probabilities. The default is the first parameter.
         """
         return parameters[0]
 
     def joint(self, parameters: Parameters) -> TorchDistribution:
-        """The distribution with all coordinates as one event: batch (...), event (D,)."""
+        """Return the distribution with all coordinates as one event: batch (...), event (D,)."""
         law = self.distribution(parameters)
         return law.to_event(1 - len(law.event_shape))
 
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """The parameters of mean + scale * variable, from those of the variable, of a location-scale family."""
+        """Convert the parameters of a location-scale variable to those of mean + scale * variable."""
         loc, *rest = parameters
         return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
 
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """Noise for all steps at once; `draw` turns it into values."""
+        """Return noise for all steps at once; `draw` transforms it into values."""
         return torch.randn(*shape, dtype=like.dtype, device=like.device)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Values (..., D), reparameterised where they can be; of the noise, unless the distribution makes its own."""
+        """Return values (..., D), reparameterised if possible. Distributions that draw their own noise ignore `noise`."""
         law = self.distribution(parameters)
         return law.rsample() if law.has_rsample else law.sample()
 
 
 def is_real(support: Any) -> bool:
-    """Whether a constraint allows all real numbers."""
+    """Return whether a constraint allows all real numbers."""
     while hasattr(support, "base_constraint"):
         support = support.base_constraint
-    parts = getattr(support, "parts", ())  # of a product
+    parts = getattr(support, "parts", ())  # only a ProductSupport has parts
     return all(is_real(own) for _, own in parts) if parts else support is constraints.real
 
 
 class LawSpec(Protocol):
-    """A description of a law: a frozen dataclass that `build`s one."""
+    """Specification of a conditional distribution: a frozen dataclass with a `build` method."""
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable; ValueError where it is none for that shape."""
+        """Return the module for a variable; raise ValueError if the distribution does not support its shape."""
         ...
 
 
 class Unconditional(nn.Module):
-    """Parameters (..., P) that are the same whatever the features; 0 at first."""
+    """Learned parameters (..., P) that do not depend on the features; initially 0."""
 
     def __init__(self, out: int):
         super().__init__()
         self.bias = nn.Parameter(torch.zeros(out))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Only the shape of the features is read."""
+        """Expand the parameters to the batch shape of the features."""
         return self.bias.expand(*features.shape[:-1], -1)

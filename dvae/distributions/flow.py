@@ -2,13 +2,13 @@
 
     z^l = Q^l R^l x^l + b^l,        x^{l+1} = PReLU(z^l) for all layers but the last,        z^L ~ N(0, I)
 
-The pose prior of GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422). Q is a product of as many Householder
-reflections as there are dimensions, H_1 H_2 ... H_D with H_i = I - 2 v_i v_i' / |v_i|^2. With the v_i as the rows of V
-it is, in closed form,
+This is the pose prior of GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422). Q is a product of D Householder
+reflections H_1 H_2 ... H_D with H_i = I - 2 v_i v_i' / |v_i|^2. If the v_i are the rows of V, the product has the
+closed form
 
     Q = I - V' S^-1 V,        S = the part of V V' above the diagonal, and half of the diagonal
 
-(the compact WY form; Joffrain et al., 2006, ACM TOMS 32), a triangular solve in place of D dependent steps.
+(the compact WY form; Joffrain et al., 2006, ACM TOMS 32). One triangular solve replaces D sequential steps.
 """
 
 from __future__ import annotations
@@ -29,29 +29,30 @@ from .priors import Prior
 
 @dataclass(frozen=True)
 class QRFlow:
-    """The law of a vector without parents that a bijection of R^D with a known determinant gives. See the file.
+    """Normalizing flow for a static latent without parents: a bijection of R^D with a closed-form determinant.
 
-    The diagonal of R is the exponential of that of `triangular`, whose part below it is unused. Ours: the parameter of
-    a PReLU is the logarithm of its slope, which so stays positive; and the first layer reads W (x - m), where location
-    m and whitening W are no parameters: 0 and the identity, unless `whiten` took them from data.
+    The diagonal of R is the exponential of the diagonal of `triangular`; the part below the diagonal is unused. There
+    are two differences from the paper. A PReLU is parameterised by the logarithm of its slope, so the slope stays
+    positive. The first layer reads W (x - m), where the location m and the whitening W are buffers, not parameters.
+    They are 0 and the identity unless `whiten` estimates them from data.
 
     Args:
-        layers: L.
+        layers: L, number of layers.
     """
 
     layers: int = 3
 
     def build(self, shape: Shape) -> QRFlowLaw:
-        """The law of a static latent without parents.
+        """Return the module for a static latent without parents.
 
         Raises:
-            ValueError: a size or number of layers below 1.
+            ValueError: the size or the number of layers is less than 1.
         """
         return QRFlowLaw(self, shape)
 
 
 class QRFlowLaw(Prior):
-    """What `QRFlow` describes."""
+    """Distribution module of `QRFlow`."""
 
     def __init__(self, spec: QRFlow, shape: Shape):
         super().__init__(spec, shape)
@@ -70,10 +71,10 @@ class QRFlowLaw(Prior):
         self.register_buffer("whitening", torch.eye(size))
 
     def factors(self) -> tuple[Tensor, Tensor]:
-        """Q and R of every layer, (L, D, D) each.
+        """Return Q and R of every layer, (L, D, D) each.
 
         Raises:
-            ValueError: parameters in half precision, in which no triangular system is solved.
+            ValueError: the parameters have half precision, which triangular solves do not support.
         """
         v = self.reflections
         if torch.finfo(v.dtype).bits < 32:
@@ -90,16 +91,16 @@ class QRFlowLaw(Prior):
         return FlowDistribution(self, self.bias[0])
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The noise that stands for a value.
+        """Map a value to noise.
 
         Args:
-            x: (..., D).
+            x: values (..., D).
 
         Returns:
-            z (..., D), standard normal where x is from this distribution, and log |det dz/dx| (...).
+            z (..., D), standard normal if x follows this distribution, and log |det dz/dx| (...).
 
         Raises:
-            ValueError: another size.
+            ValueError: x has another size.
         """
         self._check(x)
         with torch.autocast(x.device.type, enabled=False):
@@ -114,13 +115,13 @@ class QRFlowLaw(Prior):
                 if layer:
                     log_slope = self.log_slope[layer - 1]
                     log_det = log_det + log_slope / 2 * (self.size - z.sign().sum(-1))
-                    # prelu's backward makes a gradient of the slope per entry, also of a fixed slope: 17 ms against 8
+                    # prelu's backward computes a slope gradient per entry, even if it is not needed: 17 ms versus 8
                     z = torch.lerp(z.relu(), z, log_slope.exp())
                 z = nn.functional.linear(z, matrix, bias)
         return z, log_det
 
     def from_noise(self, z: Tensor) -> Tensor:
-        """The value x (..., D) for which noise z (..., D) stands."""
+        """Map noise z (..., D) to values x (..., D), the inverse of `to_noise`."""
         self._check(z)
         with torch.autocast(z.device.type, enabled=False):
             q, r = self.factors()
@@ -135,17 +136,17 @@ class QRFlowLaw(Prior):
 
     @torch.no_grad()
     def whiten(self, values: Tensor) -> None:
-        """Sets location and whitening so that these values enter the first layer with mean 0 and unit covariance.
+        """Set location and whitening so that these values enter the first layer with mean 0 and unit covariance.
 
-        What the family of distributions holds stays the same, but the parameters then learn of directions in which the
-        values vary little as fast as of others. Directions in which they hardly vary are widened, to 1e-9 of the mean
-        variance.
+        The family of distributions stays the same, but the parameters then learn about directions of low variance as
+        fast as about others. Variances are increased by 1e-9 of the mean variance, which regularises directions of
+        almost no variance.
 
         Args:
-            values: (..., D), more than D of them.
+            values: (..., D), more than D values.
 
         Raises:
-            ValueError: another size, or too few values.
+            ValueError: the values have another size, or there are too few.
         """
         self._check(values)
         values = values.detach().reshape(-1, self.size).double()
@@ -167,21 +168,21 @@ class Bijection(Protocol):
     """A bijection of R^D between values and noise."""
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The noise (..., D) that stands for values (..., D), and log |det| (...) of the Jacobian."""
+        """Map values (..., D) to noise (..., D) and the log |det| (...) of the Jacobian."""
         ...
 
     def from_noise(self, z: Tensor) -> Tensor:
-        """The values (..., D) for which noise (..., D) stands."""
+        """Map noise (..., D) to values (..., D)."""
         ...
 
 
 class FlowDistribution(TorchDistribution):
-    """The density that a bijection gives standard normal noise: exact log density, exact draws.
+    """Distribution of standard normal noise under a bijection, with exact log density and exact draws.
 
     Args:
-        flow: from values to noise.
-        like: a tensor (..., D) of their size, type and device.
-        batch_shape: of independent values.
+        flow: bijection between values and noise.
+        like: a tensor (..., D) that defines size, dtype and device.
+        batch_shape: batch shape of independent values.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -193,16 +194,16 @@ class FlowDistribution(TorchDistribution):
         super().__init__(torch.Size(batch_shape), like.shape[-1:], validate_args=False)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """Draws (*sample_shape, *batch_shape, D)."""
+        """Return draws (*sample_shape, *batch_shape, D)."""
         shape = self._extended_shape(torch.Size(sample_shape))
         return self.flow.from_noise(torch.randn(shape, dtype=self.like.dtype, device=self.like.device))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """log p (...) of values (..., D), in nats."""
+        """Return log p (...) of values (..., D), in nats."""
         noise, log_det = self.flow.to_noise(value)
         found = log_det - noise.square().sum(-1) / 2 - self.event_shape[0] / 2 * math.log(2 * math.pi)
         return found.expand(torch.broadcast_shapes(found.shape, self.batch_shape))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> FlowDistribution:
-        """With another batch shape."""
+        """Return the distribution with another batch shape."""
         return FlowDistribution(self.flow, self.like, batch_shape)

@@ -1,9 +1,10 @@
-"""Glow's steps, made of zuko's transforms: normalisation, mixing, and a coupling that reads features.
+"""The steps of Glow, built from zuko's transforms: normalisation, mixing, and a coupling that reads features.
 
     y = exp(s) x + b        v = P L U y        z_a = v_a,  z_b = exp(k(v_a, h)) v_b + m(v_a, h)
 
-Kingma and Dhariwal, 2018, arXiv 1807.03039; couplings that read features h: Henter, Alexanderson and Beskow, 2020,
-arXiv 1905.06598. P is fixed, P L U at first a random rotation. This module alone imports zuko, which is an extra.
+Source: Kingma and Dhariwal, 2018, arXiv 1807.03039. Couplings that read features h: Henter, Alexanderson and Beskow,
+2020, arXiv 1905.06598. P is fixed, and P L U is initially a random rotation. Only this module imports zuko, an optional
+dependency.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pyro import settings
 from torch import Tensor, nn
 from torch.distributions import AffineTransform
 
-# zuko turns off, for the whole process, that distributions of torch check their arguments
+# importing zuko disables torch's validation of distribution arguments for the whole process
 with settings.context(validate_distributions_torch=settings.get("validate_distributions_torch")):
     from zuko.flows import GeneralCouplingTransform, UnconditionalTransform
     from zuko.lazy import LazyComposedTransform
@@ -26,7 +27,7 @@ with settings.context(validate_distributions_torch=settings.get("validate_distri
 
 
 class Mixing(LULinearTransform):  # type: ignore[misc]
-    """L U x, whose inverse solves triangular systems for all rows at once; zuko's copies the matrices for every row."""
+    """The map L U x with an inverse that solves all rows at once; zuko's copies the matrices for every row."""
 
     def _inverse(self, y: Tensor) -> Tensor:
         y = torch.linalg.solve_triangular(self.L.mT, y, upper=True, left=False)
@@ -34,19 +35,19 @@ class Mixing(LULinearTransform):  # type: ignore[misc]
 
 
 def normalisation(shift: Tensor, log_scale: Tensor) -> AffineTransform:
-    """exp(log_scale) x + shift."""
+    """Return the transform exp(log_scale) x + shift."""
     return AffineTransform(shift, log_scale.exp(), event_dim=1)
 
 
 class Glow(LazyComposedTransform):  # type: ignore[misc]
-    """Features (..., H), or None, to a bijection of R^D, whose inverse takes one pass too.
+    """A bijection of R^D conditioned on features (..., H) or None; its inverse also takes one pass.
 
     Args:
-        size: D.
-        features: H; 0 for a bijection that reads nothing.
+        size: D, number of coordinates.
+        features: H, number of features; 0 for an unconditional bijection.
         steps: number of steps.
         hidden: widths of the perceptron of each coupling.
-        bound: |k| stays below it.
+        bound: upper bound of |k|.
     """
 
     def __init__(self, size: int, features: int, steps: int, hidden: Sequence[int], bound: float):
@@ -55,7 +56,7 @@ class Glow(LazyComposedTransform):  # type: ignore[misc]
             order, both = _rotation(size)
             affine = partial(MonotonicAffineTransform, slope=math.exp(-bound))
             coupling = GeneralCouplingTransform(size, features, univariate=affine, hidden_features=hidden)
-            with torch.no_grad():  # near the identity
+            with torch.no_grad():  # start near the identity
                 for last in coupling.hyper[-1].parameters() if hasattr(coupling, "hyper") else coupling.phi:
                     last.mul_(0.01)
             moves += [
@@ -68,7 +69,7 @@ class Glow(LazyComposedTransform):  # type: ignore[misc]
 
     @torch.no_grad()
     def start_at(self, x: Tensor, features: Tensor | None) -> None:
-        """Has every normalisation give these values (N, D) mean 0 and variance 1, one after the other."""
+        """Initialise each normalisation in turn so that these values (N, D) leave it with mean 0 and variance 1."""
         for move in self.transforms:
             if hasattr(move, "log_scale"):
                 spread, mean = torch.std_mean(x, 0)
@@ -78,7 +79,7 @@ class Glow(LazyComposedTransform):  # type: ignore[misc]
 
 
 def _rotation(size: int) -> tuple[Tensor, Tensor]:
-    """The order and, in one matrix, the triangular factors of a random rotation."""
+    """Return a random rotation as a permutation and, in one matrix, its triangular factors."""
     p, lower, upper = torch.linalg.lu(nn.init.orthogonal_(torch.empty(size, size)))
     pivots = upper.diagonal()
     return p.argmax(1), (lower * pivots).tril() + (upper / pivots[:, None]).triu(1)
