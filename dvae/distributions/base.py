@@ -150,7 +150,7 @@ class Law(nn.Module):
         return law.to_event(1 - len(law.event_shape))
 
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """Convert the parameters of a location-scale variable to those of mean + scale * variable."""
+        """Convert parameters of a variable to parameters of mean + scale * variable, for a location-scale family."""
         loc, *rest = parameters
         return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
 
@@ -159,7 +159,7 @@ class Law(nn.Module):
         return torch.randn(*shape, dtype=like.dtype, device=like.device)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Return values (..., D), reparameterised if possible. Distributions that draw their own noise ignore `noise`."""
+        """Return values (..., D), reparameterised if possible; `noise` is ignored if the distribution draws its own."""
         law = self.distribution(parameters)
         return law.rsample() if law.has_rsample else law.sample()
 

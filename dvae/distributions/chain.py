@@ -1,15 +1,15 @@
-"""A Gaussian chain as one autograd function: the loop over z_{t-1} that no guide of a state-space model can avoid.
+"""A Gaussian chain as one autograd function: the sequential loop over z_{t-1} in the guide of a state-space model.
 
-With everything else hoisted out, a step is
+Everything else is computed before the loop, so a step is
 
     f_t = features of z_{t-1}, 0 at the first step                        layers `before`; z_{t-1} itself without them
-    h_t, c_t = LSTM([f_t, h_{t-1}], c_{t-1})                              where there is a cell; else h_t = f_t
+    h_t, c_t = LSTM([f_t, h_{t-1}], c_{t-1})                              if there is a cell; otherwise h_t = f_t
     (loc_t, raw_t) = further layers of (base_t + h_t V)
     z_t = loc_t + (softplus(raw_t) + s) e_t
 
-The forward loop writes into preallocated tensors. The backward loop is written by hand: the derivatives of all
-activations are taken for all steps at once, each step is then its products and a few elementwise operations, and the
-gradients of the weights are one product each over all steps together.
+The forward loop writes to preallocated tensors. The backward loop is written by hand. It computes the derivatives of
+all activations at all steps at once, so each step needs only its products and a few elementwise operations. The
+gradient of each weight is one product over all steps.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-DERIVATIVES = {  # of the activation, in terms of its value
+DERIVATIVES = {  # derivative of each activation as a function of its output
     "tanh": lambda value: torch.addcmul(torch.ones((), dtype=value.dtype, device=value.device), value, value, value=-1),
     "relu": lambda value: (value > 0).to(value.dtype),
 }
@@ -39,17 +39,17 @@ def gaussian_chain(
     min_scale: float = 0.0,
     activation: str = "tanh",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Draws of a Gaussian chain, their locations and scales, (T, B, D); and its states h (T, B, W) if it has a cell.
+    """Return draws of a Gaussian chain, locations and scales, (T, B, D), and the states h (T, B, W) if it has a cell.
 
     Args:
-        base: (T, B, H) share of the first of the `layers` in what is not drawn, bias included.
+        base: (T, B, H) contribution of known inputs to the first of `layers`, bias included.
         noise: (T, B, D) standard normal.
-        layers: weight (out, in) and bias (out,) of every layer from h_t to (loc, raw); the activation stands between
-            them. The first has its bias in `base`.
+        layers: weight (out, in) and bias (out,) of every layer from h_t to (loc, raw), with the activation between
+            layers. The bias of the first layer is part of `base`.
         before: weight and bias of the layers on z_{t-1}, each followed by the activation.
-        cell: of an LSTM: (T, B, 4 W) share of its gates in what is not drawn, biases included, and the weight
+        cell: for an LSTM, (T, B, 4 W) contribution of known inputs to its gates, biases included, and the weight
             (4 W, F + W) of [f_t, h_{t-1}]; gates in torch's order.
-        min_scale: s.
+        min_scale: s, lower bound of the scale.
         activation: "tanh" or "relu".
     """
     gates, recurrent = cell or (None, None)
@@ -59,7 +59,7 @@ def gaussian_chain(
 
 
 class GaussianChain(torch.autograd.Function):
-    """What `gaussian_chain` describes."""
+    """The autograd function behind `gaussian_chain`."""
 
     @staticmethod
     def forward(
@@ -76,7 +76,7 @@ class GaussianChain(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Run the chain.
 
-        (Over 60 lines: the loop's tensors, made before it, are too many to be handed from one function to another.)
+        (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
         """
         steps, batch, size = noise.shape
         act = IN_PLACE[activation]
@@ -85,11 +85,11 @@ class GaussianChain(torch.autograd.Function):
         def empty(width: int) -> Tensor:
             return base.new_empty(steps, batch, width)
 
-        # z = (loc + s e) + softplus(raw) e: the least scale enters with the bias, outside the loop
+        # z = (loc + s e) + softplus(raw) e: the minimum scale s is added with the bias, outside the loop
         least = min_scale * noise
         offset = torch.cat([least, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
         values, out = empty(size), empty(2 * size)
-        # softplus of both halves, as one call on contiguous memory: on a slice it is not vectorised and thrice slower
+        # softplus of both halves in one call, since on a slice it is not vectorised and takes three times as long
         soft, zero = torch.empty_like(out), out.new_zeros(())
         features = [empty(weight.shape[0]) for weight, _ in before]
         hidden = [empty(weight.shape[1]) for weight, _ in after]
@@ -117,7 +117,7 @@ class GaussianChain(torch.autograd.Function):
             )
             product, carried_cell = recurrent.t(), base.new_zeros(batch, width)
         pre = [(weight.t(), bias, f.unbind(0)) for (weight, bias), f in zip(before, features, strict=True)]
-        # the layers after h_t as (bias at t, weight, output at t), the last one apart
+        # layers after h_t as (bias at t, output at t), except the last one
         targets = [*(h.unbind(0) for h in hidden), out.unbind(0)]
         matrices = [first.t(), *(weight.t() for weight, _ in after)]
         biases: list[Any] = [base.unbind(0), *(repeat(bias, steps) for _, bias in after)]
@@ -174,9 +174,9 @@ class GaussianChain(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of base, gates, weights and biases from those of draws, locations, scales and states.
+        """Return the gradients of base, gates, weights and biases for the gradients of all results.
 
-        (Over 60 lines: the loop's tensors, made before it, are too many to be handed from one function to another.)
+        (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
         """
         noise, values, out, recurrent, first, inputs, activated, cells, squashed, *rest = ctx.saved_tensors
         n_features, n_hidden = ctx.lists
@@ -190,14 +190,14 @@ class GaussianChain(torch.autograd.Function):
         slope_of = DERIVATIVES[ctx.activation]
 
         sigmoid = torch.sigmoid(out[..., size:])
-        # (loc, raw) receive  c + M * (g, g)  from the gradient g of the value, here twice side by side
+        # the gradient of (loc, raw) is c + M * (g, g), where g is the gradient of the value, stored twice
         factors = torch.cat([torch.ones_like(noise), noise * sigmoid], dim=-1).unbind(0)
         offsets = torch.cat([to_loc, to_scale * sigmoid], dim=-1).unbind(0)
         twice = torch.cat([to_value, to_value], dim=-1).unbind(0)
         to_out = torch.empty_like(out)
         outs = to_out.unbind(0)
 
-        # layers after h_t in reverse: weight, slope of what enters it, gradient of that
+        # layers after h_t in reverse: weight, slope of the layer's input, gradient of that input
         to_hidden = [torch.empty_like(h) for h in hidden]
         back = [
             (weight, slope_of(h).unbind(0), grad.unbind(0))
@@ -210,7 +210,7 @@ class GaussianChain(torch.autograd.Function):
                 [*(weight for weight, _ in before), None][1:], features, to_features, strict=True
             )
         ][::-1]
-        # the product through which z_{t-1} enters, twice side by side
+        # the weight of z_{t-1}, stored twice to match (g, g)
         entry = before[0][0] if before else first if inputs is None else recurrent[:, :size]
         entry = torch.cat([entry, entry], dim=1)
         to_gates = None
@@ -219,7 +219,7 @@ class GaussianChain(torch.autograd.Function):
             entering = inputs.shape[-1] - width
             i, f, g, o = activated.split(width, dim=-1)
             previous = torch.cat([torch.zeros_like(cells[:1]), cells[:-1]])
-            # the gradients of (i, f, g) are these times that of c_t, the gradient of o this times that of h_t
+            # gradient of (i, f, g) = by_cell * gradient of c_t; gradient of o = by_output * gradient of h_t
             by_cell = torch.cat([g * i * (1 - i), previous * f * (1 - f), i * (1 - g * g)], dim=-1)
             by_cell = by_cell.unflatten(-1, (3, width)).unbind(0)
             by_output = (squashed * o * (1 - o)).unbind(0)
@@ -280,5 +280,5 @@ def _layers(tensors: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
 
 
 def _product(gradient: Tensor, entered: Tensor) -> Tensor:
-    """(H, F): the gradient of a weight from those of its outputs (T, B, H) and its inputs (T, B, F)."""
+    """Return the gradient (H, F) of a weight from its inputs (T, B, F) and the gradients of its outputs (T, B, H)."""
     return gradient.flatten(0, 1).t() @ entered.flatten(0, 1)

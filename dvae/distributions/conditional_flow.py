@@ -1,8 +1,8 @@
-"""The conditional flow: a location, a scale and a bijection that read features, of normal noise.
+"""The conditional flow: normal noise through a bijection, a scale and a location that depend on features.
 
     x = m(h) + s(h) f^-1(e; h),  e ~ N(0, I):        log p(x | h) = log N(f(u; h)) + log |det f'| - sum_d log s_d
 
-with u = (x - m) / s. f are the steps of `dvae.distributions.glow`; with f the identity it is `Normal`.
+with u = (x - m) / s. f consists of the steps of `dvae.distributions.glow`; if f is the identity, it is `Normal`.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from .flow import FlowDistribution
 
 @dataclass(frozen=True)
 class ConditionalFlow:
-    """A flow of all coordinates of a step, which reads the features; without any, of a variable without parents.
+    """A flow of all coordinates of a step, conditioned on the features; unconditional for a variable without parents.
 
-    Its density is exact, and one for all that a step has. Densities and draws take one pass each. Where a mean is asked
-    for, there is none in closed form: for it stands the value of the noise 0.
+    The density is exact, with one value per step. Densities and draws take one pass each. The mean has no closed form;
+    `mean` returns the value at zero noise instead.
 
     Args:
-        steps: of the flow.
+        steps: number of steps of the flow.
         hidden: widths of the perceptron in each step.
-        bound: of the logarithm of what a step multiplies by; the smaller, the less can a free run go astray.
-        min_scale: s stays above it.
-        residual: see `Law`.
+        bound: bound on the log scale of a step; smaller values keep free-running forecasts from diverging.
+        min_scale: lower bound of s.
+        residual: share of the previous value, as in `Law`.
     """
 
     steps: int = 8
@@ -41,10 +41,10 @@ class ConditionalFlow:
     residual: float = False
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape.
+        """Return the module for a variable of this shape.
 
         Raises:
-            ValueError: no step, or a bound that is not positive.
+            ValueError: `steps` is less than 1, or the bound is not positive.
             ImportError: zuko is not installed.
         """
         if self.steps < 1 or self.bound <= 0:
@@ -55,7 +55,7 @@ class ConditionalFlow:
 
 
 class ConditionalFlowLaw(Law):
-    """What `ConditionalFlow` describes; its parameters are m, s and h: (..., D), (..., D) and (..., H)."""
+    """Distribution module of `ConditionalFlow`; its parameters are m, s and h: (..., D), (..., D) and (..., H)."""
 
     event_dim = 1
     location_scale = True
@@ -93,11 +93,11 @@ class ConditionalFlowLaw(Law):
         return Conditioned(self.flow, parameters).from_noise(noise)
 
     def start_at(self, parameters: Parameters, values: Tensor) -> None:
-        """Has values enter every coupling with mean 0 and variance 1: the data-dependent start of Glow.
+        """Initialise the flow so that values enter every coupling with mean 0 and variance 1, as in Glow.
 
         Args:
-            parameters: of N values, (N, ...) each.
-            values: (N, D), two at least.
+            parameters: parameters of N values, (N, ...) each.
+            values: (N, D), at least two.
         """
         if len(values) < 2:
             raise ValueError(f"a flow starts at two values or more, got {len(values)}")
@@ -106,7 +106,7 @@ class ConditionalFlowLaw(Law):
 
 
 class Conditioned:
-    """The bijection that parameters make of a flow, in its own precision."""
+    """The bijection of a flow for given parameters, in the precision of the flow."""
 
     def __init__(self, flow: Any, parameters: Parameters):
         dtype = next(flow.parameters()).dtype
@@ -119,17 +119,17 @@ class Conditioned:
             self.move = flow(_read(features))
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The noise (..., D) that stands for values (..., D), and the log-determinant (...)."""
+        """Map values (..., D) to noise (..., D) and the log-determinant (...)."""
         with torch.autocast(x.device.type, enabled=False):
             z, log_det = self.move.call_and_ladj((x.to(self.loc.dtype) - self.loc) / self.scale)
         return z, log_det - self.scale.log().sum(-1)
 
     def from_noise(self, z: Tensor) -> Tensor:
-        """The values (..., D) for which noise (..., D) stands."""
+        """Map noise (..., D) to values (..., D)."""
         with torch.autocast(z.device.type, enabled=False):
             return torch.addcmul(self.loc, self.scale, self.move.inv(z.to(self.loc.dtype)))
 
 
 def _read(features: Tensor) -> Tensor | None:
-    """Features as flows take them: None for none."""
+    """Return the features as zuko expects them: None for zero features."""
     return features if features.shape[-1] else None

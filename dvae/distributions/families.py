@@ -1,4 +1,4 @@
-"""Families: laws whose parameters are read from features."""
+"""Conditional distributions with parameters from features: normals, Student t and point masses."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 class Normals(dist.Normal):
-    """Normals with locations and scales (..., D), whose densities and divergences take fewer passes than torch's.
+    """Normals with locations and scales (..., D) and a faster log density and KL divergence than torch's.
 
-    They are written with quotients, which are used twice, in place of squares of scales: of a training step of STORN
-    that saves a hundredth to a twentieth (docs/results/speed.md).
+    They compute each quotient once and reuse it, in place of squared scales. This saves 1 to 5 % of a training step of
+    STORN (docs/results/speed.md).
     """
 
     @override
@@ -40,41 +40,41 @@ def _divergence(q: Normals, p: Normals) -> Tensor:
 
 
 class Gaussian(Law):
-    """A law of independent normals; its parameters are their locations and scales, (..., D) each."""
+    """Base of distribution modules for independent normals; the parameters are locations and scales, (..., D) each."""
 
     location_scale = True
     centred = True
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """The normals."""
+        """Return the normals."""
         loc, scale = parameters
         return Normals(loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Reparameterised values (..., D)."""
+        """Return reparameterised values (..., D)."""
         loc, scale = parameters
         return torch.addcmul(loc, scale, noise)
 
 
 @dataclass(frozen=True)
 class Normal:
-    """A diagonal normal whose location and scale are both read from the features, or learned without any.
+    """A diagonal normal with location and scale from the features, or learned without features.
 
     Args:
-        min_scale: the scale stays above it; a likelihood whose scale can vanish has no maximum.
-        residual: see `Law`.
+        min_scale: lower bound of the scale; without one, the likelihood may be unbounded.
+        residual: share of the previous value, as in `Law`.
     """
 
     min_scale: float = 1e-3
     residual: float = False
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         return NormalLaw(self, shape)
 
 
 class NormalLaw(Gaussian):
-    """What `Normal` describes."""
+    """Distribution module of `Normal`."""
 
     def __init__(self, spec: Normal, shape: Shape):
         super().__init__(spec.residual)
@@ -84,24 +84,24 @@ class NormalLaw(Gaussian):
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         loc, raw = self.out(features).chunk(2, dim=-1)
-        # contiguous: on a slice, softplus is not vectorised and takes nine times as long
+        # contiguous, because softplus of a slice is not vectorised and takes nine times as long
         scale = functional.softplus(raw.contiguous()) + self.min_scale
         return loc if previous is None else self.moved(loc, previous), scale
 
 
 @dataclass(frozen=True)
 class FixedNormal:
-    """A normal whose scale does not depend on the parents. Without parents its location is learned too.
+    """A normal with a scale that does not depend on the parents. Without parents, its location is learned too.
 
     Args:
-        scale: standard deviation, the initial one where it is learned.
-        learned: one learned scale per dimension.
-        project: a linear layer from features to location; False takes the features themselves.
-        steps: with `learned`, one scale per time step too, for up to so many steps. For a local variable only.
-        residual: see `Law`.
-        fitted: what the density's gradient reaches: "both", or the "scale" alone, where the location learns from
-            energies in its place.
-        error_weight: the scale is the weight of a squared error and no spread of the data; forecasts show the location.
+        scale: standard deviation; the initial value if it is learned.
+        learned: whether to learn one scale per dimension.
+        project: whether a linear layer maps features to the location; if False, the features are the location.
+        steps: with `learned`, the maximum number of time steps, with one scale per step; for a local variable only.
+        residual: share of the previous value, as in `Law`.
+        fitted: what receives the gradient of the density: "both", or "scale" if the location learns from energies only.
+        error_weight: whether the scale is the weight of a squared error, not the spread of the data; forecasts then
+            show the location.
     """
 
     scale: float = 1.0
@@ -113,7 +113,7 @@ class FixedNormal:
     error_weight: bool = False
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         if self.scale <= 0:
             raise ValueError(f"FixedNormal's scale is positive, got {self.scale}")
         if self.steps and not shape.local:
@@ -129,7 +129,7 @@ class FixedNormal:
 
 
 class FixedNormalLaw(Gaussian):
-    """What `FixedNormal` describes."""
+    """Distribution module of `FixedNormal`."""
 
     def __init__(self, spec: FixedNormal, shape: Shape):
         super().__init__(spec.residual)
@@ -145,7 +145,7 @@ class FixedNormalLaw(Gaussian):
 
     @override
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """A scale that is given is in the variable's own unit."""
+        """Convert the parameters; a scale that is not learned already has the unit of the variable."""
         loc, own = super().in_units(parameters, mean, scale)
         return loc, own if self.learned else parameters[1]
 
@@ -168,23 +168,23 @@ class FixedNormalLaw(Gaussian):
 
 @dataclass(frozen=True)
 class KnownNoise:
-    """A normal whose scale is given: the last D of its features, behind those that `networks.WithNoise` makes.
+    """A normal with a given scale: the last D features, after the features of the network in `networks.WithNoise`.
 
     Args:
-        residual: see `Law`.
+        residual: share of the previous value, as in `Law`.
     """
 
     residual: float = False
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         if shape.features <= shape.size:
             raise ValueError(f"KnownNoise has its scale from networks.WithNoise, as a network of p({shape.name} | ...)")
         return KnownNoiseLaw(self, shape)
 
 
 class KnownNoiseLaw(Gaussian):
-    """What `KnownNoise` describes."""
+    """Distribution module of `KnownNoise`."""
 
     def __init__(self, spec: KnownNoise, shape: Shape):
         super().__init__(spec.residual)
@@ -193,7 +193,7 @@ class KnownNoiseLaw(Gaussian):
 
     @override
     def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """The scale is in the variable's own unit."""
+        """Convert the location; the scale already has the unit of the variable."""
         return torch.addcmul(mean, parameters[0], scale), parameters[1]
 
     @override
@@ -204,12 +204,12 @@ class KnownNoiseLaw(Gaussian):
 
 @dataclass(frozen=True)
 class StudentT:
-    """A Student t, for observations with outliers.
+    """A Student t distribution for observations with outliers.
 
     Args:
-        df: degrees of freedom, the initial ones; learned, one per dimension, and kept above 2.
-        min_scale: the scale stays above it.
-        residual: see `Law`.
+        df: initial degrees of freedom; one per dimension is learned and stays above 2.
+        min_scale: lower bound of the scale.
+        residual: share of the previous value, as in `Law`.
     """
 
     df: float = 5.0
@@ -217,7 +217,7 @@ class StudentT:
     residual: float = False
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         if self.df <= 2:
             raise ValueError(f"StudentT needs df > 2, where the variance is finite; got {self.df}")
         return StudentTLaw(self, shape)
@@ -230,14 +230,14 @@ class StudentTs(dist.StudentT):  # type: ignore[misc]
     def log_prob(self, value: Tensor) -> Tensor:
         df, distance = self.df, (value - self.loc) / self.scale
         alike = all(size == 1 or not stride for size, stride in zip(df.shape[:-1], df.stride()[:-1], strict=True))
-        df = (df[(0,) * (df.dim() - 1)] if alike else df).double()  # one number for each coordinate, expanded
-        half = df / 2  # in double: of large df the terms cancel, and so do those of its gradient
+        df = (df[(0,) * (df.dim() - 1)] if alike else df).double()  # undo the expansion to one value per coordinate
+        half = df / 2  # in double, because the terms and their gradients cancel for large df
         normaliser = (half + 0.5).lgamma() - half.lgamma() - 0.5 * (math.pi * df).log()
         return (normaliser - (half + 0.5) * (distance.square() / df).log1p()).to(value.dtype) - self.scale.log()
 
 
 class StudentTLaw(Law):
-    """What `StudentT` describes."""
+    """Distribution module of `StudentT`."""
 
     location_scale = True
     centred = True
@@ -261,7 +261,7 @@ class StudentTLaw(Law):
         return StudentTs(df, loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Reparameterised values (..., D): the normal noise over the root of a gamma draw."""
+        """Return reparameterised values (..., D): normal noise divided by the square root of a gamma draw."""
         loc, scale, df = parameters
         gamma = torch._standard_gamma(0.5 * df)
         return loc + scale * noise * torch.rsqrt(2 * gamma / df)
@@ -269,21 +269,20 @@ class StudentTLaw(Law):
 
 @dataclass(frozen=True)
 class Delta:
-    """A point mass: a data variable that is a function of its parents, the features themselves.
+    """A point mass at the features, for a data variable that is a function of its parents.
 
-    It has no density, so that there is no likelihood and no bound: data enter such a model as its history, and through
-    energies.
+    It has no density, so there is no likelihood and no bound. Data enter such a model as history and through energies.
     """
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         if shape.features != shape.size:
             raise ValueError(f"a Delta takes {shape.size} features, its size, but the network gives {shape.features}")
         return DeltaLaw()
 
 
 class DeltaLaw(Law):
-    """What `Delta` describes."""
+    """Distribution module of `Delta`."""
 
     deterministic = True
     location_scale = True
@@ -299,7 +298,7 @@ class DeltaLaw(Law):
 
     @override
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """There is none."""
+        """Return an empty placeholder, because no noise is needed."""
         return like.new_empty(()).expand(*shape)
 
     @override
@@ -311,19 +310,19 @@ class DeltaLaw(Law):
 class Directions:
     """A point mass at unit vectors of three coordinates each, such as directions in space.
 
-    It has no density, as `Delta` has none.
+    Like `Delta`, it has no density.
 
     Args:
-        project: a linear layer from features to vectors, which are then normalised; False takes the features
-            themselves.
-        residual: see `Law`; what is kept is added before vectors are normalised.
+        project: whether a linear layer maps features to vectors before normalisation; if False, the features are the
+            vectors.
+        residual: share of the previous value, as in `Law`; it is added before normalisation.
     """
 
     project: bool = True
     residual: float = False
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         if shape.size % 3 or not (self.project or shape.features == shape.size):
             raise ValueError(
                 f"Directions are of three coordinates each, and without projection the features themselves; "
@@ -333,7 +332,7 @@ class Directions:
 
 
 class DirectionsLaw(DeltaLaw):
-    """What `Directions` describes."""
+    """Distribution module of `Directions`."""
 
     location_scale = False
     centred = False
@@ -350,15 +349,15 @@ class DirectionsLaw(DeltaLaw):
 
 @dataclass(frozen=True)
 class StandardNormal:
-    """N(0, I), whatever the features: the law of a model's variable without parents, where nothing else is said."""
+    """N(0, I) for any features: the default distribution of a model variable without parents."""
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         return StandardNormalLaw(shape.size)
 
 
 class StandardNormalLaw(Gaussian):
-    """What `StandardNormal` describes."""
+    """Distribution module of `StandardNormal`."""
 
     zero: Tensor
 

@@ -1,27 +1,27 @@
-"""Family: any distribution of Pyro's as a law, and the families of observations by name.
+"""Family: any Pyro distribution as a conditional distribution, and named families for observations.
 
-A distribution says which values its parameters may have (`arg_constraints`), and `biject_to` leads there from what a
-linear layer makes of features: a rate is an exponential of it, a matrix of scales has a positive diagonal.
+A distribution declares the constraints of its parameters (`arg_constraints`). `biject_to` maps the output of a linear
+layer to them: a rate is the exponential of the output, and a scale matrix has a positive diagonal.
 
 | family | observations | distribution |
 |---|---|---|
 | real | numbers | `Normal` |
-| fixed | numbers, with one scale for each coordinate whatever the parents | `FixedNormal` |
+| fixed | numbers, with one scale per coordinate that does not depend on the parents | `FixedNormal` |
 | robust, laplace | numbers with outliers | `StudentT`, Laplace |
 | mixture | numbers with several modes | `NormalMixture` |
-| correlated | numbers that vary together | `LowRankNormal` |
+| correlated | correlated numbers | `LowRankNormal` |
 | angle | radians from -pi to pi | von Mises |
-| positive, log-normal | positive numbers, and such over orders of magnitude | Gamma, LogNormal |
+| positive, log-normal | positive numbers; positive numbers that span orders of magnitude | Gamma, LogNormal |
 | power | squared magnitudes of a spectrum | Exponential |
 | share | above 0 and below 1 | Beta |
 | binary | 0 or 1 | Bernoulli |
-| category | one of D classes, in D coordinates of which one is 1 | OneHotCategorical |
-| count, overdispersed | whole numbers from 0, and such that vary more than Poisson's | Poisson, negative binomial |
-| sparse, sparse-overdispersed | the same with more zeros | zero-inflated Poisson, negative binomial |
+| category | one of D classes, one-hot encoded in D coordinates | OneHotCategorical |
+| count, overdispersed | non-negative integers; those with a larger variance than Poisson | Poisson, negative binomial |
+| sparse, sparse-overdispersed | the same with excess zeros | zero-inflated Poisson, negative binomial |
 
-Of a power spectrum, minus the log density is the Itakura-Saito divergence from its mean, but for what the data alone
-decide: that of complex normals, whose variance is the mean (Févotte, Bertin and Durrieu 2009; the speech models of the
-review of Girin et al. 2021, arXiv 2008.12595).
+For a power spectrum, the negative log density equals the Itakura-Saito divergence from the mean, up to terms of the
+data alone. It is the likelihood of complex normals whose variance is that mean (Févotte, Bertin and Durrieu, 2009). The
+speech models in the review of Girin et al. (2021, arXiv 2008.12595) use it.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ from .families import FixedNormal, Normal, StudentT
 from .precise import Bounded, InDouble
 
 ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
-"""Parameters that say the same: the first is read."""
+"""Equivalent parameters; the network provides the first of each group."""
 
-Moved = Callable[[Tensor, Tensor, Tensor], Tensor]  # a parameter, mean and scale -> that of mean + scale * variable
+Moved = Callable[[Tensor, Tensor, Tensor], Tensor]  # (parameter, mean, scale) -> parameter of mean + scale * variable
 
 
 def _location(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
@@ -92,22 +92,25 @@ UNITS: Mapping[str, Mapping[str, Moved]] = {
     )
     for name in names.split()
 }
-"""How parameters move with the unit of the variable, by distribution. Rates of counts become those of counts whose mean
-is a multiple; what has a scale alone heeds no mean."""
+"""Conversion of the parameters to another unit of the variable, by distribution.
+
+A rate of counts becomes the rate of counts with a mean multiplied by the scale. Distributions with a scale but no
+location ignore the mean.
+"""
 
 
 class Inside(constraints.Constraint):
-    """The unit interval or the simplex without its edges.
+    """The interior of the unit interval or of the simplex.
 
     Args:
-        closed: the constraint with its edges.
+        closed: the closed constraint, which includes the boundary.
     """
 
     def __init__(self, closed: Any):
         self.closed, self.event_dim = closed, closed.event_dim
 
     def check(self, value: Tensor) -> Tensor:
-        """Whether values are inside."""
+        """Return whether values are in the interior."""
         inside = self.closed.check(value)
         return inside & (value > 0).all(-1) if self.event_dim else inside & (value > 0) & (value < 1)
 
@@ -119,17 +122,17 @@ transform_to.register(Inside, lambda constraint: transform_to(constraint.closed)
 
 
 class VonMises(dist.VonMises):  # type: ignore[misc]
-    """A von Mises distribution at any concentration; torch's has gradients between 3e-6 and 4e4 alone in float32."""
+    """A von Mises distribution for any concentration; torch's gradients in float32 require one between 3e-6 and 4e4."""
 
     @override
     def log_prob(self, value: Tensor) -> Tensor:
         concentration, apart = self.concentration.double(), value.double() - self.loc.double()
-        kernel = -2 * concentration * (apart / 2).sin().square()  # cos - 1, whose terms cancel
+        kernel = -2 * concentration * (apart / 2).sin().square()  # cos - 1 without cancellation
         return (kernel - (2 * math.pi * torch.special.i0e(concentration)).log()).to(value.dtype)
 
     @override
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Draws; rejection sampling never ends at concentrations near 1e16."""
+        """Return draws; the concentration is clamped because rejection sampling does not terminate near 1e16."""
         narrow = dist.VonMises(self.loc, self.concentration.clamp(max=1e12), validate_args=False)
         return narrow.sample(torch.Size(sample_shape))  # type: ignore[no-any-return]
 
@@ -139,31 +142,31 @@ OPEN: Mapping[type[Distribution], Any] = {
     **dict.fromkeys((plain.Beta, plain.Kumaraswamy, plain.RelaxedBernoulli), Inside(constraints.unit_interval)),
     **dict.fromkeys((plain.Dirichlet, plain.RelaxedOneHotCategorical), Inside(constraints.simplex)),
 }
-"""Supports of distributions that torch declares closed, although the density on their edge is 0 or infinite."""
+"""Open supports of distributions that torch declares closed although their density at the boundary is 0 or infinite."""
 
 PLAIN = {"Bernoulli", "Categorical", "Cauchy", "Delta", "Exponential", "HalfCauchy", "HalfNormal", "Laplace"}
 PLAIN |= {"LogNormal", "Normal", "OneHotCategorical", "Uniform", "VonMises"}
-"""Distributions whose log densities do not subtract large terms; those of all others are evaluated in float64."""
+"""Distributions whose log density has no cancelling large terms. All others are evaluated in float64."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Any distribution of `pyro.distributions`, its parameters read from features, or learned without any.
+    """Any distribution of `pyro.distributions`, with parameters that are functions of the features or learned.
 
-    Of parameters that say the same, as probs and logits, the first of `ALTERNATIVES` is read. Whole numbers, as a
-    total count, cannot be read and are given.
+    For equivalent parameters such as probs and logits, the network provides the first of `ALTERNATIVES`. Integer
+    parameters such as a total count must be given.
 
     Args:
-        distribution: its name, such as "Poisson", or a class, which a run directory cannot keep.
-        given: parameters that are numbers, such as {"total_count": 12}.
-        learned: names of parameters that are learned, and not read from features.
-        shapes: of parameters of a distribution of vectors, where they are not D or (D, D), with -1 for D: such as
+        distribution: name, such as "Poisson", or a class; a run directory cannot store a class.
+        given: fixed parameters, such as {"total_count": 12}.
+        learned: names of parameters that are learned and do not depend on the features.
+        shapes: shapes of the parameters of a vector distribution if they are not D or (D, D), with -1 for D, such as
             {"cov_factor": (-1, 2)}.
-        min_scale: scales, and roots of diagonals, stay above it; a likelihood whose scale can vanish has no maximum.
-        residual: see `Law`; of a distribution with a location.
-        project: a linear layer from features to the parameters; False takes the features themselves, in their order,
-            the location first.
-        error_weight: see `Law`.
+        min_scale: lower bound of scales and of square roots of diagonals; without one, the likelihood may be unbounded.
+        residual: share of the previous value, as in `Law`; requires a location.
+        project: whether a linear layer maps features to parameters; if False, the features are the parameters in their
+            order, with the location first.
+        error_weight: whether the scale is the weight of a squared error, as in `Law`.
 
     Example:
         >>> pair, sizes = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"z": 2, "x": 3}
@@ -183,10 +186,10 @@ class Family:
 
     @property
     def kind(self) -> type[Distribution]:
-        """The class.
+        """The distribution class.
 
         Raises:
-            ValueError: a name that Pyro has no distribution of.
+            ValueError: Pyro has no distribution with this name.
         """
         if not isinstance(self.distribution, str):
             return self.distribution
@@ -197,12 +200,12 @@ class Family:
         raise ValueError(f"Pyro has no distribution {self.distribution!r}{nearest(self.distribution, known)}")
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         return FamilyLaw(self, shape)
 
 
 class FamilyLaw(Law):
-    """What `Family` describes; its parameters are the distribution's, flat behind the batch."""
+    """Distribution module of `Family`; its parameters are the distribution's, each flattened to (..., P)."""
 
     def __init__(self, spec: Family, shape: Shape):
         super().__init__(spec.residual)
@@ -220,7 +223,7 @@ class FamilyLaw(Law):
             raise ValueError(f"{self.kind.__name__} has no location, to which a previous value could be added")
         widths = {name: math.prod(free) for name, (free, _, _) in self.forms.items()}
         read = [name for name in widths if name not in spec.learned]
-        self.read = sorted(read, key=lambda name: name != "loc")  # the location first
+        self.read = sorted(read, key=lambda name: name != "loc")  # `projection` expects the location first
         self.widths = [widths[name] for name in self.read]
         self.learned = nn.ParameterDict({name: torch.zeros(widths[name]) for name in spec.learned})
         self.out: Any = nn.Identity()
@@ -238,7 +241,7 @@ class FamilyLaw(Law):
                 self.centre = _centre(made)
         support = getattr(made, "support", None)
         self.event_dim, self.discrete = len(made.event_shape), support is not None and support.is_discrete
-        self.reparameterised = made.has_rsample and not self.discrete  # torch.bernoulli has a gradient, of zero
+        self.reparameterised = made.has_rsample and not self.discrete  # torch.bernoulli has a gradient that is zero
         self.support = support if support is not None and _is_fixed(support) else None
 
     @property
@@ -274,7 +277,7 @@ class FamilyLaw(Law):
             for (name, (_, _, shape)), value in zip(self.forms.items(), parameters, strict=True)
         }
         given = self.given
-        if parameters:  # numbers, which torch would bring to the device each time
+        if parameters:  # cached tensors, because torch would copy numbers to the device at every call
             numbers = {name: value for name, value in given.items() if isinstance(value, float)}
             given = given | {name: constant(value, parameters[0]) for name, value in numbers.items()}
         made = self.kind(**shaped, **given)
@@ -296,21 +299,21 @@ class FamilyLaw(Law):
 
 
 def _is_fixed(support: Any) -> bool:
-    """Whether where values are is the same whatever the parameters."""
+    """Return whether a support is independent of the parameters."""
     if hasattr(support, "base_constraint"):
         return _is_fixed(support.base_constraint)
     return not any(isinstance(value, Tensor) for value in vars(support).values())
 
 
 Form = tuple[tuple[int, ...], Any, tuple[int, ...]]
-"""Of a parameter: its shape before it is mapped to where it may be, that map, and its shape there."""
+"""The unconstrained shape of a parameter, the map to its constraint, and the constrained shape."""
 
 
 def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
-    """The form of every parameter that is not given.
+    """Return the form of every parameter that is not given.
 
     Raises:
-        ValueError: parameters that are none, or whole numbers that are not given.
+        ValueError: the distribution does not declare its parameters, a name is unknown, or an integer is not given.
     """
     kind, name = spec.kind, spec.kind.__name__
     constraints = kind.arg_constraints
@@ -335,7 +338,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
             )
         if own in spec.shapes:
             size: tuple[int, ...] = tuple(shape.size if n == -1 else n for n in spec.shapes[own])
-        else:  # of a distribution of numbers each has one for each coordinate
+        else:  # a univariate distribution has one parameter per coordinate
             size = (shape.size,) * (constraint.event_dim if kind.support.event_dim else 1)  # type: ignore[union-attr]
         to = _to(constraint)
         forms[own] = tuple(to.inverse_shape(torch.Size(size))), to, size
@@ -346,7 +349,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
 
 @contextmanager
 def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
-    """Has a distribution that cannot be made of its parameters refused in a sentence."""
+    """Convert errors of constructing a distribution into a ValueError with an explanation."""
     try:
         yield
     except errors as error:
@@ -359,12 +362,12 @@ def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
 def _to(constraint: Any) -> Any:
     try:
         return biject_to(constraint)
-    except NotImplementedError:  # torch has no bijection to matrices of scales, but a map onto them
+    except NotImplementedError:  # torch has a surjective map, but no bijection, to scale matrices
         return transform_to(constraint)
 
 
 def _centre(law: Any) -> str:
-    """What stands for a value that is not there: the mean, or the mode of what has none, as Cauchy's; else nothing."""
+    """Return "mean", or "mode" if the mean is not finite (Cauchy), or "" if neither exists."""
     for name in ("mean", "mode"):
         with suppress(NotImplementedError, AttributeError):
             if torch.isfinite(getattr(law, name)).all():
@@ -374,25 +377,25 @@ def _centre(law: Any) -> str:
 
 @dataclass(frozen=True)
 class NormalMixture:
-    """Each coordinate from a mixture of normals of its own, whose weights, locations and scales are read from features.
+    """A separate mixture of normals for each coordinate, with weights, locations and scales from the features.
 
     Args:
-        components: K.
-        min_scale: scales stay above it.
+        components: K, number of components.
+        min_scale: lower bound of the scales.
     """
 
     components: int = 5
     min_scale: float = 1e-3
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         if self.components < 1:
             raise ValueError(f"a mixture has at least one component, got {self.components}")
         return NormalMixtureLaw(self, shape)
 
 
 class NormalMixtureLaw(Law):
-    """What `NormalMixture` describes; its parameters are logits, locations and scales, (..., D K) each."""
+    """Distribution module of `NormalMixture`; its parameters are logits, locations and scales, (..., D K) each."""
 
     reparameterised = False
     location_scale = True
@@ -403,7 +406,7 @@ class NormalMixtureLaw(Law):
         self.components, self.min_scale = spec.components, spec.min_scale
         self.out = self.projection(shape.features, 3 * shape.size * spec.components, 0)
         spread = torch.linspace(-1.0, 1.0, spec.components) if spec.components > 1 else torch.zeros(1)
-        with torch.no_grad():  # components that are alike at first would stay so without features
+        with torch.no_grad():  # without features, identical components would remain identical
             self.out.bias.unflatten(0, (3, shape.size, -1))[1] += spread
 
     @override
@@ -430,12 +433,12 @@ class NormalMixtureLaw(Law):
 
 @dataclass(frozen=True)
 class LowRankNormal:
-    """A normal of whole steps whose covariance is that of a few factors, and a variance of each coordinate beside it.
+    """A multivariate normal for each step, with covariance of low rank plus a diagonal.
 
     Args:
-        rank: factors.
-        min_scale: deviation that the variances stay above.
-        residual: see `Law`.
+        rank: number of factors of the covariance.
+        min_scale: lower bound of the square roots of the diagonal.
+        residual: share of the previous value, as in `Law`.
     """
 
     rank: int = 2
@@ -443,7 +446,7 @@ class LowRankNormal:
     residual: float = False
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         family = Family(
             "LowRankMultivariateNormal", {}, (), {"cov_factor": (-1, self.rank)}, self.min_scale, self.residual
         )
@@ -469,4 +472,4 @@ FAMILIES: Mapping[str, LawSpec] = {
     "sparse": Family("ZeroInflatedPoisson"),
     "sparse-overdispersed": Family("ZeroInflatedNegativeBinomial"),
 }
-"""Families of observations by name."""
+"""Families for observations, by name."""

@@ -2,21 +2,21 @@
 
     z_1 ~ N(m_1, P_1)        z_t = A_t z_{t-1} + b_t + N(0, Q_t)        weight of z_t: exp(g_t' z_t - z_t' G_t z_t / 2)
 
-The weights are what observations leave of themselves: a_t = C_t z_t + N(0, R) gives G_t = C_t' R^-1 C_t and
-g_t = C_t' R^-1 a_t, and a missing one zeros. All work is then in the dimension of z (Kalman, 1960; Rauch, Tung and
-Striebel, 1965; in information form, Särkkä, Bayesian Filtering and Smoothing, 2013).
+The weights are the likelihoods of observations: a_t = C_t z_t + N(0, R) gives G_t = C_t' R^-1 C_t and
+g_t = C_t' R^-1 a_t, and a missing observation gives zeros. All computations have the dimension of z (Kalman, 1960;
+Rauch, Tung and Striebel, 1965; in information form, Särkkä, Bayesian Filtering and Smoothing, 2013).
 
 The prediction is one autograd function. With W_t = (I + P_t G_t)^-1 and F_t = A_{t+1} W_t it is
 
     P_{t+1} = Q_{t+1} + F_t P_t A_{t+1}'        m_{t+1} = F_t m_t + A_{t+1} W_t P_t g_t + b_{t+1}
 
-of which only the first is not linear; its derivative is F_t dP F_t'. So both recursions of the backward pass are linear
-with known matrices: three products a step, all else at all steps at once. So are smoother and draws, from the last step
-back. Long series run in blocks (`scan.py`).
+Only the first recursion is nonlinear; its derivative is F_t dP F_t'. Both recursions of the backward pass are therefore
+linear with known matrices. They need three products per step; everything else is computed at all steps at once. The
+smoother and the draws, which start at the last step, are also linear recursions. Long series run in blocks (`scan.py`).
 
-Where observations are precise, terms cancel: W_t P_t g_t multiplies a small matrix by a large vector. So all work is in
-float64, and the m_t are refined once: a filter of single steps finds the error of each, which F carries forward. Then
-they are exact to a thousandth of their deviations where the product of variance and information is at most 1e10.
+Precise observations cause cancellation: W_t P_t g_t multiplies a small matrix by a large vector. All computations
+therefore use float64, and the m_t are refined once: single filter steps give the local errors, and F propagates them.
+The means are then exact to a thousandth of their standard deviations if variance times information is at most 1e10.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True)
 class LinearGaussianChain:
-    """The chain and its weights, see the file; time comes first. Gradients flow through all its results, in float64.
+    """A linear-Gaussian chain and its weights, in the notation of this module, with time as the first dimension.
+
+    Gradients flow through all results, which are in float64.
 
     Args:
         transition: A_2 to A_T, (T - 1, B, N, N).
@@ -66,7 +68,7 @@ class LinearGaussianChain:
 
     @cached_property
     def predicted(self) -> Moments:
-        """Of z_t given what came before t."""
+        """Moments of z_t given the weights before t."""
         return Moments(
             *Predict.apply(
                 self.transition,
@@ -81,27 +83,27 @@ class LinearGaussianChain:
 
     @cached_property
     def filtered(self) -> Moments:
-        """Of z_t given what came up to t."""
+        """Moments of z_t given the weights up to t."""
         return update(*self.predicted, self.information, self.potential)
 
     @cached_property
     def _gain(self) -> Tensor:
-        """(T - 1, B, N, N) coefficient of z_{t+1} in E(z_t | z_{t+1}, what came up to t)."""
+        """Coefficient (T - 1, B, N, N) of z_{t+1} in E(z_t | z_{t+1}, weights up to t)."""
         return torch.linalg.solve(self.predicted.covariance[1:], self.transition @ self.filtered.covariance[:-1]).mT
 
     @cached_property
     def _backward(self) -> tuple[Tensor, Moments]:
-        """Of z_t given z_{t+1} and what came up to t, from the last t back: the gain, and moments at z_{t+1} = 0."""
+        """Gain, and moments at z_{t+1} = 0, of z_t given z_{t+1} and the weights up to t, in reverse order of t."""
         gain = self._gain
         rest = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain @ self.transition
-        # a sum of squares (Joseph's form), which stays positive where the difference would not
+        # Joseph's form is a sum of squares, so rounding cannot make it negative, unlike the difference
         spread = rest @ self.filtered.covariance[:-1] @ rest.mT + gain @ self.noise @ gain.mT
         mean = self.filtered.mean[:-1] - _times(gain, self.predicted.mean[1:])
         return gain.flip(0), Moments(mean.flip(0), symmetric(spread).flip(0))
 
     @cached_property
     def smoothed(self) -> Moments:
-        """Of z_t given everything."""
+        """Moments of z_t given all weights."""
         gain, (mean, covariance) = self._backward
         means = States.apply(gain, mean, self.filtered.mean[-1])
         covariances = Covariances.apply(gain, covariance, self.filtered.covariance[-1])
@@ -109,11 +111,11 @@ class LinearGaussianChain:
 
     @property
     def lag_one(self) -> Tensor:
-        """(T - 1, B, N, N) Cov(z_{t+1}, z_t) given everything."""
+        """Cov(z_{t+1}, z_t) given all weights, (T - 1, B, N, N)."""
         return self.smoothed.covariance[1:] @ self._gain.mT
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Reparameterised draws (T, B, N) of z_{1:T} given everything, from standard normal noise of that shape."""
+        """Return reparameterised draws (T, B, N) of z_{1:T} given all weights, from standard normal noise (T, B, N)."""
         gain, (mean, covariance) = self._backward
         roots = torch.linalg.cholesky(torch.cat([self.filtered.covariance[-1:], covariance]))
         values = torch.cat([self.filtered.mean[-1:], mean]) + _times(roots, noise.flip(0).double())
@@ -121,17 +123,17 @@ class LinearGaussianChain:
 
 
 def update(mean: Tensor, covariance: Tensor, information: Tensor, potential: Tensor) -> Moments:
-    """Moments of N(mean, covariance) times exp(g' z - z' G z / 2); shapes (..., N) and (..., N, N)."""
+    """Return the moments of N(mean, covariance) times exp(g' z - z' G z / 2); shapes (..., N) and (..., N, N)."""
     identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
     moved = _column(covariance, potential - _times(information, mean))
-    # the covariance after times the difference would be less exact, where that is large
+    # more exact than updated covariance times difference if the difference is large
     right = torch.cat([covariance, moved], dim=-1)
     solved = torch.linalg.solve_ex(identity + covariance @ information, right)[0]
     return Moments(mean + solved[..., -1], symmetric(solved[..., :-1]))
 
 
 class Predict(torch.autograd.Function):
-    """The arguments of a `LinearGaussianChain` to m (T, B, N) and P (T, B, N, N); see the file."""
+    """The prediction m (T, B, N) and P (T, B, N, N) as a function of the arguments of `LinearGaussianChain`."""
 
     @staticmethod
     def forward(
@@ -160,9 +162,9 @@ class Predict(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_mean: Tensor, to_covariance: Tensor) -> tuple[Tensor, ...]:
-        """Gradients of the arguments from those of means and covariances.
+        """Return the gradients of the arguments from the gradients of means and covariances.
 
-        That of G is not symmetric; its symmetric part is the gradient, since G is symmetric.
+        The gradient for G is not symmetric; its symmetric part is the gradient, since G is symmetric.
         """
         transition, information, potential, means, filtered, shrink, carry = ctx.saved_tensors
         back = backward(carry)

@@ -1,8 +1,8 @@
-"""Distributions whose values or densities need more than the float32 of the networks.
+"""Distributions whose values or densities need more precision than the float32 of the networks.
 
-`Offset` takes the mean off values in float64, of which 1e9 + N(0, 1) leaves nothing in float32. `InDouble` evaluates
-in float64 a density whose terms cancel: that of a Poisson of mean 1e7 is the difference of terms near 1e8. `Bounded`
-has no density below the scale of a Pareto, where torch extrapolates.
+`Offset` subtracts the mean in float64, because float32 cannot represent the noise in 1e9 + N(0, 1). `InDouble`
+evaluates a density in float64 if its terms cancel: a Poisson log density at mean 1e7 is a difference of terms near 1e8.
+`Bounded` sets the density to 0 outside the support, such as below the scale of a Pareto, where torch extrapolates.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing_extensions import override
 
 
 class _Wrapped(TorchDistribution):
-    """A distribution with the shapes and the support of another one."""
+    """A distribution with the shapes and the support of its base distribution."""
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
@@ -28,36 +28,36 @@ class _Wrapped(TorchDistribution):
         super().__init__(base.batch_shape, base.event_shape, validate_args=False)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """A reparameterised draw."""
+        """Return a reparameterised draw."""
         return self.base.rsample(torch.Size(sample_shape))  # type: ignore[no-any-return]
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """A draw."""
+        """Return a draw."""
         return self.base.sample(torch.Size(sample_shape))  # type: ignore[no-any-return]
 
     @property
     def mean(self) -> Tensor:
-        """That of the base."""
+        """Mean of the base distribution."""
         return self.base.mean  # type: ignore[no-any-return]
 
     @property
     def variance(self) -> Tensor:
-        """That of the base."""
+        """Variance of the base distribution."""
         return self.base.variance  # type: ignore[no-any-return]
 
     @property
     def support(self) -> constraints.Constraint:  # type: ignore[override]
-        """That of the base."""
+        """Support of the base distribution."""
         return self.base.support
 
 
 class Offset(_Wrapped):
-    """The distribution of offset + value, which is in float64.
+    """The distribution of offset + value, in float64.
 
     Args:
-        base: of the value.
+        base: distribution of the value.
         offset: (D,) float64.
-        dtype: of the parameters of the base.
+        dtype: dtype of the parameters of the base distribution.
     """
 
     def __init__(self, base: Any, offset: Tensor, dtype: torch.dtype):
@@ -65,7 +65,7 @@ class Offset(_Wrapped):
         self.offset, self.dtype = offset, dtype
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density, in the precision of the base."""
+        """Return the log density in the precision of the base distribution."""
         return self.base.log_prob((value - self.offset).to(self.dtype))  # type: ignore[no-any-return]
 
     @override
@@ -82,33 +82,33 @@ class Offset(_Wrapped):
         return super().mean + self.offset
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Offset:
-        """With another batch shape."""
+        """Return the distribution with another batch shape."""
         return Offset(self.base.expand(batch_shape), self.offset, self.dtype)
 
 
 class Bounded(_Wrapped):
-    """A distribution whose density is 0 outside a support that depends on its parameters; torch's may not be.
+    """A distribution with density 0 outside a parameter-dependent support, which torch may not enforce.
 
     Args:
         base: the distribution.
     """
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density or probability."""
+        """Return the log density or log probability."""
         inside = self.support.check(value)  # type: ignore[no-untyped-call]
         return torch.where(inside, self.base.log_prob(value), -torch.inf)
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Bounded:
-        """With another batch shape."""
+        """Return the distribution with another batch shape."""
         return Bounded(self.base.expand(batch_shape))
 
 
 class InDouble(_Wrapped):
-    """A distribution whose log density is evaluated in float64, and returned in the precision of the value.
+    """A distribution whose log density is evaluated in float64 and returned in the precision of the value.
 
     Args:
         base: the distribution.
-        double: returns the same with parameters in float64.
+        double: function that returns the same distribution with parameters in float64.
     """
 
     def __init__(self, base: Any, double: Callable[[], Any]):
@@ -116,9 +116,9 @@ class InDouble(_Wrapped):
         self.double = double
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density or probability."""
+        """Return the log density or log probability."""
         return self.double().log_prob(value.double()).to(value.dtype)  # type: ignore[no-any-return]
 
     def expand(self, batch_shape: Any, _instance: object = None) -> InDouble:
-        """With another batch shape."""
+        """Return the distribution with another batch shape."""
         return InDouble(self.base.expand(batch_shape), lambda: self.double().expand(batch_shape))

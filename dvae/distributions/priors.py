@@ -1,4 +1,4 @@
-"""Laws of static latents without parents, in place of N(0, I)."""
+"""Priors of static latents without parents, as alternatives to N(0, I)."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from .base import Law, Parameters, Shape
 
 
 class Prior(Law):
-    """A law without features: one distribution of (D,), the same for every sequence. One of one's own gives `prior`.
+    """A distribution of (D,) without features, the same for every sequence; subclasses implement `prior`.
 
     All coordinates are one event.
 
     Args:
-        spec: its description.
-        shape: what it is built for.
+        spec: specification of the prior.
+        shape: shape of the variable.
 
     Raises:
-        ValueError: another variable than a static latent without parents.
+        ValueError: the variable is not a static latent without parents.
     """
 
     event_dim = 1
@@ -44,11 +44,11 @@ class Prior(Law):
             )
 
     def prior(self) -> Any:
-        """The distribution: no batch, event (D,)."""
+        """Return the distribution: no batch, event (D,)."""
         raise NotImplementedError
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """The features themselves, which say how many sequences there are."""
+        """Return the features, whose batch shape is the number of sequences."""
         return (features,)
 
     @override
@@ -67,12 +67,12 @@ class Mixture:
     components: int = 8
 
     def build(self, shape: Shape) -> Law:
-        """The law of a static latent without parents."""
+        """Return the module for a static latent without parents."""
         return MixtureLaw(self, shape)
 
 
 class MixtureLaw(Prior):
-    """What `Mixture` describes."""
+    """Distribution module of `Mixture`."""
 
     reparameterised = False
 
@@ -93,10 +93,10 @@ class MixtureLaw(Prior):
 class Vamp:
     """The variational mixture of posteriors, p(w) = 1/K sum_k q(w | u_k), with learned pseudo-sequences u_k.
 
-    Tomczak and Welling, 2018, arXiv 1705.07120. The guide is the model's own, so it must read data alone.
+    Source: Tomczak and Welling, 2018, arXiv 1705.07120. It uses the guide of the model, which must read only data.
 
     Args:
-        components: K.
+        components: K, number of pseudo-sequences.
         steps: length of the pseudo-sequences.
     """
 
@@ -104,12 +104,12 @@ class Vamp:
     steps: int = 16
 
     def build(self, shape: Shape) -> Law:
-        """The law of a static latent without parents, whose guide reads data over time."""
+        """Return the module for a static latent without parents whose guide reads data over time."""
         return VampLaw(self, shape)
 
 
 class VampLaw(Prior):
-    """What `Vamp` describes."""
+    """Distribution module of `Vamp`."""
 
     reparameterised = False
 
@@ -125,20 +125,20 @@ class VampLaw(Prior):
                 f"nothing else, such as q({shape.name} | {shape.data[0]}_{{1:T}}), not {guide or 'the prior itself'}"
             )
         self.components, self.steps = spec.components, spec.steps
-        object.__setattr__(self, "guide", shape.guide)  # the model's, which is not to be registered twice
+        object.__setattr__(self, "guide", shape.guide)  # bypasses registration: the model already owns this module
         self.pseudo = nn.ParameterDict(
             {name: torch.randn(self.components, self.steps, size) for name, size in self.guide.sizes.items()}
         )
 
     @torch.no_grad()
     def start_at(self, data: Mapping[str, Tensor]) -> None:
-        """Sets the pseudo-sequences to the first steps of K sequences.
+        """Set the pseudo-sequences to the first steps of K sequences.
 
         Args:
-            data: name to (K, T, D).
+            data: {name: values (K, T, D)}.
 
         Raises:
-            ValueError: sequences that are shorter than the pseudo-sequences.
+            ValueError: the sequences are shorter than the pseudo-sequences.
         """
         for name, pseudo in self.pseudo.items():
             if data[name].shape[1] < self.steps:
@@ -161,28 +161,28 @@ class VampLaw(Prior):
 
 @dataclass(frozen=True)
 class Flow:
-    """A normalizing flow: N(0, I) moved by monotonic splines and affine couplings, in turn, and a location and scale.
+    """A normalizing flow of N(0, I): alternating monotonic splines and affine couplings, then a location and scale.
 
-    Dinh et al., 2017, arXiv 1605.08803 (couplings); Dolatabadi et al., 2020, arXiv 2001.05168 (linear rational
-    splines). Density and draws are exact, and take one pass each. It starts near N(0, I); with Pyro's own initial
-    weights it would start far from it, with heavy tails. In one dimension there is nothing to couple, and the splines
-    alone bend the normal.
+    Sources: Dinh et al., 2017, arXiv 1605.08803 (couplings); Dolatabadi et al., 2020, arXiv 2001.05168 (linear rational
+    splines). Density and draws are exact and take one pass each. The initial weights are small, so the flow starts near
+    N(0, I); with Pyro's initial weights it would start far from it, with heavy tails. In one dimension there are no
+    couplings, only splines.
 
     Args:
-        layers: of a spline and a coupling.
-        bins: pieces of each spline.
+        layers: number of layers; each has a spline and a coupling.
+        bins: number of pieces of each spline.
     """
 
     layers: int = 4
     bins: int = 8
 
     def build(self, shape: Shape) -> Law:
-        """The law of a static latent without parents."""
+        """Return the module for a static latent without parents."""
         return FlowLaw(self, shape)
 
 
 class FlowLaw(Prior):
-    """What `Flow` describes."""
+    """Distribution module of `Flow`."""
 
     def __init__(self, spec: Flow, shape: Shape):
         super().__init__(spec, shape)
@@ -192,7 +192,7 @@ class FlowLaw(Prior):
             spline = transforms.Spline(size, spec.bins, bound=4.0)
             for parameter in spline.parameters():
                 nn.init.normal_(parameter, std=0.01)
-            nn.init.normal_(spline.unnormalized_derivatives, math.log(math.e - 1), 0.01)  # the softplus of this is 1
+            nn.init.normal_(spline.unnormalized_derivatives, math.log(math.e - 1), 0.01)  # softplus of it is 1
             layer = nn.ModuleList([spline])
             if size > 1:
                 coupling: Any = transforms.affine_coupling(size, log_scale_min_clip=-2.0, log_scale_max_clip=2.0)
@@ -204,16 +204,16 @@ class FlowLaw(Prior):
 
     @override
     def prior(self) -> Any:
-        """The density, by splines and affine couplings.
+        """Return the distribution of the flow.
 
         Raises:
-            ValueError: parameters in half precision, which Pyro's splines do not take.
+            ValueError: the parameters have half precision, which Pyro's splines do not support.
         """
         loc = self.loc
         if torch.finfo(loc.dtype).bits < 32:
             raise ValueError(f"a Flow has no half precision, but its parameters are {loc.dtype}; use mixed precision")
-        # Pyro's transforms keep their last value and result. On copies these go with the distribution; else they would
-        # outlive a change of the parameters, and the module could not be deep-copied.
+        # Pyro's transforms cache their last input and output. Copies limit the cache to this distribution; otherwise it
+        # would become stale when parameters change, and the module could not be deep-copied.
         reverse = transforms.Permute(torch.arange(len(loc) - 1, -1, -1, device=loc.device), cache_size=0)
         moves = [part for layer in self.layers for part in (*map(copy.copy, layer), reverse)]
         moves.append(transforms.AffineTransform(loc, self.log_scale.exp(), event_dim=1, cache_size=1))

@@ -1,4 +1,4 @@
-"""Product: coordinates of one variable with a law each, independent given the parents, such as columns of a table."""
+"""Product: separate conditional distributions for parts of a variable, such as the columns of a table."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from .base import Law, LawSpec, Parameters, Shape, is_real
 
 @dataclass(frozen=True)
 class Product:
-    """Laws of parts of a variable: pairs of coordinates and a law.
+    """Distributions of parts of a variable, independent given the parents: pairs of coordinates and a specification.
 
-    The density is by coordinate, of what is one event (see `Law.distribution`) at its first coordinate. So single
-    entries may be missing, but of an event all of them.
+    The density is reported per coordinate. The density of a multivariate event (see `Law.distribution`) is assigned to
+    its first coordinate. Single entries may be missing, but an event can only be missing completely.
 
     Example:
         >>> law = Product((((0, 2), dvae.distributions.Normal()), ((1,), dvae.distributions.Family("Poisson"))))
@@ -36,10 +36,10 @@ class Product:
     parts: Sequence[tuple[Sequence[int], LawSpec]]
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape.
+        """Return the module for a variable of this shape.
 
         Raises:
-            ValueError: coordinates that are of no part, or of two.
+            ValueError: a coordinate is in no part, or in more than one; a part has no density.
         """
         given = sorted(place for places, _ in self.parts for place in places)
         if given != list(range(shape.size)):
@@ -51,7 +51,7 @@ class Product:
 
 
 class ProductLaw(Law):
-    """What `Product` describes; its parameters are those of the parts, one after the other."""
+    """Distribution module of `Product`; its parameters are the concatenated parameters of the parts."""
 
     order: Tensor
 
@@ -102,7 +102,7 @@ class ProductLaw(Law):
         return sum((self._part(n, features, previous, t) for n in range(len(self.parts))), ())
 
     def each(self, parameters: Parameters) -> list[tuple[Any, list[int], Parameters]]:
-        """Law, places and parameters of every part."""
+        """Return the module, coordinates and parameters of every part."""
         split, start = [], 0
         for count in self.counts:
             split.append(parameters[start : start + count])
@@ -133,7 +133,7 @@ class ProductLaw(Law):
 
 
 def _order(parts: Iterable[Sequence[int]]) -> Tensor:
-    """Where each coordinate is among those of the parts, one after the other."""
+    """Return the position of each coordinate in the concatenated parts."""
     return torch.tensor(list(chain.from_iterable(parts))).argsort()
 
 
@@ -145,7 +145,7 @@ class ProductDistribution(TorchDistribution):
     """Independent distributions of parts of a value: batch (..., D), no event.
 
     Args:
-        parts: pairs of coordinates and their distribution, of batch (..., n), or of events (n,).
+        parts: pairs of coordinates and their distribution, with batch (..., n) or event (n,).
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -162,7 +162,7 @@ class ProductDistribution(TorchDistribution):
         return torch.cat(parts, -1).index_select(-1, indices(self.order, parts[0]))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """(..., D); of an event at its first coordinate, 0 at its others."""
+        """Return (..., D), with the density of an event at its first coordinate and 0 at its others."""
         found = []
         for places, law in self.parts:
             own = law.log_prob(value.index_select(-1, indices(places, value)))
@@ -170,31 +170,31 @@ class ProductDistribution(TorchDistribution):
         return self._whole(found)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """A reparameterised draw (..., D)."""
+        """Return a reparameterised draw (..., D)."""
         return self._whole([law.rsample(torch.Size(sample_shape)) for _, law in self.parts])
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """A draw (..., D)."""
+        """Return a draw (..., D)."""
         return self._whole([law.sample(torch.Size(sample_shape)) for _, law in self.parts])
 
     @property
     def mean(self) -> Tensor:
-        """(..., D)."""
+        """Means (..., D) of the parts."""
         return self._whole([law.mean for _, law in self.parts])
 
     @property
     def variance(self) -> Tensor:
-        """(..., D)."""
+        """Variances (..., D) of the parts."""
         return self._whole([law.variance for _, law in self.parts])
 
     @property
     def support(self) -> constraints.Constraint:  # type: ignore[override]
-        """That of the parts."""
+        """Support of the parts."""
         return ProductSupport([(places, law.support) for places, law in self.parts])
 
 
 class ProductSupport(constraints.Constraint):
-    """Constraints of parts of a value; `check` gives (..., D)."""
+    """Constraints on parts of a value; `check` returns (..., D)."""
 
     def __init__(self, parts: Sequence[tuple[list[int], Any]]):
         self.parts = parts
@@ -202,7 +202,7 @@ class ProductSupport(constraints.Constraint):
         self.event_dim = 0
 
     def check(self, value: Tensor) -> Tensor:
-        """Whether each coordinate is where it may be."""
+        """Return whether each coordinate satisfies its constraint."""
         found = []
         for places, own in self.parts:
             right = own.check(value.index_select(-1, indices(places, value)))

@@ -1,18 +1,18 @@
-"""Recursions over T steps in blocks: all blocks at once from nothing, then each from the state that it starts from.
+"""Recursions over T steps in blocks: run all blocks at once from zero, then correct each block for its initial state.
 
-A block of steps of a linear recursion with known matrices, x_{t+1} = F_t x_t + c_t, or of covariances,
-X_{t+1} = F_t X_t F_t' + C_t, is one step of the same kind: its matrix is the product D of its F, its offset what it
-makes of nothing. So is a block of the Riccati recursion
+Consider a linear recursion with known matrices, x_{t+1} = F_t x_t + c_t, or a recursion of covariances,
+X_{t+1} = F_t X_t F_t' + C_t. A block of steps is again one step of the same kind. Its matrix is the product D of the F,
+and its offset is the result from a zero initial state. The same holds for a block of the Riccati recursion
 
     P_{t+1} = Q_t + F_t P_t A_t'        F_t = A_t W_t        W_t = (I + P_t G_t)^-1
 
-for with C, W and D those of the solution from P_1 = 0 it is, from any P_1,
+If C, W and D are computed for the solution with P_1 = 0, the solution for any P_1 is
 
     P_{t+1} = C_{t+1} + D_t (I + P_1 J_t)^-1 P_1 D_t'        J_t = D_0' G_1 W_1 D_0 + ... + D_{t-1}' G_t W_t D_{t-1}
 
-(these are the A, C and J of the elements that Särkkä and García-Fernández, 2021, arXiv 1905.13002, combine by pairs).
-What the blocks start from is the same recursion again, over as many steps as there are blocks: in place of T steps
-one after the other there are 16 or 32 at each of log T / log 16 levels, with twice the work and memory linear in T.
+These are the A, C and J of the elements that Särkkä and García-Fernández (2021, arXiv 1905.13002) combine in pairs. The
+initial states of the blocks follow the same recursion with one step per block. Instead of T sequential steps there are
+16 or 32 at each of log T / log 16 levels, with twice the work and memory linear in T.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 BLOCK = 16
-"""Steps of a block. With 8 or 32 times differ by less than from run to run."""
+"""Number of steps in a block. Run times with 8 or 32 differ by less than the variation between runs."""
 WIDE = 32
-"""Most rows of a step, sequences times N: with more a step keeps a core busy, and blocks double the work."""
+"""Maximum rows per step (sequences times N). With more, a step keeps a core busy and blocks double the work."""
 
 
 def in_blocks(matrix: Tensor) -> bool:
-    """Whether blocks are faster than one step after the other, for matrices (T, B, N, N)."""
+    """Return whether blocks are faster than sequential steps for matrices (T, B, N, N)."""
     steps, batch, size, _ = matrix.shape
     return steps >= 4 * BLOCK and batch * size <= min(WIDE, steps // 6)
 
 
 class Recursion:
-    """The linear recursions that share their matrices F (T, B, N, N)."""
+    """Linear recursions that share their matrices F (T, B, N, N)."""
 
     def __init__(self, matrix: Tensor):
         self.matrix = matrix
 
     @cached_property
     def _blocks(self) -> tuple[Recursion, Tensor, Recursion]:
-        """Within all blocks at once, the products there, and from block to block."""
+        """The recursion within all blocks at once, the products within blocks, and the recursion between blocks."""
         matrix = _apart(self.matrix)
         passed = products(matrix)
         return Recursion(matrix), passed, Recursion(_last(passed, self.matrix))
 
     def states(self, offset: Tensor, start: Tensor) -> Tensor:
-        """All x (T + 1, B, N, M), of c (T, B, N, M) and x_1 (B, N, M)."""
+        """Return all x (T + 1, B, N, M) for c (T, B, N, M) and x_1 (B, N, M)."""
         if in_blocks(self.matrix):
             within, passed, between = self._blocks
             own = within.states(offset := _apart(offset), torch.zeros_like(offset[0]))[1:]
@@ -62,7 +62,7 @@ class Recursion:
         return found
 
     def covariances(self, offset: Tensor, start: Tensor) -> Tensor:
-        """All X (T + 1, B, N, N), of C (T, B, N, N) and X_1 (B, N, N)."""
+        """Return all X (T + 1, B, N, N) for C (T, B, N, N) and X_1 (B, N, N)."""
         if in_blocks(self.matrix):
             within, passed, between = self._blocks
             own = within.covariances(offset := _apart(offset), torch.zeros_like(offset[0]))[1:]
@@ -77,7 +77,7 @@ class Recursion:
 
 
 def riccati(transition: Tensor, noise: Tensor, information: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """All P (T + 1, B, N, N), W and F (T, B, N, N), of A, Q and G (T, B, N, N) and P_1 (B, N, N)."""
+    """Return all P (T + 1, B, N, N), W and F (T, B, N, N) for A, Q and G (T, B, N, N) and P_1 (B, N, N)."""
     if in_blocks(transition):
         a, q, g = (_apart(values) for values in (transition, noise, information))
         own, shrink, carry = riccati(a, q, g, torch.zeros_like(a[0]))
@@ -106,7 +106,7 @@ def riccati(transition: Tensor, noise: Tensor, information: Tensor, start: Tenso
 
 
 def products(matrix: Tensor) -> Tensor:
-    """D_t = F_t ... F_1 of F (T, B, N, N), for all t."""
+    """Return D_t = F_t ... F_1 for all t, from F (T, B, N, N)."""
     found, steps = _room(matrix[0], len(matrix) - 1)
     for f, last, new in zip(matrix.unbind(0)[1:], steps, steps[1:], strict=False):
         torch.bmm(f, last, out=new)
@@ -114,35 +114,35 @@ def products(matrix: Tensor) -> Tensor:
 
 
 def symmetric(matrix: Tensor) -> Tensor:
-    """The symmetric part."""
+    """Return the symmetric part."""
     return 0.5 * (matrix + matrix.mT)
 
 
 def _room(start: Tensor, steps: int) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Room for so many steps after the first, as a whole and one by one; products into other layouts take long."""
+    """Allocate memory for `steps` steps after the first, as a whole and by step; other layouts slow products down."""
     found = start.new_empty(steps + 1, *start.shape)
     found[0] = start
     return found, found.unbind(0)
 
 
 def _apart(values: Tensor) -> Tensor:
-    """(T, B, ...) to the steps of all blocks, (BLOCK, blocks * B, ...); zeros fill up the last one."""
+    """Rearrange (T, B, ...) to the steps of all blocks, (BLOCK, blocks * B, ...); zeros pad the last block."""
     values = torch.cat([values, values.new_zeros(-len(values) % BLOCK, *values.shape[1:])])
     return values.unflatten(0, (-1, BLOCK)).transpose(0, 1).flatten(1, 2).contiguous()
 
 
 def _joined(values: Tensor, like: Tensor) -> Tensor:
-    """Back from `_apart`, to as many steps and sequences as another has."""
+    """Invert `_apart`, with the numbers of steps and sequences of `like`."""
     return values.unflatten(1, (-1, like.shape[1])).transpose(0, 1).flatten(0, 1)[: len(like)]
 
 
 def _last(values: Tensor, like: Tensor) -> Tensor:
-    """Of the steps of all blocks the last, (blocks, B, ...) for as many sequences as another has."""
+    """Return the last step of all blocks, (blocks, B, ...), with the number of sequences of `like`."""
     return values[-1].unflatten(0, (-1, like.shape[1]))
 
 
 class States(torch.autograd.Function):
-    """F (T, B, N, N), c (T, B, N) and x_1 (B, N) to x (T + 1, B, N)."""
+    """The states x (T + 1, B, N) from F (T, B, N, N), c (T, B, N) and x_1 (B, N)."""
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, offset: Tensor, start: Tensor) -> Tensor:
@@ -154,14 +154,14 @@ class States(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """It runs the other way."""
+        """Run the adjoint recursion, backward in time."""
         matrix, found = ctx.saved_tensors
         total = backward(matrix).states(*from_last(gradient[..., None])).flip(0)
         return total[1:] @ found[:-1, ..., None].mT, total[1:, ..., 0], total[0, ..., 0]
 
 
 class Covariances(torch.autograd.Function):
-    """F and C (T, B, N, N) and X_1 (B, N, N) to X (T + 1, B, N, N), the latter three symmetric."""
+    """The covariances X (T + 1, B, N, N) from F and C (T, B, N, N) and X_1 (B, N, N); C, X_1 and X are symmetric."""
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, offset: Tensor, start: Tensor) -> Tensor:
@@ -173,17 +173,17 @@ class Covariances(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """It runs the other way."""
+        """Run the adjoint recursion, backward in time."""
         matrix, found = ctx.saved_tensors
         total = symmetric(backward(matrix).covariances(*from_last(symmetric(gradient))).flip(0))
         return 2 * total[1:] @ matrix @ found[:-1], total[1:], total[0]
 
 
 def backward(matrix: Tensor) -> Recursion:
-    """Of gradients, from those of the last state to those of the first."""
+    """Return the recursion of gradients, from the last state to the first."""
     return Recursion(matrix.mT.flip(0))
 
 
 def from_last(values: Tensor) -> tuple[Tensor, Tensor]:
-    """What a recursion from the last of them to the first adds at every step, and starts from."""
+    """Split values into the offsets and the initial state of a recursion from the last step to the first."""
     return values[:-1].flip(0), values[-1]

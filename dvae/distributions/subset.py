@@ -1,4 +1,4 @@
-"""Subsets: which of some indices are chosen, at random, in the same number each time.
+"""Random subsets of fixed size from a set of indices.
 
 >>> Subset(0.5).distribution(6).sample().sum()
 tensor(3.)
@@ -22,13 +22,14 @@ from ..options import Share, check
 
 @dataclass(frozen=True)
 class Subset:
-    """Which indices of a variable are chosen: a share of them, uniformly without replacement.
+    """A subset of the indices of a variable: a fixed share, drawn uniformly without replacement.
 
-    A curriculum begins with the first ones and swaps more and more of them for others: at its end as many as differ,
-    in the mean, in a uniform draw. Each process of several draws for its own share of a batch.
+    With a curriculum, the subset initially contains the first indices. Later, an increasing number of them is replaced
+    by other indices, up to the expected number in a uniform draw. With several processes, each draws for its own part
+    of a batch.
 
     Args:
-        share: of the indices, from 0 to 1; of L of them, that times L is rounded up.
+        share: share of the indices, from 0 to 1; the number of chosen indices is rounded up.
     """
 
     share: Share
@@ -37,15 +38,15 @@ class Subset:
         check(self)
 
     def chosen(self, size: int) -> int:
-        """How many of so many indices."""
-        return ceil(self.share * size - 1e-9)  # .3 of 10 is 3, and not 4
+        """Return the number of chosen indices out of `size`."""
+        return ceil(self.share * size - 1e-9)  # rounding error must not turn 0.3 * 10 into 4
 
     def distribution(self, size: int, curriculum: float = 1.0) -> Subsets:
-        """The distribution of (L,), 1 at chosen indices and 0 at others.
+        """Return the distribution of vectors (L,) that are 1 at chosen indices and 0 elsewhere.
 
         Args:
-            size: L.
-            curriculum: how far it has come, from 0 to 1.
+            size: L, number of indices.
+            curriculum: progress of the curriculum, from 0 to 1.
         """
         chosen = self.chosen(size)
         most = round(chosen * (size - chosen) / size)
@@ -54,12 +55,12 @@ class Subset:
 
 
 class Subsets(TorchDistribution):
-    """Vectors (L,) of zeros and ones, with so many ones, all alike probable.
+    """Uniform distribution over vectors (L,) of zeros and ones with a fixed number of ones.
 
     Args:
-        size: L.
-        chosen: how many are 1.
-        swapped: how many of those are not among the first; None for any number.
+        size: L, number of indices.
+        chosen: number of ones.
+        swapped: number of ones that are not among the first `chosen` indices; None for any number.
     """
 
     arg_constraints: ClassVar[dict[str, Any]] = {}
@@ -73,7 +74,7 @@ class Subsets(TorchDistribution):
 
     @lazy_property
     def _log_number(self) -> float:
-        """Of the sets."""
+        """Log of the number of possible subsets."""
         if self.swapped is None:
             return _log_choose(self.size, self.chosen)
         return _log_choose(self.chosen, self.swapped) + _log_choose(self.size - self.chosen, self.swapped)
@@ -95,7 +96,7 @@ class Subsets(TorchDistribution):
 
 
 def _some(shape: torch.Size, size: int, count: int) -> Tensor:
-    """(*shape, size), 1 at so many places."""
+    """Return (*shape, size) with ones at `count` random places."""
     places = torch.rand(*shape, size).argsort(-1)[..., :count]
     return torch.zeros(*shape, size).scatter(-1, places, 1.0)
 

@@ -1,4 +1,4 @@
-"""A normal with full covariance, by the root of its precision."""
+"""A multivariate normal parameterised by a triangular factor of its precision matrix."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from .base import Law, Parameters, Shape
 
 @dataclass(frozen=True)
 class Triangular:
-    """A normal with full covariance, whose features are its location and whitening matrix."""
+    """A normal with full covariance; the features are its location and whitening matrix."""
 
     def build(self, shape: Shape) -> Law:
-        """The law of a variable of this shape."""
+        """Return the module for a variable of this shape."""
         needed = shape.size + shape.size**2
         if shape.features != needed:
             raise ValueError(f"a Triangular law takes {needed} features, but the network gives {shape.features}")
@@ -30,7 +30,7 @@ class Triangular:
 
 
 class TriangularLaw(Law):
-    """See `Triangular`; its parameters are (..., D) and (..., D * D)."""
+    """Distribution module of `Triangular`; its parameters have shapes (..., D) and (..., D * D)."""
 
     event_dim = 1
 
@@ -75,29 +75,29 @@ class TriangularNormal(TorchDistribution):
 
     @property
     def mean(self) -> Tensor:
-        """(..., D)."""
+        """Mean (..., D)."""
         return self.loc
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """Draws (*sample_shape, ..., D)."""
+        """Return draws (*sample_shape, ..., D)."""
         shape = self._extended_shape(torch.Size(sample_shape))
         return self.color(torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device))
 
     def color(self, noise: Tensor) -> Tensor:
-        """The value v whose e is `noise`."""
+        """Return the value v with e = `noise`."""
         return self.loc + torch.linalg.solve_triangular(self.whitening, noise[..., None], upper=False)[..., 0]
 
     def whiten(self, value: Tensor) -> Tensor:
-        """e, standard normal where the value is from this distribution."""
+        """Return e, which is standard normal if the value follows this distribution."""
         return (self.whitening @ (value - self.loc)[..., None])[..., 0]
 
     @property
     def log_precision(self) -> Tensor:
-        """(...) the sum of log U_dd."""
+        """The sum of log U_dd, (...)."""
         return self.whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """(...), in nats."""
+        """Return the log density (...), in nats."""
         constant = self.event_shape[0] * math.log(2 * math.pi)
         return self.log_precision - 0.5 * ((self.whiten(value) ** 2).sum(-1) + constant)
 
@@ -117,15 +117,15 @@ def _from_triangular(q: TriangularNormal, p: TriangularNormal) -> Tensor:
 
 
 class InverseCholesky(torch.autograd.Function):
-    """Symmetric positive definite S (..., D, D) to the lower triangular U with U'U = S^-1; nan where S is not that.
+    """Map S (..., D, D) to the lower triangular U with U'U = S^-1; nan where S is not symmetric positive definite.
 
-    Its backward pass is three products (torch's, through factor and solution, solves triangular systems), and gives a
-    matrix whose symmetric part is the gradient.
+    The backward pass takes three matrix products, whereas torch's solves triangular systems. It returns a matrix whose
+    symmetric part is the gradient.
     """
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor) -> Tensor:
-        """U."""
+        """Return U."""
         root, info = torch.linalg.cholesky_ex(matrix)
         identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
         inverse = torch.linalg.solve_triangular(root, identity, upper=False)
@@ -136,7 +136,7 @@ class InverseCholesky(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_inverse: Tensor) -> Tensor:
-        """Of dU = -Phi(U dS U') U, where Phi keeps the lower triangle and half of the diagonal."""
+        """Return the gradient from dU = -Phi(U dS U') U; Phi keeps the lower triangle and half of the diagonal."""
         (inverse,) = ctx.saved_tensors
         size = inverse.shape[-1]
         lower = torch.ones(size, size, dtype=inverse.dtype, device=inverse.device).tril_()
@@ -145,10 +145,10 @@ class InverseCholesky(torch.autograd.Function):
 
 
 def refuse_half(dtype: torch.dtype) -> None:
-    """Refuses parameters in half precision.
+    """Raise an error for parameters in half precision.
 
     Raises:
-        ValueError: saying in which they can be.
+        ValueError: the dtype has half precision; the message names the supported precisions.
     """
     if dtype in (torch.bfloat16, torch.float16):
         raise ValueError(
