@@ -1,4 +1,4 @@
-"""Networks: parents to features under the masks of a factorization.
+"""Networks that map the parents of a factor to features, under the masks of the factorization.
 
 >>> networks = {"p": dvae.networks.Dense((16,)), "q": dvae.networks.Attention(width=16, heads=2)}
 >>> model = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 2, "x": 3}, networks)

@@ -1,7 +1,7 @@
-"""Attention: masked cross-attention, from the current step to what it may see (Vaswani et al., 2017, arXiv 1706.03762).
+"""Masked cross-attention from the current step to the steps it may read (Vaswani et al., 2017, arXiv 1706.03762).
 
-Distances enter as linear biases (Press et al., 2022, arXiv 2108.12409) rather than as absolute positions, so that a
-model runs beyond the length it was trained on.
+Distances enter as linear biases (Press et al., 2022, arXiv 2108.12409) instead of absolute positions, so that a model
+can run on sequences longer than those in training.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from .loop import Rows, each_at, select, valid_steps
 
 @dataclass(frozen=True)
 class Attention:
-    """Pointwise parents form the query; parents read over a range are keys and values under their mask.
+    """Attention with pointwise parents as the query; parents read over a range are keys and values under their mask.
 
     A learned start token is always visible, because a first step has no past.
 
     Args:
-        width: of queries, keys and values.
+        width: width of queries, keys and values.
         heads: number of attention heads; divides the width.
-        layers: cross-attention layers over the same keys.
+        layers: number of cross-attention layers over the same tokens.
         feedforward: width of the perceptron after each attention; 0 for four times the width.
-        activation: of the perceptrons.
-        nearest: the nearest visible frame of each range joins the query, which then knows where in a sequence it is
-            before it attends to more.
-        extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
+        activation: activation of the perceptrons.
+        nearest: whether the nearest visible frame of each range joins the query, so that the query depends on the
+            position in the sequence before attention.
+        extract: extractors by parent, applied first: widths of a perceptron, or the specification of another module,
             such as `NodeGraph()`.
     """
 
@@ -52,30 +52,30 @@ class Attention:
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return AttentionNetwork(self, inputs, local)
 
 
 @dataclass(frozen=True)
 class SelfAttention(Attention):
-    """A transformer's encoder: every frame is a token, of the parents in it and of static ones, and sees the others.
+    """A transformer encoder with one token per frame, from the parents in the frame and the static parents.
 
-    It is for a local variable that reads parents over {1:T}; over {<=t} or {>=t} it looks to one side. What else the
-    factor reads, such as its own past, is attended to after the encoder, as in `Attention`, with the frame's token in
-    the query. Heads take turns to look back and ahead: to the other side, distances count four times.
+    It is for a local variable that reads parents over {1:T}; over {<=t} or {>=t} the attention is one-sided. All other
+    parents, such as the variable's own past, are attended to after the encoder, as in `Attention`, with the frame's
+    token in the query. Heads alternate between past and future: distances to the other side count four times.
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SelfAttentionNetwork:  # type: ignore[override]
-        """The network of a factor with these parents.
+        """Return the network of a factor with these parents.
 
         Raises:
-            ValueError: there is nothing to encode.
+            ValueError: no parent can be encoded.
         """
         return SelfAttentionNetwork(self, inputs, local)
 
 
 class Layer(nn.Module):
-    """One cross-attention and its perceptron, both residual with normalisation before them."""
+    """One cross-attention and its perceptron, both residual, with normalisation before them."""
 
     def __init__(self, spec: Attention):
         super().__init__()
@@ -95,23 +95,23 @@ class Layer(nn.Module):
         )
 
     def project(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys and values (B, heads, S, W / heads) of tokens (B, S, W)."""
+        """Return keys and values (B, heads, S, W / heads) of tokens (B, S, W)."""
         keys, values = self.keys_values(tokens).unflatten(-1, (2 * self.heads, -1)).transpose(1, 2).chunk(2, dim=1)
         return keys, values
 
     def queries(self, stream: Tensor) -> Tensor:
-        """(B, heads, T, W / heads) from the stream (B, T, W)."""
+        """Return queries (B, heads, T, W / heads) from the stream (B, T, W)."""
         query: Tensor = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1))
         return query.transpose(1, 2)
 
     def weights(self, stream: Tensor, keys: Tensor, bias: Tensor) -> Tensor:
-        """The shares (B, heads, T, S) in which a query mixes the values."""
+        """Return the attention weights (B, heads, T, S)."""
         query = self.queries(stream)
         return (query @ keys.transpose(-1, -2) / math.sqrt(query.shape[-1]) + bias).softmax(-1)
 
     def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
-        """The stream (B, T, W) after attending under the additive bias, broadcastable to (B, heads, T, S)."""
-        if stream.shape[1] == 1:  # a single query, for which the fused kernel takes several times as long
+        """Return the stream (B, T, W) after attention under an additive bias, broadcastable to (B, heads, T, S)."""
+        if stream.shape[1] == 1:  # for a single query, the fused kernel takes several times as long
             seen = self.weights(stream, keys, bias) @ values
         else:
             seen = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
@@ -120,13 +120,14 @@ class Layer(nn.Module):
         return stream + update
 
     def absorbed(self, columns: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """For `step`: from queries to C numbers (heads, W / heads, C), from these to values, and the bias of `out`.
+        """Return maps for `step`: queries to C numbers (heads, W / heads, C), these to values, and the bias of `out`.
 
-        Keys and values are linear in tokens, so that a query can be put to these themselves: a loop keeps them alone.
-        What a bias adds to all keys is the same for all, and the shares of the values add up to one.
+        Keys and values are linear in the tokens, so queries can be applied to the tokens and a loop stores only these.
+        A bias of the keys shifts all scores equally and cancels. A bias of the values is added once, since the weights
+        sum to one.
 
         Args:
-            columns: (C, W), tokens of C numbers as tokens of W; None where they have so many.
+            columns: (C, W) matrix from stored tokens with C numbers to tokens with W; None if C = W.
         """
         keys, values = self.keys_values.weight.unflatten(0, (2 * self.heads, -1)).chunk(2)
         if columns is not None:
@@ -135,7 +136,7 @@ class Layer(nn.Module):
         return keys / math.sqrt(keys.shape[1]), values.mT, bias
 
     def step(self, stream: Tensor, tokens: Tensor, bias: Tensor, absorbed: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """`forward` at one step: the stream (B, W) after attending to tokens (B, S, C), under a bias (B, heads, S)."""
+        """Run `forward` at one step: the stream (B, W) attends to tokens (B, S, C) under a bias (B, heads, S)."""
         keys, values, offset = absorbed
         query = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(0, 1)
         query, tokens = (query @ keys).transpose(0, 1)[:, None], tokens[:, None]
@@ -147,7 +148,7 @@ class Layer(nn.Module):
 
 
 class AttentionNetwork(Network):
-    """What `Attention` describes."""
+    """Network of `Attention`."""
 
     slopes: Tensor
 
@@ -183,7 +184,7 @@ class AttentionNetwork(Network):
         self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
 
     def bias(self, parent: Input, length: int) -> Tensor:
-        """(heads, T, T) or (1, 1, T) for a static child: minus slope times distance where visible, else -inf."""
+        """Return (heads, T, T), or (1, 1, T) for a static child: minus slope times distance if visible, else -inf."""
         assert parent.relation is not None
         mask = visible(parent.relation, length, self.slopes.device)
         if not self.local:
@@ -206,12 +207,12 @@ class AttentionNetwork(Network):
 
     @torch.no_grad()
     def attention(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> list[Tensor]:
-        """What every layer attends to, to look at: shares (B, heads, T, 1 + T parents) that sum to one.
+        """Return the attention weights of every layer for inspection: (B, heads, T, 1 + T parents), with sum one.
 
-        The start token comes first, then the steps of each ranged parent, in the order of `ranged`.
+        The start token is first, followed by the steps of each ranged parent in the order of `ranged`.
 
         Args:
-            parents, length, lengths: see `Network.forward`.
+            parents, length, lengths: as in `Network.forward`.
         """
         batch = next(iter(parents.values())).shape[0]
         parents = self.extractors.of(parents, lengths)
@@ -225,7 +226,7 @@ class AttentionNetwork(Network):
         return found
 
     def queries(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
-        """(B, T, W), or (B, 1, W) for a static child."""
+        """Return the stream (B, T, W), or (B, 1, W) for a static child."""
         stream = self.origin.expand(batch, length if self.local else 1, -1)
         if self.point is None:
             return stream
@@ -235,15 +236,16 @@ class AttentionNetwork(Network):
     def tokens(
         self, parents: Sequence[Input], values: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Tokens (B, 1 + T * parents, W), the start token first, and their bias to every step."""
+        """Return tokens (B, 1 + T * parents, W), the start token first, and their bias for every step."""
         tokens = [self.embed[parent.name](values[parent.name]) for parent in parents]
         bias = functional.pad(self.biases(parents, length, lengths), (1, 0))
         return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), bias
 
     def kept(self, name: str, values: Tensor) -> Tensor:
-        """What a loop keeps of a parent's values (..., D): tokens (..., W), or where these are wider what makes them.
+        """Return what a loop stores of a parent's values (..., D): tokens (..., W), or a shorter form if W is larger.
 
-        That is (..., D + 2), the values and a 1 for the bias of their embedding; the last one is of the start token.
+        The shorter form is (..., D + 2): the values, a 1 for the bias of the embedding, and an indicator of the start
+        token.
         """
         if self.narrow:
             return torch.cat([values, constant((1.0, 0.0), values).expand(*values.shape[:-1], 2)], -1)
@@ -251,14 +253,14 @@ class AttentionNetwork(Network):
         return tokens
 
     def columns(self) -> Tensor | None:
-        """(D + 2, W), to make tokens of what is kept; None where that is tokens."""
+        """Return the matrix (D + 2, W) from the stored form to tokens; None if tokens are stored."""
         if not self.narrow:
             return None
         embed: Any = self.embed[self.ranged[0].name]
         return torch.cat([embed.weight.mT, embed.bias[None], self.start_token[None]])
 
     def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
-        """(B or 1, heads or 1, T or 1, T * parents), of every step to the parents' valid ones."""
+        """Return the bias of every step to the parents' valid steps, (B or 1, heads or 1, T or 1, T * parents)."""
         none = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
         bias = torch.cat([none, *(self.bias(parent, length) for parent in parents)], dim=-1)[None]
         if lengths is None:
@@ -317,11 +319,11 @@ class AttentionNetwork(Network):
 
     @override
     def reach(self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        return self.step(state, t + count - 1, drawn)  # what it has not seen yet enters the cache
+        return self.step(state, t + count - 1, drawn)  # `step` also adds all skipped tokens to the cache
 
 
 class SelfAttentionNetwork(Network):
-    """What `SelfAttention` describes."""
+    """Network of `SelfAttention`."""
 
     slopes: Tensor
 
@@ -354,7 +356,7 @@ class SelfAttentionNetwork(Network):
         return encoded if self.after is None else self.after({ENCODED: encoded, **parents}, length, lengths)
 
     def encode(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None) -> Tensor:
-        """The frames' tokens (B, T, W) after the encoder."""
+        """Return the tokens (B, T, W) of the frames after the encoder."""
         values = self.extractors.of(parents, lengths)
         frames = torch.cat(aligned([values[p.name] for p in (*self.encoded, *self.statics)]), dim=-1)
         stream: Tensor = self.embed(frames)
@@ -362,21 +364,21 @@ class SelfAttentionNetwork(Network):
         if lengths is not None:
             bias = bias.masked_fill(~valid_steps(lengths, length)[:, None, None], -math.inf)
             own = torch.eye(length, dtype=torch.bool, device=bias.device)
-            bias = bias.masked_fill(own, 0.0)  # padding sees itself: softmax over nothing is NaN
+            bias = bias.masked_fill(own, 0.0)  # padding attends to itself, since a softmax over nothing is NaN
         for layer in self.layers:
             stream = layer(stream, *layer.project(layer.norm_query(stream)), bias)
         stream = self.norm(stream)
         return stream
 
     def bias(self, length: int) -> Tensor:
-        """(1, heads, T, T): minus slope times distance where visible, else -inf."""
+        """Return (1, heads, T, T): minus slope times distance if visible, else -inf."""
         relation = self.encoded[0].relation
         assert relation is not None
         mask = visible(relation, length, self.slopes.device)
         steps = torch.arange(length, device=self.slopes.device, dtype=self.slopes.dtype)
         ahead = steps[None, :] - steps[:, None]
         looks_ahead = torch.arange(len(self.slopes), device=self.slopes.device)[:, None, None] % 2 == 1
-        away = ((ahead < 0) == looks_ahead) & mask.T.logical_and(mask).all()  # only where both sides are seen
+        away = ((ahead < 0) == looks_ahead) & mask.T.logical_and(mask).all()  # only if both sides are visible
         distance = ahead.abs() * torch.where(away, 4, 1)
         return (-self.slopes[:, None, None] * distance).masked_fill(~mask, -math.inf)[None]
 
@@ -399,7 +401,7 @@ class SelfAttentionNetwork(Network):
 
 
 ENCODED = "encoded frame"
-"""How an encoder's output is called among the parents of what comes after it."""
+"""Name of the encoder's output among the parents of the following attention."""
 
 
 def _slopes(heads: int) -> Tensor:
@@ -407,15 +409,15 @@ def _slopes(heads: int) -> Tensor:
 
 
 def _closed(parent: Input) -> bool:
-    """Whether frames that exchange what they see see no more for it, themselves included."""
+    """Return whether two rounds of attention see the same frames as one, and each frame sees itself."""
     if parent.relation is None or parent.relation.intervals is None or parent.relation.pointwise:
         return False
-    mask = parent.relation.mask(2 * parent.relation.lag + 6)  # two looks, as far as they go
+    mask = parent.relation.mask(2 * parent.relation.lag + 6)  # long enough for two rounds of attention
     return bool(mask.diagonal().all() and not ((mask.astype(int) @ mask > 0) & ~mask).any())
 
 
 class Cache:
-    """Tokens seen so far, (B, S, C), written in place where no gradient is wanted."""
+    """Tokens seen so far, (B, S, C), written in place if no gradient is needed."""
 
     def __init__(self, tokens: Tensor, room: int):
         self.tokens = tokens
@@ -425,7 +427,7 @@ class Cache:
             self.buffer[:, : tokens.shape[1]] = tokens
 
     def append(self, tokens: Sequence[Tensor]) -> None:
-        """Add new tokens (B, C)."""
+        """Append new tokens (B, C)."""
         if self.buffer is None:
             self.tokens = torch.cat([self.tokens, torch.stack(list(tokens), 1)], 1)
             return
@@ -434,7 +436,7 @@ class Cache:
         self.tokens = self.buffer[:, : self.tokens.shape[1] + len(tokens)]
 
     def select(self, rows: Tensor) -> Cache:
-        """Its rows."""
+        """Return the selected rows."""
         chosen = copy.copy(self)
         if self.buffer is None:
             chosen.tokens = self.tokens.index_select(0, rows)
@@ -446,38 +448,38 @@ class Cache:
 
 @dataclass
 class Attending:
-    """What an `AttentionNetwork` keeps between steps."""
+    """The state of an `AttentionNetwork` between steps."""
 
     queries: Hoisted | None
     points: list[tuple[Input, int | None]]
     bias: Tensor
-    """Of every step to the given tokens and then to all live ones: (B or 1, heads, T, given + parents * T)."""
+    """Bias of every step to the given tokens, then to all live tokens: (B or 1, heads, T, given + parents * T)."""
     given: int
     batch: int
     live: list[Input]
     length: int
     masks: np.ndarray
-    """(T, parents * T): the live tokens that a step sees."""
+    """(T, parents * T): live tokens that are visible at a step and not yet in the cache."""
     cache: Cache
     absorbed: list[tuple[Tensor, Tensor, Tensor]]
-    """By layer, see `Layer.absorbed`; the same for all rows."""
+    """Results of `Layer.absorbed` by layer, the same for all rows."""
     extracted: dict[str, tuple[Any, Rows]]
     lengths: Tensor | None
     seen: list[int] = field(default_factory=list)
-    """Live tokens in the order of the cache: the step, plus T times the parent's place."""
+    """Live tokens in the order of the cache: the step plus T times the index of the parent."""
     in_order: bool = True
     rows: Tensor | None = None
-    """Of the bias, which stays that of the start."""
+    """Rows of the bias, which is not copied when rows are selected."""
 
     def select(self, rows: Tensor) -> Attending:
-        """Its rows."""
+        """Return the selected rows."""
         moved = {name: select(getattr(self, name), rows) for name in ("queries", "cache", "extracted", "lengths")}
         masks, seen = self.masks.copy(), list(self.seen)
         rows = rows if self.rows is None else self.rows.index_select(0, rows)
         return replace(self, **moved, batch=len(rows), masks=masks, seen=seen, rows=rows)
 
     def fresh(self, t: int) -> list[int]:
-        """The live tokens that step t is the first to see, which enter the cache now."""
+        """Return the live tokens that step t is the first to see and mark them as cached."""
         found = np.flatnonzero(self.masks[t]).tolist()
         if found:
             self.masks[:, found] = False
@@ -486,7 +488,7 @@ class Attending:
         return found
 
     def row(self, t: int) -> Tensor:
-        """The bias of step t to every token in the cache, broadcastable to (B, heads, S)."""
+        """Return the bias of step t to every token in the cache, broadcastable to (B, heads, S)."""
         row = self.bias[:, :, t]
         if self.rows is not None and row.shape[0] > 1:
             row = row.index_select(0, self.rows)

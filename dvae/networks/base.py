@@ -1,8 +1,8 @@
-"""What every network shares: its inputs, the join of pointwise parts, shifting in time.
+"""Base of all networks: inputs, the join of pointwise parts, and shifts in time.
 
 A network maps the parents of one factor to features, under the masks that the factor declares. It has two forms that
-must agree: `forward` evaluates all steps at once (teacher forcing), `start` and `step` one step at a time, with
-everything that does not depend on a variable being drawn computed once, in `start`.
+must agree. `forward` evaluates all steps at once (teacher-forced). `start` and `step` evaluate one step at a time;
+`start` computes once everything that does not depend on a variable being drawn.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "gelu": nn.GELU, "elu": nn.ELU}
 
 @dataclass(frozen=True)
 class Input:
-    """One parent of a factor, as a network sees it.
+    """One parent of a factor, as seen by a network.
 
     Args:
-        name: the parent's name.
-        size: its dimension D.
-        relation: which of its steps are visible at t; None for a static parent.
+        name: name of the parent.
+        size: D, dimension of the parent.
+        relation: steps of the parent that are visible at t; None for a static parent.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Input:
 
     @property
     def lags(self) -> tuple[int, ...] | None:
-        """The offsets s - t that are visible, where they are finitely many."""
+        """The visible offsets s - t if there are finitely many, otherwise None."""
         if self.relation is None or self.relation.intervals is None:
             return None
         if any(math.isinf(end) for interval in self.relation.intervals for end in interval):
@@ -50,16 +50,16 @@ class Input:
 
 
 class Network(nn.Module):
-    """Parents to features under masks; see the contract in `docs/networks.md`.
+    """A module from parents to features under masks; its contract is described in `docs/networks.md`.
 
     Args:
         inputs: the parents.
-        local: whether the child is a local variable. A static child has features (B, H) in place of (B, T, H).
-        features: H.
+        local: whether the child is a local variable. A static child has features (B, H) instead of (B, T, H).
+        features: H, number of features.
     """
 
     law: ClassVar[Any] = None
-    """Description of the law whose parameters the features are, where no other can read them."""
+    """Specification class of the distribution that the features parameterise, if no other can read them."""
 
     def __init__(self, inputs: Sequence[Input], local: bool, features: int):
         super().__init__()
@@ -68,12 +68,12 @@ class Network(nn.Module):
         self.features = features
 
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """Features at all steps, from the parents at all steps.
+        """Return the features at all steps from the parents at all steps.
 
         Args:
-            parents: name to (B, T, D), or (B, D) for a static parent; zero at padded steps.
-            length: T.
-            lengths: (B,) numbers of valid steps in a ragged batch; later steps are padding and stay unseen.
+            parents: {name: values (B, T, D), or (B, D) for a static parent}, zero at padded steps.
+            length: T, number of steps.
+            lengths: (B,) numbers of valid steps in a ragged batch; later steps are padding, which the network ignores.
 
         Returns:
             (B, T, H), or (B, H) for a static child.
@@ -81,27 +81,27 @@ class Network(nn.Module):
         raise NotImplementedError
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """The state before the first step of a loop, with all work on the `given` parents done."""
+        """Return the state before the first step of a loop, with all computations on the `given` parents done."""
         raise NotImplementedError
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """Features (B, H) at step t (0-based), and the next state.
+        """Return the features (B, H) at step t (counted from 0) and the next state.
 
         Args:
-            state: from `start` or the last `step`. Steps are taken in the order of the loop, each once.
+            state: state from `start` or the previous `step`. Steps are taken once each, in the order of the loop.
             t: the step.
-            drawn: name to its values (B, D) by step, for the parents that the loop itself draws.
+            drawn: {name: values (B, D) by step} of the parents that the loop draws.
         """
         raise NotImplementedError
 
     def stretch(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """Features (B, N, H) at N steps from t on, where what they read is known already, and the next state.
+        """Return the features (B, N, H) at N steps from t on, whose parents are already known, and the next state.
 
-        A network that can do so evaluates them at once.
+        The default calls `step` N times; networks override it if they can evaluate the steps at once.
 
         Args:
-            state, t, drawn: as in `step`; the draws of these steps may be there before their features.
-            count: N.
+            state, t, drawn: as in `step`; `drawn` may already contain the draws of these steps.
+            count: N, number of steps.
         """
         features = []
         for s in range(t, t + count):
@@ -110,30 +110,30 @@ class Network(nn.Module):
         return torch.stack(features, dim=1), state
 
     def reach(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """Features (B, H) at the last of the N steps of a `stretch`, where nobody asks for those before, and the state.
+        """Return only the features (B, H) at the last of N steps, and the next state, with arguments as in `stretch`.
 
-        A network that need not find these does without.
+        Networks override it if they can skip the earlier features.
         """
         features, state = self.stretch(state, t, count, drawn)
         return features[:, -1], state
 
     def refuse_ragged(self, lengths: Tensor | None) -> None:
-        """Refuses padding, for a network in which every step sees all of a sequence."""
+        """Raise an error for padded batches, in a network whose steps all read the whole sequence."""
         if lengths is not None:
             name = type(self).__name__.removesuffix("Network")
             raise ValueError(f"{name} makes sequences of one length, but this is a ragged batch; split it by length")
 
     def select(self, state: Any, rows: Tensor) -> Any:
-        """The state with these rows (N,) of its batch, each as often as it is named (see `rows.select`)."""
+        """Return the state with these rows (N,) of its batch; rows may repeat, as in `loop.select`."""
         return select(state, rows)
 
     def chain(self, state: Any) -> Chain | None:
-        """The loop after `start` in the form that one fused function runs, where it has that form."""
+        """Return the loop after `start` as a `Chain` for the fused function, or None if it has another form."""
         return None
 
 
 class AtOnce(Network):
-    """A network that makes all steps together, of sequences of one length."""
+    """A network that evaluates all steps together, for sequences of equal length."""
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
@@ -148,41 +148,42 @@ class AtOnce(Network):
 
 
 def presence(name: str) -> str:
-    """Under which a network finds, among its parents, at which steps (B, T) a latent is there, if not at all of them.
+    """Return the name of the mask (B, T) of the steps at which a latent exists.
 
-    At the others it is integrated out (`Rollout.present`), and its values are not to be read.
+    A network finds it among its parents, unless the latent exists at all steps. At other steps the latent is integrated
+    out (`Rollout.present`), and its values must not be read.
     """
     return f"{name} is there"
 
 
 def indicator(name: str) -> str:
-    """Under which a guide's factor finds, among its parents, which entries of the data were observed, if not all."""
+    """Return the name of the mask of observed data entries, which a guide's factor reads if any are missing."""
     return f"{name} was observed"
 
 
 def share_modules(networks: Sequence[Any], *names: str) -> None:
-    """Gives networks the modules of these names of the first of them."""
+    """Assign the named modules of the first network to the other networks."""
     for network in networks[1:]:
         for name in names:
             setattr(network, name, getattr(networks[0], name))
 
 
 class NetworkSpec(Protocol):
-    """A description of a network: a frozen dataclass that `build`s one for a factor."""
+    """Specification of a network: a frozen dataclass with a `build` method."""
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
-        """The network of a factor with these parents, for a child of dimension `size`."""
+        """Return the network of a factor with these parents, for a child of dimension `size`."""
         ...
 
 
 def part(values: Tensor, lag: int | None) -> Tensor:
-    """A parent's contribution at every step: itself if static, else shifted by its lag."""
+    """Return a parent's values at every step: shifted by the lag, or unchanged if static."""
     return values if lag is None else shift(values, lag)
 
 
 @dataclass
 class Hoisted:
-    """What a `Join` computes before a loop: base (B, T, H), the weights (H, D) of live parts, and the known parts."""
+    """Results of a `Join` before a loop: base (B, T, H), weights (H, D) of live parts, and known parts."""
 
     base: Tensor
     weights: list[Tensor]
@@ -191,31 +192,35 @@ class Hoisted:
 
     @property
     def like(self) -> Tensor:
-        """A tensor of the loop's batch, which `select` may have changed, and its type."""
+        """A tensor with the loop's batch size, which `select` may have changed, and its dtype and device."""
         return self.base if self.rows is None else self.base.new_empty(()).expand(len(self.rows), 1)
 
     def select(self, rows: Tensor) -> Hoisted:
-        """Its rows; they are read from the same base."""
+        """Return the selected rows, which are read from the same base."""
         chosen = Hoisted(self.base, self.weights, self.known, rows)
         chosen.steps = select(self.steps, rows)
         return chosen
 
     @cached_property
     def steps(self) -> Sequence[Tensor]:
-        """The base by step. (unbind, not indexing: T selections would each write a (B, T, H) gradient.)"""
+        """The base by step.
+
+        It uses unbind, because the backward pass of T index operations would write T gradients (B, T, H).
+        """
         return self.base.unbind(1)
 
 
 @dataclass
 class Chain:
-    """A loop in the form that `distributions.chain` runs: one product a step with features of the child's last value.
+    """A loop in the form that `distributions.chain` runs, with one product per step on the child's last value.
 
     Args:
-        lag: where the child's value is read, a step away.
-        join: of the parts; `hoisted` is the share of those that are known.
+        lag: offset at which the child's own value is read, one step away.
+        join: join of the parts; `hoisted` contains the contribution of the known parts.
         before: layers on the child's value, each followed by the activation.
-        cell: of a memory that reads it: share (B, T, 4 W) of the gates in what is known, and the weight.
-        keep: to be called with the drawn child and the states (B, T, W) of that memory.
+        cell: for a memory that reads the child's value, the contribution (B, T, 4 W) of known inputs to the gates, and
+            the weight.
+        keep: function to call with the drawn child and the states (B, T, W) of that memory.
     """
 
     lag: int
@@ -227,16 +232,16 @@ class Chain:
 
 
 class Join(nn.Module):
-    """A multilayer perceptron on the concatenation of parts, of which some may come one step at a time.
+    """A multilayer perceptron on the concatenation of parts, some of them available only step by step.
 
     Args:
         sizes: dimension of every part.
-        widths: of the layers; each is followed by the activation. Without any, the features are the concatenation.
+        widths: widths of the layers, each followed by the activation. If empty, the features are the concatenation.
         activation: "tanh", "relu", "gelu" or "elu".
-        mean: the mean of the parts in place of their concatenation.
+        mean: whether to average the parts instead of concatenating them.
 
     Raises:
-        ValueError: an unknown activation; parts of different sizes with `mean`.
+        ValueError: the activation is unknown, or `mean` is set and the parts differ in size.
     """
 
     like: Tensor
@@ -256,7 +261,7 @@ class Join(nn.Module):
         self.register_buffer("like", torch.empty(0), persistent=False)
 
     def forward(self, parts: Sequence[Tensor]) -> Tensor:
-        """(B, T, H) from parts (B, T, D) or (B, D); (B, H) where every part is (B, D)."""
+        """Return (B, T, H) for parts (B, T, D) or (B, D); return (B, H) if every part is (B, D)."""
         joined = self._join(parts)
         return joined if self.first is None else self.rest(self.first(joined))
 
@@ -267,12 +272,12 @@ class Join(nn.Module):
         return torch.stack(parts).mean(0) if self.mean else torch.cat(parts, dim=-1)
 
     def hoist(self, known: Mapping[int, Tensor], batch: int, length: int, through: nn.Linear | None = None) -> Hoisted:
-        """The first layer's share of the known parts at every step, and the weights of the live ones.
+        """Return the known parts' contribution to the first layer at every step, and the weights of the live parts.
 
         Args:
-            known: place of a part to its values.
+            known: {index of a part: values}.
             batch, length: B and T.
-            through: the layer that comes first where the join has none of its own.
+            through: layer that is applied first if the join has none of its own.
         """
         layer = self.first or through
         if layer is None:
@@ -290,7 +295,7 @@ class Join(nn.Module):
         return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in known], known)
 
     def add(self, hoisted: Hoisted, t: int | slice, live: Sequence[Tensor]) -> Tensor:
-        """Features (B, H) at step t, or (B, N, H) at several, from their hoisted share and the live parts."""
+        """Return the features (B, H) at step t, or (B, N, H) at several, from hoisted and live parts."""
         first = hoisted.steps[t] if isinstance(t, int) else hoisted.base[:, t]
         if self.first is None:
             seen = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=-1), strict=True))
@@ -303,7 +308,7 @@ class Join(nn.Module):
 
 
 def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:
-    """Linear layers from widths[0] to widths[-1], each followed by the activation."""
+    """Return linear layers from widths[0] to widths[-1], each followed by the activation."""
     if activation not in ACTIVATIONS:
         raise ValueError(f"unknown activation {activation!r}; known: {', '.join(ACTIVATIONS)}")
     if min(widths) < 1:
@@ -315,7 +320,7 @@ def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:
 
 
 def aligned(parts: Sequence[Tensor]) -> list[Tensor]:
-    """The parts with a time axis, static ones repeated; as they are where none has one."""
+    """Return the parts with a time axis, repeating static parts; unchanged if no part has one."""
     steps = max((part.shape[1] for part in parts if part.dim() == 3), default=None)
     if steps is None:
         return list(parts)

@@ -1,9 +1,9 @@
-"""torch's recurrent networks, with a gradient in evaluation mode on a GPU too.
+"""torch's recurrent networks with gradients in evaluation mode on a GPU.
 
-cuDNN keeps what the gradient is made of in training alone, and latents are sampled, and control and completion descend,
-in evaluation. The mode changes nothing else where there is no dropout, which is refused.
+cuDNN stores what the backward pass needs only in training mode. Sampling of latents and the gradient descent of control
+and completion run in evaluation mode. Without dropout, which these classes reject, the mode has no other effect.
 
-oneDNN has no LSTM in half precision for some processors. There, an LSTM under autocast computes in float32.
+On some processors, oneDNN has no LSTM in half precision. There, an LSTM under autocast runs in float32.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing_extensions import override
 
 
 class _Differentiable(nn.RNNBase):
-    """In training, for cuDNN, wherever gradients are recorded."""
+    """A recurrent network that is in training mode whenever gradients are recorded, as cuDNN requires."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -38,7 +38,7 @@ class GRU(_Differentiable, nn.GRU):
 
 
 class LSTM(_Differentiable, nn.LSTM):
-    """`torch.nn.LSTM`, without dropout; in float32 where the processor has no LSTM in autocast's precision."""
+    """`torch.nn.LSTM` without dropout, in float32 if the processor does not support the precision of autocast."""
 
     @override
     def forward(self, *args: Any) -> Any:
@@ -58,7 +58,7 @@ class RNN(_Differentiable, nn.RNN):
 
 @cache
 def _runs_lstm(precision: torch.dtype, training: bool) -> bool:
-    """Whether this processor runs an LSTM under autocast, tried once on a single entry."""
+    """Return whether this processor can run an LSTM under autocast; tested once on a single entry."""
     with torch.inference_mode(False), torch.set_grad_enabled(training), torch.autocast("cpu", precision):
         entry, weight, bias = (torch.zeros(shape, requires_grad=training) for shape in ((1, 1, 1), (4, 1), (4,)))
         try:

@@ -1,16 +1,16 @@
-"""CosineEncoder and CosineDecoder: transformers between a sequence and the cosine coefficients of a latent one.
+"""CosineEncoder and CosineDecoder: transformers between a sequence and the cosine coefficients of a latent sequence.
 
-Step k of the latent is its coefficient k. The encoder reads what is given over time, and the first step s of all, and
-changes over to coefficients half way:
+Step k of the latent is coefficient k. The encoder reads a sequence y and the first step s of the output. It transforms
+to coefficients between its layers:
 
     h_t = transformer([f(y_t); g(s)] + position)        features_k = transformer(sum_t basis_{kt} h_t)
 
-The decoder goes back in time, and makes a sequence by its offsets from the first step:
+The decoder transforms back to time and generates a sequence as offsets from the first step:
 
     o_t = transformer(f([sum_k basis_{kt} z_k; g(s)]) + position)        x_t = s + o_1 + ... + o_t
 
-Everything is parallel in time. TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with the layers of its
-public implementation. Ours: a decoder starts near the sequence that stays where it begins.
+All steps are computed in parallel. Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with the
+layers of its public implementation. Difference: the decoder is initialised close to a constant sequence.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from .loop import once_valid
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
+@torch.inference_mode(False)  # a matrix created in inference mode could not be used under autograd
 def cosine_basis(
     length: int, coefficients: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None
 ) -> Tensor:
-    """The first rows of the orthonormal DCT-II matrix: w_k cos(pi (t + 1/2) k / T), w_0 = sqrt(1/T), else sqrt(2/T).
+    """Return the first rows of the orthonormal DCT-II matrix, w_k cos(pi (t + 1/2) k / T).
 
-    As in Mao, Liu, Salzmann and Li, 2019, arXiv 1908.05436.
+    The weights are w_0 = sqrt(1/T), and sqrt(2/T) otherwise, as in Mao, Liu, Salzmann and Li, 2019, arXiv 1908.05436.
 
     Args:
-        length: T.
-        coefficients: C, at most T.
-        dtype, device: of the matrix, which all who ask for it share.
+        length: T, number of steps.
+        coefficients: C, number of coefficients, at most T.
+        dtype, device: dtype and device of the matrix, which is cached and shared.
 
     Returns:
         (C, T) with orthonormal rows: `basis @ v` are the coefficients of v (T, D), and
@@ -61,16 +61,16 @@ def cosine_basis(
 
 @dataclass(frozen=True)
 class CosineEncoder:
-    """Features of each coefficient, from one parent over all time, such as y_{1:T}, and one static parent.
+    """Features of each coefficient from one parent over all time, such as y_{1:T}, and one static parent.
 
     Args:
         width: W, features of each parent; the transformers have 2 W.
-        feedforward: hidden units in their layers.
-        heads: of their attention.
-        layers: of each of the three transformers: one before the change to coefficients, two after it.
-        dropout: share of units left out in training.
-        cosine: False to stay in time, so that step t of the child is time t.
-        components: C, coefficients that are made, the slow ones; features of the others are 0. 0 for all.
+        feedforward: hidden units of the transformer layers.
+        heads: number of attention heads.
+        layers: layers of each of the three transformers, one before and two after the transform to coefficients.
+        dropout: dropout probability in training.
+        cosine: whether to use coefficients; if False, step t of the child is time t.
+        components: C, number of low-frequency coefficients to compute, 0 for all; features of the others are 0.
     """
 
     width: int = 256
@@ -82,42 +82,42 @@ class CosineEncoder:
     components: int = 0
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineEncoderNetwork:
-        """The network of a factor with these parents.
+        """Return the network of a factor with these parents.
 
         Raises:
-            ValueError: other parents, or a static child.
+            ValueError: the parents do not match, or the child is static.
         """
         return CosineEncoderNetwork(self, inputs, local)
 
 
 @dataclass(frozen=True)
 class CosineDecoder(CosineEncoder):
-    """A sequence (B, T, D) from coefficients, a parent over time, and from a static parent of size D, its first step.
+    """A sequence (B, T, D) from coefficients, a parent over time, and from its first step, a static parent of size D.
 
-    A further parent over all time joins the coefficients, once they are back in time.
+    Further parents over all time are concatenated after the transform back to time.
 
     Args:
         width: W, features of the static parent.
-        components: C, coefficients that are read; 0 for all.
-        feedforward, heads, layers, dropout, cosine: as of `CosineEncoder`; there is one transformer.
-        hidden: features in time.
-        latent: name of the parent that holds coefficients.
+        components: C, number of coefficients to read; 0 for all.
+        feedforward, heads, layers, dropout, cosine: as in `CosineEncoder`, for a single transformer.
+        hidden: features of each time step.
+        latent: name of the parent with the coefficients.
     """
 
     hidden: int = 512
     latent: str = "z"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineDecoderNetwork:  # type: ignore[override]
-        """The network of a factor with these parents.
+        """Return the network of a factor with these parents.
 
         Raises:
-            ValueError: other parents, or a static child.
+            ValueError: the parents do not match, or the child is static.
         """
         return CosineDecoderNetwork(self, inputs, local, size)
 
 
 def _apart(network: Network, spec: Any) -> tuple[list[Input], Input]:
-    """The parents over time and the static one."""
+    """Return the parents over time and the static parent."""
     over_time = [parent for parent in network.inputs if parent.relation is not None]
     static = [parent for parent in network.inputs if parent.relation is None]
     if not network.local or not over_time or len(static) != 1:
@@ -130,7 +130,7 @@ def _apart(network: Network, spec: Any) -> tuple[list[Input], Input]:
 
 
 class CosineEncoderNetwork(AtOnce):
-    """What `CosineEncoder` describes. Networks may share `over_time`, `static`, `before` and `between`."""
+    """Network of `CosineEncoder`. Networks may share `over_time`, `static`, `before` and `between`."""
 
     def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 2 * spec.width)
@@ -147,7 +147,7 @@ class CosineEncoderNetwork(AtOnce):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """No sequence is padded."""
+        """Return the features; ragged batches are not supported."""
         self.refuse_ragged(lengths)
         source, static = (parents[name] for name in self.names)
         first = once_valid(self.static, static, None)
@@ -160,7 +160,7 @@ class CosineEncoderNetwork(AtOnce):
 
 
 class CosineDecoderNetwork(AtOnce):
-    """What `CosineDecoder` describes. Networks may share `static`."""
+    """Network of `CosineDecoder`. Networks may share `static`."""
 
     def __init__(self, spec: CosineDecoder, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
@@ -178,7 +178,7 @@ class CosineDecoderNetwork(AtOnce):
         self.into = nn.Sequential(*_layer(into, spec.hidden), nn.Linear(spec.hidden, spec.hidden))
         self.transformer: Any = transformer(spec.hidden, spec)
         last = nn.Linear(spec.hidden, size)
-        with torch.no_grad():  # summed up over time, offsets of the usual size would lead far away
+        with torch.no_grad():  # offsets accumulate over time, so the initial ones must be small
             for parameter in last.parameters():
                 parameter.mul_(0.01)
         self.offsets = nn.Sequential(*_layer(spec.hidden, spec.hidden), last)
@@ -186,7 +186,7 @@ class CosineDecoderNetwork(AtOnce):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """No sequence is padded."""
+        """Return the sequence; ragged batches are not supported."""
         self.refuse_ragged(lengths)
         first, values = parents[self.first], parents[self.spec.latent]
         components = min(self.spec.components or length, length)
@@ -204,8 +204,9 @@ class CosineDecoderNetwork(AtOnce):
 
 
 class Dropout(nn.Dropout):
-    """Dropout by one random number for four units, on a processor: torch draws one for each, a fifth of a training
-    step. The probability is a multiple of 2^-16.
+    """Dropout that, on a CPU, uses one random number for four units.
+
+    torch draws one per unit, which takes a fifth of a training step. The probability is rounded to a multiple of 2^-16.
     """
 
     @override
@@ -219,10 +220,11 @@ class Dropout(nn.Dropout):
 
 
 class TransformerLayer(nn.TransformerEncoderLayer):
-    """A layer of a transformer's encoder, normalised behind its parts, with ReLU.
+    """A transformer encoder layer with ReLU and normalisation after each part.
 
-    As torch's in all it computes. In training that one takes queries, keys and values apart so that their gradients are
-    put together from three tensors of zeros, and attends, with dropout, by a path that looks for masks: another fifth.
+    It computes the same as torch's. In training, torch's layer assembles the gradients of queries, keys and values from
+    three zero tensors, and attends with dropout on a path that checks for masks. This takes another fifth of a training
+    step.
     """
 
     def __init__(self, size: int, heads: int, feedforward: int, dropout: float, **options: Any):
@@ -231,7 +233,7 @@ class TransformerLayer(nn.TransformerEncoderLayer):
 
     @override
     def forward(self, src: Tensor, *masks: Any, **options: Any) -> Tensor:
-        """Masks are not for training."""
+        """Return the layer's output; masks are not supported in training."""
         if not self.training:
             return super().forward(src, *masks, **options)
         attention = self.self_attn
@@ -247,7 +249,7 @@ class TransformerLayer(nn.TransformerEncoderLayer):
 
 
 def two_layers(size: int, width: int) -> nn.Sequential:
-    """Two layers with normalisation, step by step."""
+    """Return two layers with normalisation, applied to each step."""
     return nn.Sequential(*_layer(size, width), *_layer(width, width))
 
 
@@ -256,19 +258,19 @@ def _layer(size: int, out: int) -> list[nn.Module]:
 
 
 def transformer(size: int, spec: CosineEncoder) -> nn.TransformerEncoder:
-    """A transformer's encoder, normalised behind each layer and at its end."""
+    """Return a transformer encoder with normalisation after each layer and at the end."""
     layer = TransformerLayer(size, spec.heads, spec.feedforward, spec.dropout, batch_first=True)
     made = nn.TransformerEncoder(layer, spec.layers, nn.LayerNorm(size), enable_nested_tensor=False)
-    for parameter in made.parameters():  # the layers are copies of one, which would start alike
+    for parameter in made.parameters():  # torch copies one layer, so all would have the same initial weights
         if parameter.dim() > 1:
             nn.init.xavier_uniform_(parameter)
     return made
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # as of `cosine_basis`
+@torch.inference_mode(False)  # as in `cosine_basis`
 def positions(length: int, size: int, dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
-    """Sinusoidal encodings (T, size) of the steps (Vaswani et al., 2017)."""
+    """Return sinusoidal position encodings (T, size) (Vaswani et al., 2017)."""
     waves = torch.exp(torch.arange(0, size, 2, dtype=torch.float64) * (-math.log(10000.0) / size))
     phase = torch.arange(length, dtype=torch.float64)[:, None] * waves
     return torch.stack([phase.sin(), phase.cos()], dim=-1).flatten(1)[:, :size].to(device, dtype)

@@ -1,4 +1,4 @@
-"""Extractors: features of a parent at single steps, before a network reads it over time."""
+"""Extractors: features of a parent at single steps, computed before a network reads it over time."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from .loop import Rows, follow, once_valid
 
 
 class ExtractorSpec(Protocol):
-    """A description of an extractor: a frozen dataclass that `build`s one for a parent of dimension `size`."""
+    """Specification of an extractor: a frozen dataclass with a `build` method."""
 
     def build(self, size: int) -> Any:
-        """A module from (..., size) to (..., F), with F as its attribute `features`."""
+        """Return a module from (..., size) to (..., F) with the attribute `features` = F."""
         ...
 
 
 Extract = Mapping[str, "tuple[int, ...] | ExtractorSpec"]
-"""Name of a parent to the widths of a perceptron on it, or to the description of another module; () for none."""
+"""{name of a parent: widths of a perceptron, or the specification of another module}; () for no extractor."""
 
 
 class Extractors(nn.ModuleDict):
-    """The extractors of a network by parent. Outside the sequence what they give is 0.
+    """The extractors of a network by parent. Their output is 0 outside the sequence.
 
     Args:
         inputs: the network's parents.
-        extract: see `Extract`.
-        activation: of perceptrons.
+        extract: specifications, as in `Extract`.
+        activation: activation of the perceptrons.
     """
 
     def __init__(self, inputs: Sequence[Input], extract: Extract, activation: str):
@@ -45,29 +45,29 @@ class Extractors(nn.ModuleDict):
                 self[parent.name], self.sizes[parent.name] = module, module.features
 
     def seen(self, parent: Input) -> Input:
-        """The parent as the network reads it."""
+        """Return the parent with the size of its extracted features."""
         return replace(parent, size=self.sizes[parent.name]) if parent.name in self else parent
 
     def of(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> dict[str, Tensor]:
-        """What the network reads of its parents (B, T, D) or (B, D)."""
+        """Return the parents, (B, T, D) or (B, D), with extracted features in place of values."""
         return {**parents, **{n: once_valid(self[n], parents[n], lengths) for n in self.keys() & parents}}
 
     def start(self, length: int) -> dict[str, tuple[Any, Rows]]:
-        """What `drawn` evaluates in a loop, with what can be done before it done, and where it keeps what it finds."""
+        """Return each extractor, prepared for a loop, and storage for its features at every step."""
         return {n: (getattr(m, "hoisted", lambda m=m: m)(), Rows([None] * length)) for n, m in self.items()}
 
     def drawn(
         self, kept: Mapping[str, tuple[Any, Rows]], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
     ) -> dict[str, Sequence[Tensor]]:
-        """The draws of a loop so far as the network reads them; each passes through its extractor once."""
+        """Return the draws of a loop so far with extracted features in place of values; each draw is evaluated once."""
         found = {n: follow(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
         return {**drawn, **found}
 
 
 def share(name: str, *networks: Any) -> None:
-    """Gives networks one extractor of a parent, that of the first which has one.
+    """Assign one extractor of a parent to all networks, taken from the first network that has one.
 
-    What it finds is evaluated once for all of them (see `once`).
+    Its output is evaluated once for all of them by `once`.
     """
     held = [network.extractors for network in networks if name in network.extractors]
     for extractors in held[1:]:

@@ -2,11 +2,11 @@
 
     H' = tanh(BN(A H W + b))
 
-A is a free matrix over nodes, learned, one per layer. The layers see a whole trajectory at once as its first C
-coefficients; and so they make one, for all steps together.
+A is a free adjacency matrix over nodes, learned separately for each layer. The layers read a whole trajectory as its
+first C coefficients and output all steps together.
 
-Mao, Liu, Salzmann and Li, 2019, arXiv 1908.05436 (the network); Mao, Liu and Salzmann, 2021, arXiv 2108.08422 (one for
-every part of the nodes), with the layers of its public implementation.
+Mao, Liu, Salzmann and Li, 2019, arXiv 1908.05436 (the network); Mao, Liu and Salzmann, 2021, arXiv 2108.08422 (one
+network for every part of the nodes), with the layers of its public implementation.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from .cosine import cosine_basis
 
 @dataclass(frozen=True)
 class GraphConv:
-    """Trajectories of some nodes from those of others, and from static parents, which every node reads.
+    """Trajectories of some nodes from those of other nodes and from static parents, which every node reads.
 
     Args:
-        nodes: name of every local variable, parents and child, to the nodes that it holds, of as many coordinates each.
-            One parent holds all nodes: it is what the network starts from, and others take their nodes' place in it.
-        child: the name of the child.
-        length: T, the steps of every sequence.
-        coefficients: C, of T, that are kept.
+        nodes: {name of a local variable, parents and child: its nodes}, with equal numbers of coordinates. One parent
+            contains all nodes and is the initial trajectory; other parents replace their nodes in it.
+        child: name of the child.
+        length: T, steps of every sequence.
+        coefficients: C, number of coefficients kept, at most T.
         width: features of a node.
-        blocks: residual blocks, of two convolutions each.
+        blocks: number of residual blocks with two convolutions each.
     """
 
     nodes: Mapping[str, Sequence[int]]
@@ -50,16 +50,16 @@ class GraphConv:
     blocks: int = 4
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GraphConvNetwork:
-        """The network of a factor with these parents.
+        """Return the network of a factor with these parents.
 
         Raises:
-            ValueError: the parents or the nodes are not as this network needs them.
+            ValueError: the parents or the nodes do not meet the requirements above.
         """
         return GraphConvNetwork(self, inputs, local, size)
 
 
 class GraphConvNetwork(AtOnce):
-    """What `GraphConv` describes; the features (B, T, D) are the child's coordinates themselves."""
+    """Network of `GraphConv`; the features (B, T, D) are the child's coordinates."""
 
     def __init__(self, spec: GraphConv, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
@@ -87,7 +87,7 @@ class GraphConvNetwork(AtOnce):
                 "GraphConv starts from a parent that holds every node, such as the history h_{1:O}; the parents are "
                 f"{', '.join(parent.name for parent in self.inputs)}"
             )
-        cosine_basis(spec.length, coefficients)  # refuses too many
+        cosine_basis(spec.length, coefficients)  # raises an error for too many coefficients
         self.statics = [parent.name for parent in self.inputs if parent.relation is None]
         nodes = len(self.trajectories[0][1])
         self.inner = self.coordinates * coefficients
@@ -101,7 +101,7 @@ class GraphConvNetwork(AtOnce):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """T is that of the description, and no sequence is padded."""
+        """Return the coordinates for T steps as specified; ragged batches are not supported."""
         self.refuse_ragged(lengths)
         if length != self.spec.length:
             raise ValueError(
@@ -112,7 +112,7 @@ class GraphConvNetwork(AtOnce):
                 "GraphConv normalises over the batch, which in training needs more than one row; take a larger batch "
                 "or more draws"
             )
-        with torch.autocast(self.last.weight.device.type, enabled=False):  # positions need all their digits
+        with torch.autocast(self.last.weight.device.type, enabled=False):  # half precision is too coarse for positions
             known = self._coefficients(parents)
         static = [parents[name][:, None].expand(-1, known.shape[1], -1) for name in self.statics]
         joined = torch.cat([known, *static], dim=-1)
@@ -125,7 +125,7 @@ class GraphConvNetwork(AtOnce):
             return (made @ self._transform(length, made)).transpose(1, 2)
 
     def _coefficients(self, parents: Mapping[str, Tensor]) -> Tensor:
-        """(B, nodes, coordinates * C): coefficients of the first coordinate, then of the second, and so on."""
+        """Return (B, nodes, coordinates * C): coefficients of the first coordinate, then of the second, and so on."""
         known: Tensor | None = None
         for name, nodes, seen in self.trajectories:
             values, own = parents[name][:, :seen], indices(nodes, self.last.weight)
@@ -140,7 +140,7 @@ class GraphConvNetwork(AtOnce):
 
 
 class _Convolution(nn.Module):
-    """A H W + b over (B, nodes, features), with a normalisation over the batch and tanh behind it if it has one."""
+    """The map A H W + b on (B, nodes, features), optionally followed by batch normalisation and tanh."""
 
     def __init__(self, nodes: int, features: int, out: int, bias: bool = True, normalised: bool = False):
         super().__init__()
@@ -154,17 +154,17 @@ class _Convolution(nn.Module):
 
     def forward(self, nodes: Tensor) -> Tensor:
         nodes = nodes @ self.weight
-        out: Tensor = _Mix.apply(self.adjacency.to(nodes.dtype), nodes)  # under autocast the product has another type
+        out: Tensor = _Mix.apply(self.adjacency.to(nodes.dtype), nodes)  # under autocast the product has another dtype
         if self.bias is not None:
             out = out + self.bias
         return out if self.norm is None else torch.tanh(self.norm(out.flatten(1)).view(out.shape))
 
 
 class _Mix(Function):
-    """A H over (B, nodes, features).
+    """The product A H over (B, nodes, features).
 
-    A batched product on a view of A: matmul and einsum would copy H to and fro. The gradient of A is one long product
-    in place of B small ones. Forward and backward take a third of the time of einsum's.
+    It is a batched product on a view of A, because matmul and einsum would copy H. The gradient of A is one long
+    product instead of B small ones. Forward and backward take a third of the time of einsum.
     """
 
     @staticmethod
@@ -181,7 +181,7 @@ class _Mix(Function):
 
 
 def _seen(parent: Input, length: int) -> int:
-    """How many first steps of a parent are read; the same ones from every step."""
+    """Return how many first steps of a parent are read; they must be the same at every step."""
     assert parent.relation is not None
     mask = torch.as_tensor(parent.relation.mask(length))
     count = int(mask[0].sum())
@@ -194,9 +194,9 @@ def _seen(parent: Input, length: int) -> int:
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # whoever asks first, others will differentiate through it
+@torch.inference_mode(False)  # a matrix created in inference mode could not be used under autograd
 def _transform(seen: int, length: int, coefficients: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(C, O) from the O steps that are seen to the coefficients of the whole, in which the last one stays."""
+    """Return (C, O), which maps O visible steps to coefficients of the sequence padded with the last visible step."""
     basis = cosine_basis(length, coefficients)
     folded = torch.cat([basis[:, : seen - 1], basis[:, seen - 1 :].sum(1, keepdim=True)], dim=1)
     return folded.to(device, dtype)

@@ -1,10 +1,11 @@
-"""NodeGraph and FrameGraph: graph convolutions over the coordinates of one frame, and over the frames of a window.
+"""NodeGraph and FrameGraph: graph convolutions over the coordinates of a frame, and over the frames of a window.
 
     H' = act(A H W + b)
 
-A is a free matrix over the nodes, learned, one per layer (Mao et al., 2019, arXiv 1908.05436). HiT-DVAE (Bie et al.,
-2022, arXiv 2204.01565) has the first before all its factors and sums up a sequence by the second. Ours: frames are not
-normalised over the batch, which would let others into the features of one.
+A is a free adjacency matrix over the nodes, learned separately for each layer (Mao et al., 2019, arXiv 1908.05436).
+HiT-DVAE (Bie et al., 2022, arXiv 2204.01565) uses the first before all its factors and summarises a sequence
+with the second. Difference from the paper: frames have no batch normalisation, since the features of a sequence
+would then depend on others.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from .extract import Extract, Extractors
 
 @dataclass(frozen=True)
 class NodeGraph:
-    """Features, frame by frame: an extractor of `Attention`, `SelfAttention`, `FrameGraph` and `Recurrent`.
+    """Features of each frame: an extractor for `Attention`, `SelfAttention`, `FrameGraph` and `Recurrent`.
 
     Args:
         width: features of a node.
-        blocks: residual blocks, of two convolutions each.
-        coordinates: successive numbers that make a node; where the size is no multiple of that, each number is one.
+        blocks: number of residual blocks with two convolutions each.
+        coordinates: consecutive numbers per node; if the size is not a multiple, each number is a node.
     """
 
     width: int = 8
@@ -39,12 +40,12 @@ class NodeGraph:
     coordinates: int = 1
 
     def build(self, size: int) -> NodeFeatures:
-        """The module for frames (..., size)."""
+        """Return the module for frames (..., size)."""
         return NodeFeatures(self, size)
 
 
 class NodeFeatures(nn.Module):
-    """What `NodeGraph` describes: (..., D) to (..., nodes * width)."""
+    """Module of `NodeGraph`: (..., D) to (..., nodes * width)."""
 
     def __init__(self, spec: NodeGraph, size: int):
         super().__init__()
@@ -57,11 +58,11 @@ class NodeFeatures(nn.Module):
         )
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Features of each frame."""
+        """Return the features of each frame."""
         return self.hoisted()(frames)
 
     def hoisted(self) -> Callable[[Tensor], Tensor]:
-        """`forward` with the products of weights done, for a loop that calls it many times."""
+        """Return `forward` with the products of weights computed, for a loop that calls it many times."""
         first, *others = (layer.product() for layer in (self.first, *(layer for b in self.blocks for layer in b)))
 
         def features(frames: Tensor) -> Tensor:
@@ -74,9 +75,9 @@ class NodeFeatures(nn.Module):
 
 
 class NodeConvolution(nn.Module):
-    """The weights of A H W + b on frames (..., nodes * features): one product, with the Kronecker product of A and W.
+    """Weights of A H W + b on frames (..., nodes * features), as one Kronecker product of A and W.
 
-    As long as the features are few, that is faster than a product with each for every frame.
+    With few features, this is faster than separate products with A and W for every frame.
     """
 
     def __init__(self, nodes: int, features: int, out: int):
@@ -86,22 +87,23 @@ class NodeConvolution(nn.Module):
         self.bias = nn.Parameter(_uniform(out) / math.sqrt(features))
 
     def product(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of one linear layer on whole frames."""
+        """Return the weight and bias of the equivalent linear layer on whole frames."""
         return torch.kron(self.adjacency, self.weight), self.bias.repeat(len(self.adjacency))
 
 
 @dataclass(frozen=True)
 class FrameGraph:
-    """The summary of a sequence for a static variable: graph convolutions over the frames of a window.
+    """Summary of a sequence for a static variable: graph convolutions over the frames of a window.
 
-    A parent is read over {1:T}, but the graph has a fixed number of frames. In training the window starts anywhere,
-    anew for every sequence at every evaluation; else it is the first frames. A shorter sequence stays in its last one.
+    A parent is read over {1:T}, but the graph has a fixed number of frames. In training, the window starts at a random
+    step, drawn for every sequence at every evaluation; otherwise it contains the first frames. A shorter sequence
+    repeats its last frame.
 
     Args:
-        frames: nodes of the graph. Outside training, more frames than these are not read.
+        frames: number of frames in the window. Outside training, later frames are ignored.
         width: features of a frame.
-        blocks: residual blocks, of two convolutions each.
-        extract: what comes before all else, by parent, as in `Attention`.
+        blocks: number of residual blocks with two convolutions each.
+        extract: extractors by parent, as in `Attention`.
     """
 
     frames: int
@@ -110,10 +112,10 @@ class FrameGraph:
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FrameGraphNetwork:
-        """The network of a factor with these parents.
+        """Return the network of a factor with these parents.
 
         Raises:
-            ValueError: a local child, or parents that are not read over {1:T}.
+            ValueError: the child is local, or a parent is not read over {1:T}.
         """
         if local or any(p.relation != ALL for p in inputs):
             raise ValueError(
@@ -124,7 +126,7 @@ class FrameGraph:
 
 
 class FrameGraphNetwork(Network):
-    """What `FrameGraph` describes; the features are those of all frames, one after the other."""
+    """Network of `FrameGraph`; its features are the concatenated features of all frames."""
 
     def __init__(self, spec: FrameGraph, inputs: Sequence[Input], size: int):
         super().__init__(inputs, False, spec.frames * spec.width)
@@ -139,13 +141,13 @@ class FrameGraphNetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """(B, frames * width)."""
+        """Return (B, frames * width)."""
         found = self.extractors.of(parents, lengths)
         values = torch.cat([found[parent.name] for parent in self.inputs], dim=-1)
         last = values.new_full((len(values),), length - 1, dtype=torch.long) if lengths is None else lengths - 1
         first = torch.zeros_like(last)
         if self.training:
-            room = (last + 2 - self.frames).clamp_min(1)  # of starts whose window ends with the sequence
+            room = (last + 2 - self.frames).clamp_min(1)  # number of possible starts of the window
             first = (torch.rand(len(values), device=values.device) * room).long()
         window = (first[:, None] + torch.arange(self.frames, device=values.device)).minimum(last[:, None])
         features: Tensor = self.first(values.gather(1, window[..., None].expand(-1, -1, values.shape[-1])))
@@ -155,7 +157,7 @@ class FrameGraphNetwork(Network):
 
 
 class FrameConvolution(nn.Module):
-    """tanh(LN(A H W + b)) over (B, frames, features)."""
+    """The layer tanh(LN(A H W + b)) on (B, frames, features)."""
 
     def __init__(self, frames: int, features: int, out: int):
         super().__init__()
@@ -164,7 +166,7 @@ class FrameConvolution(nn.Module):
         self.norm = nn.LayerNorm(out)
 
     def forward(self, values: Tensor) -> Tensor:
-        """(B, frames, out)."""
+        """Return (B, frames, out)."""
         return torch.tanh(self.norm(self.adjacency @ self.linear(values)))
 
 

@@ -1,8 +1,8 @@
-"""WithNoise: any network, and behind its features a scale that is given, for the law `distributions.KnownNoise`.
+"""WithNoise: append a given noise scale to the features of a network, for `distributions.KnownNoise`.
 
     p(x_t | z_t, s_t) = N(f(z_t), s_t²)
 
-as of instruments that say how exact a measurement is, or of means over so many repetitions.
+Examples are instruments that report the precision of each measurement, and averages over a known number of repetitions.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from .recurrent import Recurrent
 
 @dataclass(frozen=True)
 class WithNoise:
-    """A network of all parents but the scale of the noise, which it hands on; for the law `distributions.KnownNoise`.
+    """A network on all parents except the noise scale, which is appended to its features.
+
+    Use it with `distributions.KnownNoise`.
 
     Args:
-        scale: name of the parent, context at t or static, with one standard deviation for each coordinate.
-        network: description of that of the others.
+        scale: name of the parent with one standard deviation per coordinate; context at t or static.
+        network: specification of the network on the other parents.
 
     Example:
         >>> networks = {"p(x)": dvae.networks.WithNoise("s", dvae.networks.Dense((8,)))}
@@ -42,10 +44,10 @@ class WithNoise:
     network: NetworkSpec = field(default_factory=Recurrent)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WithNoiseNetwork:
-        """The network of a factor that reads the scale.
+        """Return the network of a factor that reads the scale.
 
         Raises:
-            ValueError: the factor does not read it at t alone, or it has another size than the child.
+            ValueError: the factor does not read the scale at t only, has no other parents, or the sizes differ.
         """
         found = [p for p in inputs if p.name == self.scale and p.size == size and p.lags in (None, (0,))]
         if not found or (found[0].relation is not None) != (found[0].lags == (0,)) or len(inputs) < 2:
@@ -58,7 +60,7 @@ class WithNoise:
 
 
 class WithNoiseNetwork(Network):
-    """What `WithNoise` describes; its features are those of the network, and the scale behind them."""
+    """Network of `WithNoise`; its features are the inner network's, followed by the scale."""
 
     law = KnownNoise
 
@@ -70,7 +72,7 @@ class WithNoiseNetwork(Network):
         return {name: value for name, value in given.items() if name != self.name}
 
     def _scales(self, values: Tensor, length: int, lengths: Tensor | None) -> Tensor:
-        """(B, T, D) or (B, D), 1 at padding."""
+        """Return the scales (B, T, D) or (B, D), 1 at padding."""
         if values.dim() == 2 and self.local:
             values = values[:, None].expand(-1, length, -1)
         there = torch.ones_like(values, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Linear: the affine-Gaussian network, whose models have a known evidence (see `dvae.program.oracle`)."""
+"""Linear: an affine network for linear-Gaussian models, with an evidence known from `dvae.program.oracle`."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from .loop import at, select
 
 @dataclass(frozen=True)
 class Linear:
-    """features_t = b_t + sum over parents and their visible steps s of W_ts v_s, in the child's own dimension.
+    """An affine network: features_t = b_t + sum over parents and their visible steps s of W_ts v_s.
 
-    The weights vary with t and s, so that a guide of this kind can hold the exact posterior of a linear-Gaussian model.
+    The features have the child's dimension. The weights depend on t and s, so a guide with this network can represent
+    the exact posterior of a linear-Gaussian model.
 
     Args:
-        steps: the longest sequence.
+        steps: maximum sequence length.
         scale: standard deviation of the initial weights.
     """
 
@@ -30,12 +31,12 @@ class Linear:
     scale: float = 0.3
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return LinearNetwork(self, inputs, local, size)
 
 
 class LinearNetwork(Network):
-    """What `Linear` describes. Weights are (T, S, H, D): T is 1 for a static child, S is 1 for a static parent."""
+    """Network of `Linear` with weights (T, S, H, D); T is 1 for a static child, S is 1 for a static parent."""
 
     def __init__(self, spec: Linear, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
@@ -48,14 +49,14 @@ class LinearNetwork(Network):
             self.weights[parent.name] = nn.Parameter(spec.scale * torch.randn(rows, columns, size, parent.size))
 
     def mask(self, name: str, length: int) -> Tensor:
-        """(T or 1, S or 1) True where the parent is read; a custom mask may depend on the length."""
+        """Return (T or 1, S or 1), True where the parent is read; a custom mask may depend on the length."""
         relation = next(parent.relation for parent in self.inputs if parent.name == name)
         if relation is None:
             return torch.ones(1, 1, dtype=torch.bool)
         return torch.as_tensor(relation.mask(length)[: length if self.local else 1])
 
     def weight(self, name: str, length: int) -> Tensor:
-        """Masked weights (T or 1, S or 1, H, D) for sequences of `length` steps."""
+        """Return the masked weights (T or 1, S or 1, H, D) for sequences of `length` steps."""
         if length > self.steps:
             raise ValueError(f"Linear(steps={self.steps}) was given {length} steps; build it with steps={length}")
         weight: Tensor = self.weights[name][:length, :length]
@@ -65,7 +66,7 @@ class LinearNetwork(Network):
         return weight * visible(relation, length, weight.device)[: len(weight), :, None, None]
 
     def known(self, given: Mapping[str, Tensor], length: int) -> Tensor:
-        """The share of given parents in the features (B, T, H), or (T, H) without any."""
+        """Return the contribution of the given parents to the features (B, T, H), or (T, H) without any."""
         features: Tensor = self.bias[:length]
         for parent in self.inputs:
             if parent.name in given:

@@ -1,8 +1,8 @@
-"""Loops over time: their draws step by step, in the rows of the batch, and results that are computed once.
+"""Loops over time: draws by step, selection of batch rows, and results that are computed once.
 
-A particle filter repeats every sequence and, in the middle of the loop, replaces unlikely particles by copies of likely
-ones. The states of all networks move along (`select`). What lies at every step (hoisted work, the draws so far) is
-moved where it is read and not before (`Rows`), so that a run costs the same per step however long it is.
+A particle filter repeats every sequence and, within the loop, replaces unlikely particles by copies of likely ones.
+`select` applies the same choice of rows to the states of all networks. Tensors stored for every step (hoisted work, the
+draws so far) are selected only when they are read (`Rows`). The cost per step therefore does not depend on the length.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from torch.nn import functional
 
 
 class Rows(Sequence[Any]):
-    """Tensors (B, ...) by step, or None, as the rows that were chosen since they were written.
+    """Tensors (B, ...) or None by step, with rows selected lazily since they were written.
 
     Args:
-        values: by step.
+        values: tensors by step.
     """
 
     def __init__(self, values: Sequence[Any]):
         self.values = list(values)
         self.written = [0] * len(values)
         self.moves: list[Tensor] = []
-        self.origin: Tensor | None = None  # the moves as one: hoisted work is moved by it in one go
+        self.origin: Tensor | None = None  # composition of all moves, which selects hoisted work in one step
 
     def select(self, rows: Tensor) -> Rows:
-        """The same under one more choice of rows (N,)."""
+        """Return the same values under one more selection of rows (N,)."""
         chosen = Rows(self.values)
         chosen.written = list(self.written)
         chosen.moves = [*self.moves, rows]
@@ -59,7 +59,7 @@ class Rows(Sequence[Any]):
 
 
 def pick(value: Tensor, rows: Tensor | None) -> Tensor:
-    """The rows (N,) of a tensor (B, ...), without a copy where all rows are one."""
+    """Return the rows (N,) of a tensor (B, ...), without a copy if all rows are equal."""
     if rows is None:
         return value
     if value.shape[0] == 1 or value.stride(0) == 0:
@@ -68,11 +68,12 @@ def pick(value: Tensor, rows: Tensor | None) -> Tensor:
 
 
 def select(state: Any, rows: Tensor) -> Any:
-    """A loop's state with these rows (N,) of its batch.
+    """Return a loop's state with these rows (N,) of its batch.
 
-    Tensors have the batch as their first dimension. Containers and dataclasses (frozen ones are descriptions) are
-    entered; lists and tuples of tensors are moved step by step, when read. What has a `select` of its own moves itself:
-    a state that keeps weights needs one. All else is the same for every row.
+    The batch is the first dimension of tensors. Containers and dataclasses are processed recursively, except frozen
+    dataclasses, which are specifications. Lists and tuples of tensors are selected step by step when they are read. An
+    object with a `select` method uses that; a state that contains weights needs one. All other objects are shared by
+    the rows.
     """
     if isinstance(state, Tensor):
         return pick(state, rows)
@@ -99,7 +100,7 @@ _ONCE: ContextVar[dict[Any, Any] | None] = ContextVar("once", default=None)
 
 @contextmanager
 def computing_once() -> Iterator[None]:
-    """Within it, `once` results are kept: for one evaluation of guide and model, whose parameters do not change."""
+    """Cache the results of `once` within the block: for one evaluation of guide and model with fixed parameters."""
     if _ONCE.get() is not None:
         yield
         return
@@ -111,22 +112,22 @@ def computing_once() -> Iterator[None]:
 
 
 def once(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
-    """compute(), or its result for the same owner, such as a module, and the very same inputs within `computing_once`.
+    """Return compute(), or its cached result for the same owner and identical input objects, within `computing_once`.
 
-    Factors that share a module (SRNN's h_t) then evaluate it once, without knowing of each other.
+    Factors that share a module, such as h_t in SRNN, thus evaluate it once without a reference to each other.
     """
     kept = _ONCE.get()
     if kept is None:
         return compute()
     key = _key(owner, inputs)
     if key not in kept:
-        kept[key] = (inputs, compute())  # the inputs are held, so that their ids stay theirs
+        kept[key] = (inputs, compute())  # keep the inputs alive, so that their ids are not reused
     result: Computed = kept[key][1]
     return result
 
 
 def keep(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
-    """Tells `once` a result that came about in another way, such as within a loop."""
+    """Store a result for `once` that was computed in another way, such as within a loop."""
     kept = _ONCE.get()
     if kept is not None:
         kept[_key(owner, inputs)] = (inputs, result)
@@ -137,7 +138,7 @@ def _key(owner: object, inputs: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def shift(values: Tensor, lag: int) -> Tensor:
-    """values[:, t + lag] at every t of (B, T, D), zero where t + lag is outside."""
+    """Return values[:, t + lag] at every t of (B, T, D), zero if t + lag is outside."""
     if lag == 0:
         return values
     steps = values.shape[1]
@@ -147,46 +148,46 @@ def shift(values: Tensor, lag: int) -> Tensor:
 
 
 def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
-    """values[t] of a loop's draws, zero outside the sequence; `like` is any (B, ...) tensor."""
+    """Return values[t] of a loop's draws, zero outside the sequence; `like` is any (B, ...) tensor."""
     return values[t] if 0 <= t < len(values) else like.new_zeros(like.shape[0], size)
 
 
 def each_at(drawn: Mapping[str, Sequence[Tensor]], parents: Sequence[Any], t: int, like: Tensor) -> list[Tensor]:
-    """Return the draws at step t + lag of each (parent, lag). Parents are `base.Input`; a lag of None is left out."""
+    """Return the draws at step t + lag of each (parent, lag), a `base.Input` and a lag; a lag of None is skipped."""
     return [at(drawn[parent.name], t + lag, like, parent.size) for parent, lag in parents if lag is not None]
 
 
 def over(values: Sequence[Tensor], t: int, count: int, like: Tensor, size: int) -> Tensor:
-    """(B, N, D) of a loop's draws at N steps from t on, as `at` has them."""
+    """Return (B, N, D) of a loop's draws at N steps from t on, with `at` for each step."""
     return torch.stack([at(values, s, like, size) for s in range(t, t + count)], dim=1)
 
 
 def valid_steps(lengths: Tensor, length: int) -> Tensor:
-    """(B, T) True at the steps of a ragged batch that exist."""
+    """Return (B, T), True at the valid steps of a ragged batch."""
     return torch.arange(length, device=lengths.device) < lengths[:, None]
 
 
 def again(values: Tensor, n: int) -> Tensor:
-    """Every row n times over, (n B, ...), row after row; `once_valid` finds features of the rows as they were."""
+    """Repeat all rows n times, (n B, ...); `once_valid` then computes features of the original rows only."""
     repeated = values.repeat(n, *[1] * (values.dim() - 1))
     keep(again, [repeated], (values, n))
     return repeated
 
 
 def steps_of(values: Tensor) -> Sequence[Tensor]:
-    """The steps of values (B, T, ...), which `whole_of` knows."""
+    """Return the steps of values (B, T, ...); `whole_of` can restore the values without a copy."""
     steps = values.unbind(1)
     keep(steps_of, steps, values)
     return steps
 
 
 def whole_of(steps: Sequence[Tensor]) -> Tensor:
-    """Values (B, T, ...) of these steps: what they are steps of, if that is known."""
+    """Return values (B, T, ...) from their steps, without a copy if `steps_of` returned them."""
     return once(steps_of, steps, lambda: torch.stack(list(steps), dim=1))
 
 
 def once_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Tensor:
-    """The module's features of (B, T, D) or (B, D), 0 at padding; once for all that read the same values."""
+    """Return the module's features of (B, T, D) or (B, D), 0 at padding; computed once for identical values."""
 
     def compute() -> Tensor:
         first, n = once(again, [values], lambda: (values, 1))
@@ -207,13 +208,13 @@ def follow(
     lengths: Tensor | None,
     change: Callable[[Tensor], Tensor] | None = None,
 ) -> Rows:
-    """What a module makes of the draws (B, D) of a loop so far, 0 at padding; once for all that read the same draws.
+    """Add the module's output for new draws (B, D) of a loop, 0 at padding; computed once for identical draws.
 
     Args:
-        rows: of the steps before, to which those of the others are added.
-        drawn: by step; None where there is none yet.
-        module, lengths: see `once_valid`.
-        change: the module as the loop has it, with its work done that is the same at all steps.
+        rows: outputs by step, which are extended.
+        drawn: draws by step; None if not drawn yet.
+        module, lengths: as in `once_valid`.
+        change: version of the module for single steps, with computations shared by all steps already done.
     """
     there = drawn.values if isinstance(drawn, Rows) else drawn
     fresh = [s for s, (made, value) in enumerate(zip(rows.values, there, strict=False)) if made is None is not value]
@@ -232,7 +233,7 @@ def follow(
 
 
 def reverse(values: Tensor, lengths: Tensor | None) -> Tensor:
-    """(B, T, D) with every sequence's valid steps in reverse order, padding left behind them."""
+    """Reverse the valid steps of every sequence (B, T, D); padding stays at the end."""
     if lengths is None:
         return values.flip(1)
     steps = torch.arange(values.shape[1], device=values.device)

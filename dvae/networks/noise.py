@@ -1,18 +1,18 @@
-"""How noise enters a code: four ways for a latent to meet the code of what was observed.
+"""Four ways to combine a latent with the code of the observed past.
 
-A sequence model that starts from a code h of its past makes many futures by having a latent z change that code. It may
-learn to ignore z where both come in the same way every time; Mix-and-Match (Aliakbarian et al. 2020, arXiv 1908.00733)
-therefore perturbs the code at indices that are drawn anew for every batch.
+A sequence model that starts from a code h of its past generates different futures if a latent z changes that code. The
+model may learn to ignore z if h and z are always combined in the same way. Mix-and-Match (Aliakbarian et al., 2020,
+arXiv 1908.00733) therefore perturbs the code at random indices, which are drawn for every batch.
 
 | | code | from (arXiv) |
 |---|---|---|
-| `MixAndMatch` | at random indices what a network makes of h there and z elsewhere; h at the others | 1908.00733 |
-| `Concatenate` | a network on [h, z] | MT-VAE: Yan et al. 2018, 1808.04545 |
-| `AddProjected` | h + W z; nothing encodes z, which is drawn from its prior | HP-GAN: Barsoum et al. 2018, 1711.09561 |
+| `MixAndMatch` | at random indices, a network of h there and z elsewhere; h at the other indices | 1908.00733 |
+| `Concatenate` | a network of [h, z] | MT-VAE: Yan et al. 2018, 1808.04545 |
+| `AddProjected` | h + W z; z has no encoder and is drawn from its prior | HP-GAN: Barsoum et al. 2018, 1711.09561 |
 
-Each is a description with two modules: what the guide makes of the codes of past and future (`encoder`), and what the
-decoder makes of the code of the past and z (`decoder`). A fourth way, a latent for each step (Pose-Knows: Walker et al.
-2017, arXiv 1705.00053), is another factorization: `p(z_t) p(x_t | x_{<t}, h, z_t)`.
+Each specification builds two modules. The `encoder` maps the codes of past and future to the guide's features; the
+`decoder` maps the code of the past and z to the decoder's code. The fourth way, a latent for each step (Pose-Knows:
+Walker et al. 2017, arXiv 1705.00053), is a different factorization: `p(z_t) p(x_t | x_{<t}, h, z_t)`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from ..distributions.subset import Subset
 
 
 class Residual(nn.Module):
-    """A linear layer past three others, of which two have half the width and are followed by ReLUs.
+    """A linear layer in parallel with three others, two of half the width that are followed by ReLUs.
 
     Args:
-        size, features: numbers in and out.
+        size, features: numbers of inputs and outputs.
     """
 
     def __init__(self, size: int, features: int) -> None:
@@ -43,15 +43,15 @@ class Residual(nn.Module):
         )
 
     def forward(self, values: Tensor) -> Tensor:
-        """(B, features) of (B, size)."""
+        """Return (B, features) for (B, size)."""
         made: Tensor = self.short(values) + self.long(values)
         return made
 
 
 class CodeDecoder(nn.Module):
-    """Two layers on a code (B, L), normalised over the batch between them; the code it makes is that of a state.
+    """Two layers on a code (B, L) with batch normalisation between them; the output has the range of a recurrent state.
 
-    In evaluation, and of a single row, the statistics are those of training, so that rows know nothing of each other.
+    In evaluation, and for a single row, it uses the training statistics, so rows do not depend on each other.
     """
 
     def __init__(self, width: int) -> None:
@@ -59,7 +59,7 @@ class CodeDecoder(nn.Module):
         self.first, self.norm, self.last = nn.Linear(width, width), nn.BatchNorm1d(width), nn.Linear(width, width)
 
     def forward(self, code: Tensor) -> Tensor:
-        """(B, L) of (B, L), between -1 and 1 as states are."""
+        """Return (B, L) for (B, L), between -1 and 1 like recurrent states."""
         norm, learning = self.norm, self.training and len(code) > 1
         mean, var = norm.running_mean, norm.running_var
         made = functional.batch_norm(self.first(code), mean, var, norm.weight, norm.bias, learning, eps=norm.eps)
@@ -68,18 +68,17 @@ class CodeDecoder(nn.Module):
 
 @dataclass(frozen=True)
 class MixAndMatch:
-    """A share of the code's indices is drawn; a network reads the code there and z at the others.
+    """Replace the code at random indices by the output of a network that reads the code there and z elsewhere.
 
-    What it makes takes the code's place at the drawn indices. So a share alpha of the code is perturbed, and the rest
-    goes on as it is: with 0 the code is that of the past alone. Of a code of L numbers z has the L - ceil(alpha L)
-    that the network reads at the other indices; another size is brought there by a layer. With alpha = 1 no place is
-    left for z.
+    A share alpha of the code is perturbed and the rest is unchanged; with alpha 0 the code depends only on the past.
+    For a code of L numbers, z has L - ceil(alpha L) numbers, which fill the other indices. A layer maps z of another
+    size to the code. With alpha = 1 there are no indices for z.
 
-    The guide reads the code of the past at the drawn indices and that of the future at the others. All of it is by the
-    same indices, which the programs draw once for a batch: `DynamicalVAE(shared={"i": noise.indices})`.
+    The guide reads the code of the past at the drawn indices and the code of the future at the others. All modules use
+    the same indices, which are drawn once per batch: `DynamicalVAE(shared={"i": noise.indices})`.
 
     Args:
-        alpha: the share, from 0 to 1.
+        alpha: share of the indices, from 0 to 1.
     """
 
     indices_name: ClassVar[str] = "i"
@@ -87,23 +86,23 @@ class MixAndMatch:
     alpha: float = 0.5
 
     def __post_init__(self) -> None:
-        Subset(self.alpha)  # which refuses what is no share
+        Subset(self.alpha)  # validates alpha
 
     @property
     def indices(self) -> Subset:
-        """The law of the drawn indices, as (L,) of ones and zeros."""
+        """The distribution of the drawn indices, (L,) of ones and zeros."""
         return Subset(self.alpha)
 
     def latent(self, width: int) -> int:
-        """Size of z that the paper has."""
+        """Return the size of z in the paper."""
         return max(width - self.indices.chosen(width), 1)
 
     def encoder(self, width: int) -> nn.Module:
-        """The guide's features."""
+        """Return the module for the guide's features."""
         return _MixedEncoder(width)
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """The code that the future starts from."""
+        """Return the module for the initial code of the future."""
         return _MixedDecoder(width, latent, self.indices.chosen(width))
 
 
@@ -145,30 +144,30 @@ def _told(chosen: Tensor | None) -> Tensor:
 
 
 def _laid_out(values: Tensor, places: Tensor) -> Tensor:
-    """(B, L) with values (B, n) one after the other at n places (B, L)."""
+    """Return (B, L) with values (B, n) placed in order at the n marked positions of `places` (B, L)."""
     order = (places.cumsum(-1) - 1).clamp(0, values.shape[-1] - 1)
     return values.gather(-1, order)
 
 
 def half(width: int) -> int:
-    """Of a code, at least 1."""
+    """Return half the width, at least 1."""
     return max(width // 2, 1)
 
 
 @dataclass(frozen=True)
 class Concatenate:
-    """A network reads the code and z beside each other."""
+    """A network on the concatenation of the code and z."""
 
     def latent(self, width: int) -> int:
-        """Half as many as the code has."""
+        """Return half the size of the code."""
         return half(width)
 
     def encoder(self, width: int) -> nn.Module:
-        """The guide's features."""
+        """Return the module for the guide's features."""
         return _Beside(2 * width, width)
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """The code that the future starts from."""
+        """Return the module for the initial code of the future."""
         return _Beside(width + latent, width, CodeDecoder(width))
 
 
@@ -184,17 +183,17 @@ class _Beside(nn.Module):
 
 @dataclass(frozen=True)
 class AddProjected:
-    """A linear layer of z is added to the code. There is no encoder: the guide is the prior."""
+    """The code plus a linear layer of z, without an encoder: the guide is the prior."""
 
     def latent(self, width: int) -> int:
-        """Half as many as the code has."""
+        """Return half the size of the code."""
         return half(width)
 
     def encoder(self, width: int) -> None:
-        """There is none."""
+        """Return None, because the guide is the prior."""
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """The code that the future starts from."""
+        """Return the module for the initial code of the future."""
         return _Added(width, latent)
 
 
@@ -209,13 +208,13 @@ class _Added(nn.Module):
 
 
 class Noise(Protocol):
-    """How noise enters a code: a frozen dataclass such as these."""
+    """Specification of how noise enters a code: a frozen dataclass such as those in this module."""
 
     def latent(self, width: int) -> int:
-        """Size of z for a code of so many numbers, unless another is given."""
+        """Return the default size of z for a code of this width."""
 
     def encoder(self, width: int) -> nn.Module | None:
-        """Of codes of past and future and the drawn indices, the guide's features; None where it is the prior."""
+        """Return the module from past code, future code and indices to the guide's features; None for the prior."""
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """Of the code of the past, z and the drawn indices, the code that the future starts from."""
+        """Return the module from the code of the past, z and the drawn indices to the initial code of the future."""

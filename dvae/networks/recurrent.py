@@ -1,4 +1,4 @@
-"""Recurrent: forward and backward GRUs or LSTMs for what a factor reads over time, a perceptron for the rest."""
+"""Recurrent: forward and backward GRUs or LSTMs for parents over time, and a perceptron for the rest."""
 
 from __future__ import annotations
 
@@ -23,28 +23,29 @@ CELLS: dict[str, type[GRU] | type[LSTM]] = {"gru": GRU, "lstm": LSTM}
 
 @dataclass(frozen=True)
 class Recurrent:
-    """Parents read over the past enter a forward network, those over the future a backward one.
+    """A forward network for parents read over the past, and a backward network for parents read over the future.
 
-    One that is read over {1:T} enters both, each frame once: those before t the forward one, the others the backward
-    one (so that a guide's forward states can be the generative model's).
+    A parent read over {1:T} enters both, each frame once: frames before t enter the forward network, the others the
+    backward network. The forward states of a guide can therefore be those of the generative model.
 
-    Parents at single steps (and static ones) join after them. All parents with a past share one forward state, as
-    VRNN's h_t summarises x and z together.
+    Parents at single steps and static parents are joined afterwards. All parents with a past share one forward state,
+    as in VRNN, where h_t summarises x and z together.
 
     Args:
-        width: of the recurrent states.
-        cell: "lstm" or "gru"; torch trains the first 2.4 times as fast on a CPU.
-        layers: of each recurrent network.
-        embed: width of a dense layer on what enters the recurrent networks; 0 for none.
-        hidden: widths of the perceptron that joins the states and the pointwise parents; () for none, the features
-            are then their concatenation.
+        width: width of the recurrent states.
+        cell: "lstm" or "gru"; on a CPU, torch trains an LSTM 2.4 times as fast.
+        layers: layers of each recurrent network.
+        embed: width of a dense layer on the input of the recurrent networks; 0 for none.
+        hidden: widths of the perceptron on the states and the pointwise parents; with () the features are their
+            concatenation.
         activation: "tanh", "relu", "gelu" or "elu".
-        extract: what comes before all else, by parent: widths of a perceptron, or the description of another module,
-            such as `NodeGraph()`. Outside the sequence what it gives is 0.
-        separate: a forward and a backward state for each parent, in place of one for all.
-        apart: a parent read over {<=t} enters the forward network up to t-1, and joins with its value at t.
-        stack: the backward network reads the forward states too, and alone joins. Only for parents read over {1:T}.
-        mean: states and pointwise parents are averaged before the perceptron, in place of concatenated.
+        extract: extractors by parent, applied first: widths of a perceptron, or the specification of another module,
+            such as `NodeGraph()`. Their output is 0 outside the sequence.
+        separate: whether each parent has its own forward and backward state.
+        apart: whether a parent read over {<=t} enters the forward network up to t-1 only and joins with its value at t.
+        stack: whether the backward network also reads the forward states and only its states are joined; requires
+            parents read over {1:T}.
+        mean: whether to average the states and pointwise parents instead of concatenating them.
     """
 
     width: int = 64
@@ -60,7 +61,7 @@ class Recurrent:
     mean: bool = False
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> RecurrentNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         if self.cell not in CELLS:
             raise ValueError(f"unknown cell {self.cell!r}; known: {', '.join(CELLS)}")
         if self.width < 1 or self.layers < 1:
@@ -71,12 +72,12 @@ class Recurrent:
 
 
 class Memory(nn.Module):
-    """The state of a recurrent network over one direction of time, at every step or step by step.
+    """A recurrent network over one direction of time, evaluated at all steps at once or step by step.
 
     Args:
-        entries: (parent, lag): the network reads the parent at t + lag when it arrives at t.
+        entries: pairs (parent, lag); at step t the network reads the parent at t + lag.
         direction: +1 forward, -1 backward in time.
-        under: a memory whose states enter before the entries.
+        under: a memory whose states are further inputs, placed before the entries.
     """
 
     def __init__(
@@ -95,17 +96,17 @@ class Memory(nn.Module):
         self.cell = gru_cell if spec.cell == "gru" else lstm_cell
 
     def forward(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
-        """States (B, T, W) at every step.
+        """Return the states (B, T, W) at every step.
 
         Args:
-            values: features of the parents, by name.
-            keys: the parents themselves, which tell whether the states have been computed before.
-            lengths: (B,) of a ragged batch.
+            values: {name: features of the parent}.
+            keys: {name: the parent itself}, which identifies states that have already been computed.
+            lengths: (B,) numbers of valid steps in a ragged batch.
         """
         return once(self, self.key(keys, lengths), lambda: self._states(values, keys, lengths))
 
     def key(self, keys: Mapping[str, Tensor], lengths: Tensor | None) -> list[Tensor | None]:
-        """What the states are computed from."""
+        """Return the inputs that determine the states."""
         return [*(keys[parent.name] for parent, _ in self.entries), lengths]
 
     def _states(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
@@ -122,7 +123,7 @@ class Memory(nn.Module):
         return reverse(states, lengths) if self.direction < 0 else states
 
     def start(self, given: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> MemoryState:
-        """The state before the first step, with the given parents' products with the first weights done."""
+        """Return the state before the first step, with the first products of the given parents computed."""
         first = self.embed[0] if self.embed is not None else self.layers[0]
         weight, bias = (first.weight, first.bias) if self.embed is not None else (first.weight_ih_l0, first.bias_ih_l0)
         columns = weight.split([parent.size for parent, _ in self.entries], dim=1)
@@ -141,7 +142,7 @@ class Memory(nn.Module):
         )
 
     def step(self, state: MemoryState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
-        """The state (B, W) at t; `state` is advanced."""
+        """Return the state (B, W) at t; `state` is advanced in place."""
         value = state.steps[t if len(state.steps) > 1 else 0]
         for parent, lag, weight in state.live:
             value = torch.addmm(value, at(drawn[parent.name], t + lag, value, parent.size), weight)
@@ -152,15 +153,15 @@ class Memory(nn.Module):
             if i or self.embed is not None:
                 value = functional.linear(value, layer.weight_ih_l0, layer.bias_ih_l0)
             new = self.cell(value, state.hidden[i], layer)
-            if valid is not None:  # a backward network starts at a sequence's last valid step
+            if valid is not None:  # a backward network must start at the last valid step of each sequence
                 new = (torch.where(valid, new[0], state.hidden[i][0]), torch.where(valid, new[1], state.hidden[i][1]))
             state.hidden[i] = new
             value = new[0]
         return value
 
     def stretch(self, state: MemoryState, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
-        """The states (B, N, W) of a forward memory at N steps from t on; `state` is advanced."""
-        if self.embed is None and len(state.live) < len(self.entries):  # some of its gates are known, and nothing else
+        """Return the states (B, N, W) of a forward memory at N steps from t on; `state` is advanced in place."""
+        if self.embed is None and len(state.live) < len(self.entries):  # part of its gates is known
             return torch.stack([self.step(state, s, drawn) for s in range(t, t + count)], dim=1)
         like = state.hidden[0][0]
         parts = [over(drawn[parent.name], t + lag, count, like, parent.size) for parent, lag, _ in state.live]
@@ -178,7 +179,7 @@ class Memory(nn.Module):
         return value
 
     def gates(self, state: MemoryState, length: int) -> tuple[Tensor, Tensor] | None:
-        """(B, T, 4 W) share of an LSTM's gates in what is known, and its weight; None for what is not one LSTM."""
+        """Return known inputs' contribution (B, T, 4 W) to an LSTM's gates and its weight; None for other networks."""
         if self.embed is not None or len(self.layers) > 1 or self.cell is not lstm_cell:
             return None
         (layer,) = self.layers
@@ -188,7 +189,7 @@ class Memory(nn.Module):
 
 @dataclass
 class MemoryState:
-    """What a `Memory` keeps between steps: hoisted products, live parents, hidden states by layer."""
+    """The state of a `Memory` between steps: hoisted products, live parents and hidden states by layer."""
 
     base: Tensor
     live: list[tuple[Input, int, Tensor]]
@@ -197,29 +198,29 @@ class MemoryState:
 
     @cached_property
     def steps(self) -> Sequence[Tensor]:
-        """The base by step, or one for all steps."""
+        """The base by step, or a single one for all steps."""
         return self.base.unbind(1)
 
     def select(self, rows: Tensor) -> MemoryState:
-        """Its rows; the base is that of the start."""
+        """Return the selected rows; the base is unchanged."""
         chosen = MemoryState(self.base, self.live, select(self.lengths, rows), select(self.hidden, rows))
         chosen.steps = select(self.steps, rows)
         return chosen
 
 
 def gru_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[Tensor, Tensor]:
-    """torch.nn.GRU's step from the input's product W x + b (B, 3W)."""
+    """Run a step of torch.nn.GRU from the input's product W x + b (B, 3 W)."""
     h = hidden[0]
     width = h.shape[1]
     recurrent = functional.linear(h, layer.weight_hh_l0, layer.bias_hh_l0)
     reset, update = torch.sigmoid(gates[:, : 2 * width] + recurrent[:, : 2 * width]).chunk(2, 1)
     candidate = torch.tanh(torch.addcmul(gates[:, 2 * width :], reset, recurrent[:, 2 * width :]))
-    new = torch.lerp(candidate.to(h.dtype), h, update.to(h.dtype))  # autocast computes gates in half precision
+    new = torch.lerp(candidate.to(h.dtype), h, update.to(h.dtype))  # under autocast the gates have half precision
     return new, new
 
 
 def lstm_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[Tensor, Tensor]:
-    """torch.nn.LSTM's step from the input's product W x + b (B, 4W)."""
+    """Run a step of torch.nn.LSTM from the input's product W x + b (B, 4 W)."""
     h, cell = hidden
     entry, forget, candidate, output = torch.addmm(gates + layer.bias_hh_l0, h, layer.weight_hh_l0.t()).chunk(4, 1)
     cell = torch.sigmoid(forget) * cell + torch.sigmoid(entry) * torch.tanh(candidate)
@@ -227,7 +228,7 @@ def lstm_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple
 
 
 class RecurrentNetwork(Network):
-    """What `Recurrent` describes."""
+    """Network of `Recurrent`."""
 
     def __init__(self, spec: Recurrent, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 0)
@@ -247,7 +248,7 @@ class RecurrentNetwork(Network):
             for low, high in parent.relation.intervals:
                 first = 0 if math.isinf(low) else int(low)
                 last = (-1 if local and math.isinf(low) else 0) if math.isinf(high) else int(high)
-                # A memory has read its past (future) by t; what lies on the other side of t joins by single steps.
+                # A memory covers one side of t; steps on the other side are joined as single steps.
                 if math.isinf(low):
                     past.append((parent, min(last, -1 if spec.apart and local else 0)))
                     first = past[-1][1] + 1 if last >= 0 else 1
@@ -271,7 +272,7 @@ class RecurrentNetwork(Network):
 
     @property
     def past(self) -> Memory | None:
-        """The forward memory, where there is one for all parents."""
+        """The forward memory if all parents share one, otherwise None."""
         memories = [memory.under or memory for memory in self.memories]
         forward = [memory for memory in memories if memory.direction > 0]
         return forward[0] if len(forward) == 1 else None
@@ -348,15 +349,15 @@ class RecurrentNetwork(Network):
 
 @dataclass
 class RecurrentState:
-    """What a `RecurrentNetwork` keeps between steps.
+    """The state of a `RecurrentNetwork` between steps.
 
     Args:
-        hoisted: the join's share of what is known.
-        memories: those that read what is drawn, and their states.
+        hoisted: contribution of the known parts to the join.
+        memories: memories that read drawn variables, and their states.
         live: pointwise parents that are drawn, and their lags.
-        extracted: name to what the extractor gave for the draws so far.
+        extracted: {name: output of the extractor for the draws so far}.
         given: the known parents.
-        lengths: (B,) of a ragged batch.
+        lengths: (B,) numbers of valid steps in a ragged batch.
     """
 
     hoisted: Hoisted
@@ -367,18 +368,18 @@ class RecurrentState:
     lengths: Tensor | None
 
     def select(self, rows: Tensor) -> RecurrentState:
-        """Its rows; the known parents stay those of the start."""
+        """Return the selected rows; the known parents are unchanged."""
         moved = {name: select(getattr(self, name), rows) for name in ("hoisted", "memories", "extracted", "lengths")}
         return replace(self, **moved)
 
 
 def tie(first: Any, *others: Any) -> None:
-    """Gives recurrent networks one forward memory, of the same parents at the same lags, and its extractors.
+    """Assign the forward memory of the first network, and its extractors, to other recurrent networks.
 
-    What they share is evaluated once for all of them.
+    All memories must read the same parents at the same lags. Shared states are evaluated once for all networks.
 
     Raises:
-        ValueError: networks without one forward memory, or whose memories read or hold different things.
+        ValueError: a network has no single forward memory, or the memories differ in parents, lags or parameter shapes.
     """
     shape = _shape(first)
     for other in others:
@@ -395,7 +396,7 @@ def tie(first: Any, *others: Any) -> None:
 
 
 def _shape(network: Any) -> dict[str, Any]:
-    """What two forward memories must have in common to be one: what they read, and the shapes of their parameters."""
+    """Return the properties that tied forward memories must share: parents, lags and parameter shapes."""
     if not isinstance(network, RecurrentNetwork):
         raise ValueError(f"only recurrent networks have a memory to tie, not a {type(network).__name__}")
     if network.past is None:
@@ -406,7 +407,7 @@ def _shape(network: Any) -> dict[str, Any]:
 
 
 def _groups(entries: list[tuple[Input, int]], separate: bool) -> list[list[tuple[Input, int]]]:
-    """Entries by the memory that reads them."""
+    """Group entries by the memory that reads them."""
     if not separate:
         return [entries] if entries else []
     names = dict.fromkeys(parent.name for parent, _ in entries)
@@ -414,7 +415,7 @@ def _groups(entries: list[tuple[Input, int]], separate: bool) -> list[list[tuple
 
 
 def summary(states: Tensor, direction: int, lengths: Tensor | None) -> Tensor:
-    """(B, W): the state that has read the whole sequence, of states (B, T, W) over time."""
+    """Return the state (B, W) after reading the whole sequence, from states (B, T, W)."""
     if direction < 0:
         return states[:, 0]
     if lengths is None:
@@ -427,7 +428,7 @@ class Dense:
     """A multilayer perceptron on pointwise parents (z_t, z_{t-1}, x_{t-3:t-1}, w).
 
     Args:
-        widths: of the layers; () for none, the features are then the parents.
+        widths: widths of the layers; with () the features are the parents.
         activation: "tanh", "relu", "gelu" or "elu".
     """
 
@@ -435,12 +436,12 @@ class Dense:
     activation: str = "tanh"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DenseNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return DenseNetwork(self, inputs, local)
 
 
 class DenseNetwork(RecurrentNetwork):
-    """What `Dense` describes: a recurrent network without a memory."""
+    """Network of `Dense`: a recurrent network without a memory."""
 
     def __init__(self, spec: Dense, inputs: Sequence[Input], local: bool):
         for parent in inputs:

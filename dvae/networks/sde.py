@@ -1,26 +1,28 @@
 """LinearSDE: the exact transition of a linear stochastic differential equation, for steps at irregular times.
 
-    dz = A z dt + L dW        z_1 ~ N(0, I)        d_t, the time since the step before
+    dz = A z dt + L dW        z_1 ~ N(0, I)        d_t, the time since the previous step
 
     p(z_t | z_{t-1}, d_t) = N(F z_{t-1}, Q)        F = e^{A d_t},  Q = int_0^{d_t} e^{A s} L L' e^{A' s} ds
 
-The coordinates are those in which the stationary law is N(0, I), which is to say A + A' + L L' = 0, and in which noise
-enters each by itself:
+The coordinates are chosen so that the stationary distribution is N(0, I), that is A + A' + L L' = 0, and so that the
+noise of the coordinates is independent:
 
     A = S - diag(r)        L L' = 2 diag(r)        S' = -S,  r > 0
 
-Every stable linear equation whose noise spreads to all coordinates is a linear map of one of these, or of a limit as
-some r vanish, and what reads z learns that map. So nothing grows in a gap however long, at the end of which z is as at
-the start; the first step of a sequence has no law of its own; and to leave out a step is to make one gap of two.
+Every stable linear equation whose noise reaches all coordinates is a linear map of such an equation, or of a limit with
+some r going to 0. The networks that read z learn this map. The parameterisation has three consequences. The variance
+does not grow over a long gap, and after an infinite gap z follows its initial distribution. The first step of a
+sequence needs no distribution of its own. Omitting a step is equivalent to merging two gaps.
 
-LinearSDEGuide has such a transition too, and makes a Gaussian potential of all else that it reads:
+LinearSDEGuide has the same kind of transition, multiplied by a Gaussian potential of all its other parents:
 
     q(z_t | z_{t-1}, d_t, ...) = N(F z_{t-1}, Q) N(e_t; W_t' z_t, I) / constant
 
-With what a linear-Gaussian model's data from t on say of z_t for e_t and W_t, it is that model's exact posterior.
+If e_t and W_t represent the likelihood of z_t given the data from t on in a linear-Gaussian model, this is the exact
+posterior of that model.
 
-(Särkkä and Solin, Applied Stochastic Differential Equations, 2019, chapter 6. A guide of the prior's transition and
-potentials that a network makes: Johnson et al., 2016, arXiv 1603.06277.)
+(Särkkä and Solin, Applied Stochastic Differential Equations, 2019, chapter 6. A guide with the prior's transition and
+potentials from a network: Johnson et al., 2016, arXiv 1603.06277.)
 """
 
 from __future__ import annotations
@@ -40,16 +42,15 @@ from .loop import at, once, select, shift, valid_steps
 from .recurrent import Recurrent
 
 ORDER = 22
-"""Terms of the series over a gap of norm 1: in double precision the rest is below rounding, 2^22 / 23! = 2e-16."""
+"""Terms of the series over a gap of norm 1: in double precision the remainder is below rounding, 2^22 / 23! = 2e-16."""
 
 
 @dataclass(frozen=True)
 class LinearSDE:
-    """A linear stochastic differential equation from z_{t-1} over a gap, for the law `distributions.Triangular`; see
-    the file.
+    """A linear stochastic differential equation from z_{t-1} over a gap, for `distributions.Triangular`.
 
     Args:
-        times: between which the coordinates' times of forgetting, 1 / r, are spread at the start; in the unit of gaps.
+        times: range of the initial relaxation times 1 / r of the coordinates, in the unit of the gaps.
 
     Example:
         >>> networks = {"p(z)": dvae.networks.LinearSDE(), "q(z)": dvae.networks.LinearSDEGuide()}
@@ -63,10 +64,10 @@ class LinearSDE:
     times: tuple[float, float] = (1.0, 100.0)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearSDENetwork:
-        """The network of a factor p(z_t | z_{t-1}, d_t), for z of dimension `size`.
+        """Return the network of a factor p(z_t | z_{t-1}, d_t), for z of dimension `size`.
 
         Raises:
-            ValueError: other parents, or times that are not positive or not in order.
+            ValueError: the parents differ from z_{t-1} and d_t, or the times are not positive and in order.
         """
         before = [p for p in inputs if p.lags == (-1,) and p.size == size]
         gaps = [p for p in inputs if p.lags == (0,) and p.size == 1]
@@ -80,16 +81,16 @@ class LinearSDE:
 
 @dataclass(frozen=True)
 class LinearSDEGuide:
-    """The transition of a `LinearSDE` times a Gaussian potential, for the law `distributions.Triangular`; see the file.
+    """The transition of a `LinearSDE` times a Gaussian potential, for `distributions.Triangular`.
 
-    A network that only reads z_{t-1} beside the gap has to learn how z turns in any time before it can be near a prior
-    of little noise. This one turns with it from the start. `networks.base.share_modules(networks, "equation")` of both
-    factors' networks gives it the prior's own equation, which is then computed once for both.
+    A network that simply reads z_{t-1} and the gap must learn the rotation of z over any time before it can approximate
+    a prior with little noise. This guide contains that rotation from the start. To use the prior's own equation, and
+    compute it once, call `networks.base.share_modules(networks, "equation")` with the networks of both factors.
 
     Args:
-        potential: description of the network of the other parents that makes e_t and W_t.
-        times: see `LinearSDE`.
-        gap: name of the time since the step before, which `potential` reads too.
+        potential: specification of the network of the other parents that outputs e_t and W_t.
+        times: initial relaxation times, as in `LinearSDE`.
+        gap: name of the time since the previous step, which `potential` reads too.
     """
 
     potential: NetworkSpec = field(default_factory=Recurrent)
@@ -97,10 +98,10 @@ class LinearSDEGuide:
     gap: str = "d"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearSDEGuideNetwork:
-        """The network of a factor q(z_t | z_{t-1}, d_t, ...), for z of dimension `size`.
+        """Return the network of a factor q(z_t | z_{t-1}, d_t, ...), for z of dimension `size`.
 
         Raises:
-            ValueError: no last value or no gap among the parents.
+            ValueError: the last value or the gap is missing among the parents.
         """
         before = [p for p in inputs if p.lags == (-1,) and p.size == size]
         gaps = [p for p in inputs if p.name == self.gap and p.relation and p.relation.reads(0, 2) and p.size == 1]
@@ -118,11 +119,11 @@ def _but(inputs: Sequence[Input], size: int) -> str:
 
 
 class Equation(nn.Module):
-    """A and L L' in their coordinates, and what they do over gaps.
+    """The parameters A and L L', and the transitions over gaps.
 
     Args:
-        size: D.
-        times: see `LinearSDE`.
+        size: D, dimension of z.
+        times: initial relaxation times, as in `LinearSDE`.
     """
 
     unit: Tensor
@@ -135,7 +136,7 @@ class Equation(nn.Module):
         places = (torch.arange(size) + 0.5) / size
         self.log_rate = nn.Parameter(-math.log(shortest) - math.log(longest / shortest) * places)
         root = (0.5 * self.log_rate.detach()).exp()
-        self.turning = nn.Parameter(0.3 * shortest * torch.randn(size, size) * root * root[:, None])  # without unit
+        self.turning = nn.Parameter(0.3 * shortest * torch.randn(size, size) * root * root[:, None])  # dimensionless
         self.register_buffer("unit", torch.tensor(1 / shortest))
 
     @property
@@ -149,15 +150,15 @@ class Equation(nn.Module):
         return 2 * self.log_rate.exp().diag()
 
     def at_all(self, gaps: Tensor, lengths: Tensor | None, name: str) -> tuple[Tensor, Tensor]:
-        """F and the whitening matrix of Q, (B, T, D, D) each, at all steps.
+        """Return F and the whitening matrix of Q, (B, T, D, D) each, at all steps.
 
         Args:
-            gaps: d, (B, T, 1); that of the first step, before which there is nothing, is not read.
-            lengths: (B,) valid steps.
-            name: of the gaps.
+            gaps: d, (B, T, 1); the value at the first step is ignored.
+            lengths: (B,) numbers of valid steps.
+            name: name of the gaps in messages.
 
         Raises:
-            ValueError: gaps that are not positive.
+            ValueError: a gap is not positive and finite.
         """
 
         def compute() -> tuple[Tensor, Tensor]:
@@ -170,16 +171,16 @@ class Equation(nn.Module):
         return once(self, [gaps, lengths], compute)
 
     def over(self, gaps: Tensor, there: Tensor, name: str, first: int = 0) -> tuple[Tensor, Tensor]:
-        """F and the whitening matrix of Q, (B, T, D, D) each; once for gaps that are equal.
+        """Return F and the whitening matrix of Q, (B, T, D, D) each; equal gaps are computed once.
 
         Args:
             gaps: d, (B, T).
-            there: (B, T) False where there is no step before, and z is from its stationary law.
-            name: of the gaps.
-            first: the number of the first step, counted from 0.
+            there: (B, T), False if there is no previous step and z follows its stationary distribution.
+            name: name of the gaps in messages.
+            first: number of the first step, counted from 0.
 
         Raises:
-            ValueError: gaps that are not positive.
+            ValueError: a gap is not positive and finite.
         """
         if (bad := there & ~((gaps > 0) & (gaps < math.inf))).any():
             row, t = bad.nonzero()[0].tolist()
@@ -194,7 +195,7 @@ class Equation(nn.Module):
         refuse_half(self.log_rate.dtype)
         with torch.autocast(gaps.device.type, enabled=False):
             decay, covariance = transition(self.drift, self.noise, distinct.to(self.log_rate.dtype))
-            # the last is that from the stationary law, which forgets all
+            # the last entry draws from the stationary distribution, independently of the previous value
             decay = torch.cat([decay, torch.zeros_like(self.turning)[None]])
             whitening = torch.cat(
                 [
@@ -208,13 +209,13 @@ class Equation(nn.Module):
 
 
 class LinearSDENetwork(Network):
-    """What `LinearSDE` describes; the features are location and whitening matrix, (..., D + D * D).
+    """Network of `LinearSDE`; the features are location and whitening matrix, (..., D + D * D).
 
     Args:
         inputs: the parents.
-        before: that of them which is z_{t-1}.
-        gap: the name of that which is d_t.
-        times: see `LinearSDE`.
+        before: the parent z_{t-1}.
+        gap: name of the parent d_t.
+        times: initial relaxation times, as in `LinearSDE`.
     """
 
     law = Triangular
@@ -243,7 +244,7 @@ class LinearSDENetwork(Network):
         return _features(moved, None, whitening, self._last(known, t, drawn, moved)), state
 
     def drawn_over(self, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
-        """F and the whitening matrix of Q, (B, D, D) each, over gaps that the loop draws too."""
+        """Return F and the whitening matrix of Q, (B, D, D) each, over gaps that the loop draws."""
         gaps = drawn[self.gap][t]
         moved, whitening = self.equation.over(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), self.gap, t)
         return moved[:, 0], whitening[:, 0]
@@ -253,14 +254,14 @@ class LinearSDENetwork(Network):
 
 
 class LinearSDEGuideNetwork(LinearSDENetwork):
-    """What `LinearSDEGuide` describes."""
+    """Network of `LinearSDEGuide`."""
 
     def __init__(self, spec: LinearSDEGuide, inputs: Sequence[Input], before: Input):
         super().__init__(inputs, before, spec.gap, spec.times)
         size = before.size
         self.potential = spec.potential.build([p for p in inputs if p is not before], True, size)
         self.out = nn.Linear(self.potential.features, size + size**2)
-        with torch.no_grad():  # at the start, every coordinate is told with unit noise
+        with torch.no_grad():  # initially, the potential observes every coordinate with unit noise
             self.out.weight[size:] *= 0.1
             self.out.bias[size:] = torch.eye(size).flatten()
 
@@ -300,9 +301,9 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
         return self.updated(moved, whitening, self.potential(others, length, lengths))
 
     def updated(self, moved: Tensor, whitening: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """M, c and V of q(z_t | z_{t-1}, ...) = N(M z_{t-1} + c, (V'V)^-1): (..., D, D), (..., D) and (..., D, D).
+        """Return M (..., D, D), c (..., D) and V (..., D, D) of q(z_t | z_{t-1}, ...) = N(M z_{t-1} + c, (V'V)^-1).
 
-        With G = U'^-1 W, where U whitens Q, all that is inverted is I + G'G, which is near I over short gaps.
+        With G = U'^-1 W, where U whitens Q, the only inverted matrix is I + G'G, which is close to I over short gaps.
 
         Args:
             moved, whitening: F and U, (..., D, D) each.
@@ -313,7 +314,7 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
             weight = scale.unflatten(-1, moved.shape[-2:])
             g = torch.linalg.solve_triangular(whitening.mT, weight, upper=True)
             identity = torch.eye(self.size, dtype=g.dtype, device=g.device)
-            # of T'T = I + G G', T lower triangular: the root of the matrix with rows and columns in reverse
+            # lower triangular T with T'T = I + G G': Cholesky factor of the matrix with rows and columns reversed
             root = torch.linalg.cholesky((identity + g @ g.mT).flip(-1, -2)).flip(-1, -2).mT
             inner = torch.linalg.cholesky(identity + g.mT @ g)
             gain = torch.linalg.solve_triangular(whitening, torch.cholesky_solve(g.mT, inner).mT, upper=False)
@@ -327,11 +328,11 @@ def _features(moved: Tensor, offset: Tensor | None, whitening: Tensor, before: T
 
 
 def transition(drift: Tensor, noise: Tensor, gaps: Tensor) -> tuple[Tensor, Tensor]:
-    """F = e^{A d} and Q = int_0^d e^{A s} N e^{A' s} ds, (K, D, D) each: dz = A z dt + L dW over gaps of length d.
+    """Return F = e^{A d} and Q = int_0^d e^{A s} N e^{A' s} ds, (K, D, D) each, of dz = A z dt + L dW over gaps d.
 
-    By series over d / 2^k, and k doublings, F(2d) = F(d)^2 and Q(2d) = Q(d) + F(d) Q(d) F(d)'. Nothing that is large
-    is taken from anything (F - I is carried in place of F), so that both keep their digits over the shortest gaps, and
-    over the longest where A is stable; Van Loan's one exponential of both (1978) overflows there.
+    It sums a series over d / 2^k and doubles k times: F(2d) = F(d)^2 and Q(2d) = Q(d) + F(d) Q(d) F(d)'. It stores F -
+    I in place of F, so there is no cancellation, and both results are accurate for the shortest gaps. For stable A they
+    are also accurate for the longest gaps, where the single matrix exponential of Van Loan (1978) overflows.
 
     Args:
         drift: A, (D, D).

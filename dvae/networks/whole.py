@@ -1,8 +1,8 @@
-"""WholeEncoder and WholeDecoder: perceptrons between sequences of one length, seen whole, and what is static.
+"""WholeEncoder and WholeDecoder: perceptrons between static variables and whole sequences of fixed length.
 
-The encoder reads all steps of its parents side by side. The decoder makes all steps of a variable from static parents:
-each step has a part of the last layer of its own. Variables of one program that are made from the same parents can
-share the perceptron, so that each takes its coordinates of what that makes.
+The encoder reads the concatenation of all steps of its parents. The decoder generates all steps of a variable from
+static parents, with separate weights of the last layer for each step. Variables of one program with the same parents
+can share the perceptron; each then uses its own coordinates of the output.
 
 Source: the latent space of Marsot et al. (2021, arXiv 2106.04387).
 """
@@ -25,11 +25,11 @@ from .loop import once
 
 @dataclass(frozen=True)
 class WholeEncoder:
-    """Features of a static child from all steps of its parents, and from static ones.
+    """Features of a static child from all steps of its parents and from static parents.
 
     Args:
-        length: N, steps of a sequence. Shorter ones are zero behind their end.
-        widths: of the layers, each followed by the activation.
+        length: N, steps of a sequence; shorter sequences are padded with zeros at the end.
+        widths: widths of the layers, each followed by the activation.
         activation: "tanh", "relu", "gelu" or "elu".
     """
 
@@ -38,24 +38,24 @@ class WholeEncoder:
     activation: str = "relu"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeEncoderNetwork:
-        """The network of a factor with these parents.
+        """Return the network of a factor with these parents.
 
         Raises:
-            ValueError: a local child, or a parent of which it may not read all steps.
+            ValueError: the child is local, or the factor does not read all steps of a parent.
         """
         return WholeEncoderNetwork(self, inputs, local)
 
 
 @dataclass(frozen=True)
 class WholeDecoder(WholeEncoder):
-    """All steps of a child from static parents.
+    """All steps of a local child from static parents.
 
     Args:
-        length: N, steps that are made.
-        widths: of the hidden layers, each followed by the activation; the last layer is linear.
-        activation: see `WholeEncoder`.
-        sizes: dimensions of the variables that share the perceptron, by name, in the order of their coordinates.
-        name: which of them the child is.
+        length: N, maximum number of steps.
+        widths: widths of the hidden layers, each followed by the activation; the last layer is linear.
+        activation: as in `WholeEncoder`.
+        sizes: {name: dimension} of the variables that share the perceptron, in the order of their coordinates.
+        name: name of the child.
     """
 
     sizes: Mapping[str, int] | None = None
@@ -63,10 +63,10 @@ class WholeDecoder(WholeEncoder):
 
     @override
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeDecoderNetwork:  # type: ignore[override]
-        """The network of a factor with these parents.
+        """Return the network of a factor with these parents.
 
         Raises:
-            ValueError: a static child, or a parent that is not static.
+            ValueError: the child is static, or a parent is not static.
         """
         return WholeDecoderNetwork(self, inputs, local, size)
 
@@ -77,7 +77,7 @@ def _refuse(steps: int, length: int) -> None:
 
 
 class WholeEncoderNetwork(Network):
-    """What `WholeEncoder` describes."""
+    """Network of `WholeEncoder`."""
 
     def __init__(self, spec: WholeEncoder, inputs: Sequence[Input], local: bool):
         partial = [parent.name for parent in inputs if parent.relation not in (None, ALL)]
@@ -100,7 +100,7 @@ class WholeEncoderNetwork(Network):
 
 
 class Trunk(nn.Module):
-    """(B, N, D) of (B, S): a perceptron whose last layer is linear."""
+    """A perceptron with a linear last layer, from (B, S) to (B, N, D)."""
 
     def __init__(self, size: int, spec: WholeDecoder, numbers: int):
         super().__init__()
@@ -109,16 +109,16 @@ class Trunk(nn.Module):
         self.length = spec.length
 
     def forward(self, given: Sequence[Tensor]) -> Tensor:
-        """All steps of all variables."""
+        """Return all steps of all variables."""
         return self.made(self.features(given))
 
     def features(self, given: Sequence[Tensor]) -> Tensor:
-        """What all steps are made of, (B, H)."""
+        """Return the features (B, H) that determine all steps."""
         found: Tensor = self.hidden(torch.cat(list(given), -1))
         return found
 
     def made(self, features: Tensor, steps: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:
-        """Steps of features: all, or these (K,) and these coordinates alone, of which no other is computed."""
+        """Return all steps from the features, or compute only the given steps (K,) and coordinates."""
         weight, bias = (part.unflatten(0, (self.length, -1))[:, coordinates] for part in self.out.parameters())
         if steps is not None:
             weight, bias = weight[steps], bias[steps]
@@ -127,7 +127,7 @@ class Trunk(nn.Module):
 
 
 class WholeDecoderNetwork(AtOnce):
-    """What `WholeDecoder` describes."""
+    """Network of `WholeDecoder`."""
 
     def __init__(self, spec: WholeDecoder, inputs: Sequence[Input], local: bool, size: int):
         if not local or any(parent.relation is not None for parent in inputs):
