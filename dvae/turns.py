@@ -1,8 +1,8 @@
 """Serialise threads, because Pyro's handler stack and torch's random state are global to the process.
 
 Two programs running at the same time would share one handler stack and one stream of random numbers. Building a model
-and running a program therefore hold the lock `alone`: in `DynamicalVAE.running`, in the terms of a bound, in a step of
-`SVI`, and in `seeded`, which also sets and restores the random state. Threads wait for one such step, not for a
+and running a program therefore hold the lock `alone`: in `DynamicalVAE.running`, in the terms of a bound, and in a step
+of `SVI`. `seeded` holds it too, and also sets and restores the random state. Threads wait for one such step, not for a
 whole fit. Processes are independent (`dvae.runs.sweep`). If a process forks while another thread holds the lock, the
 child starts with a free lock and an empty handler stack.
 """

@@ -3,7 +3,7 @@
     z_1 ~ N(m_1, P_1)        z_t = A_t z_{t-1} + b_t + N(0, Q_t)        weight of z_t: exp(g_t' z_t - z_t' G_t z_t / 2)
 
 The weights are the likelihoods of observations: a_t = C_t z_t + N(0, R) gives G_t = C_t' R^-1 C_t and
-g_t = C_t' R^-1 a_t, and a missing observation gives zeros. All computations have the dimension of z (Kalman, 1960;
+g_t = C_t' R^-1 a_t. A missing observation gives zeros. All computations have the dimension of z (Kalman, 1960;
 Rauch, Tung and Striebel, 1965; in information form, Särkkä, Bayesian Filtering and Smoothing, 2013).
 
 The prediction is one autograd function. With W_t = (I + P_t G_t)^-1 and F_t = A_{t+1} W_t it is

@@ -4,8 +4,8 @@
 
     p(z_t | z_{t-1}, d_t) = N(F z_{t-1}, Q)        F = e^{A d_t},  Q = int_0^{d_t} e^{A s} L L' e^{A' s} ds
 
-The coordinates are chosen so that the stationary distribution is N(0, I), that is A + A' + L L' = 0, and so that the
-noise of the coordinates is independent:
+In the chosen coordinates, the stationary distribution is N(0, I), that is A + A' + L L' = 0, and the noise of the
+coordinates is independent:
 
     A = S - diag(r)        L L' = 2 diag(r)        S' = -S,  r > 0
 
@@ -328,7 +328,7 @@ def _features(moved: Tensor, offset: Tensor | None, whitening: Tensor, before: T
 
 
 def transition(drift: Tensor, noise: Tensor, gaps: Tensor) -> tuple[Tensor, Tensor]:
-    """Return F = e^{A d} and Q = int_0^d e^{A s} N e^{A' s} ds, (K, D, D) each, of dz = A z dt + L dW over gaps d.
+    """Return F = e^{A d} and Q = int_0^d e^{A s} N e^{A' s} ds, (K, D, D) each, for dz = A z dt + L dW.
 
     It sums a series over d / 2^k and doubles k times: F(2d) = F(d)^2 and Q(2d) = Q(d) + F(d) Q(d) F(d)'. It stores F -
     I in place of F, so there is no cancellation, and both results are accurate for the shortest gaps. For stable A they
