@@ -576,14 +576,14 @@ def main(
     """Measure, and write the tables.
 
     Args:
-        data: motion file (bandai2.npz), for what has not been measured yet.
-        runs: directories of fitted runs, seeds of one fit; as many of residual-sup are fitted.
-        tuned: that of a run that was fitted on file group A.
-        out: where measurements are kept, under the name of each run.
-        page: where the tables stand; they are printed where none is named.
-        picture: of errors by time, and of completion.
+        data: motion file (bandai2.npz), required for new measurements.
+        runs: directories of fitted runs, one per seed; the study fits as many of residual-sup.
+        tuned: directory of a run fitted on file group A.
+        out: directory of the measurements, in a folder per run.
+        page: page of the tables; None prints them.
+        picture: file of the picture of errors over time and completions.
         parts: prediction, completion, uncertainty, tuning.
-        budget: what it may cost.
+        budget: limits of computation.
     """
     torch.set_num_threads(1)
     refuse_unknown("part", parts, PARTS)

@@ -51,16 +51,16 @@ SHOWN = ("CRPS", "energy score", "coverage 50 %", "coverage 80 %", "coverage 90 
 
 @dataclass(frozen=True)
 class Section:
-    """What is compared on one domain.
+    """Settings of the comparison on one domain.
 
     Args:
-        cases: method to `options` of it and of its `training`; the one without latents is among them.
-        training: of all runs.
-        forecast: of which steps, from which.
-        cut: of the sequences, for training and its validations; bounds are of whole sequences.
-        unit: of a step.
-        season: of the reference that repeats.
-        particles: of bounds.
+        cases: method name to its `options` and its `training` options; one method has no latents.
+        training: training options of all runs.
+        forecast: observed and predicted steps.
+        cut: windows for training and validation; bounds use whole sequences.
+        unit: name of a step.
+        season: period of the seasonal reference, in steps.
+        particles: number of particles of the bounds.
     """
 
     cases: Mapping[str, Mapping[str, Any]]
@@ -73,7 +73,7 @@ class Section:
 
 
 def section(told: Mapping[str, Any]) -> Section:
-    """What is compared on a domain, as the file has it."""
+    """Return the settings of one domain from the TOML file."""
     return Section(**{**told, **{name: Cut(**told[name]) for name in ("forecast", "cut") if name in told}})
 
 

@@ -1,11 +1,11 @@
-"""What the studies share: settings, fits and measurements that are made once, and rows of seeds with their errors.
+"""Shared code of the studies: settings, fits and measurements without repetition, and results over seeds with errors.
 
-A measurement is a dictionary, kept as JSON in the directory of its run. It, or each part of it that has a name, holds
-scores by row and sequence, the clip of each sequence, and its weight:
+A measurement is a dictionary, stored as JSON in the directory of its run. The measurement, or each of its named parts,
+contains scores by row and sequence, the clip of each sequence, and the weight of each sequence:
 
     {"clips": ["walk 1", "walk 2"], "weights": [3, 1], "rows": {"ours": {"ADE": [0.31, 0.28]}}}
 
-A `Row` is one row of what several seeds measured; scripts say in a dictionary which columns a table of rows has.
+A `Row` combines the measurements of several seeds. Scripts define the columns of a table of rows in a dictionary.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OURS, MEASURED = "ours", "measured.json"
 
 
 def settings(script: str) -> dict[str, Any]:
-    """What a script says in the TOML file of its name, with tuples in place of lists."""
+    """Return the settings of a script from the TOML file with the same name; lists become tuples."""
 
     def fixed(value: Any) -> Any:
         if isinstance(value, dict):
@@ -52,12 +52,12 @@ def settings(script: str) -> dict[str, Any]:
 
 
 def folder(name: Any) -> str:
-    """The directory of a section, a case or a row, by its name."""
+    """Return the directory name of a section, case or row."""
     return str(name).replace(", ", "-").replace(",", "").replace(" ", "-")
 
 
 def kept(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
-    """What is in a file; or what `measure` returns, which is written to it with the seconds of processor time."""
+    """Read a measurement from a file. If the file is missing, measure, and write the result with its processor time."""
     if not file.exists():
         begun = time.process_time()
         found = measure()
@@ -72,7 +72,7 @@ def kept(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]
 def measure(
     path: Path, cases: Iterable[str], seeds: Iterable[int], run: Callable[[str, int, Path], Any], file: str = MEASURED
 ) -> None:
-    """Fit and measure what is not there yet, seed by seed: `run` of a case, a seed and its directory."""
+    """Fit and measure all missing cases, seed by seed, by calling `run(case, seed, directory)`."""
     for seed, case in itertools.product(seeds, cases):
         out = path / f"{folder(case)}-{seed}"
         kept(out / file, partial(run, case, seed, out))
@@ -81,17 +81,17 @@ def measure(
 def fitted(
     method: Any, data: Any, train: Any, validation: Any = None, *, out: Path, seed: int, steps: int, **options: Any
 ) -> Fit:
-    """Fit a method, or continue its run, which may have ended.
+    """Fit a method, resume its run, or load the finished run.
 
     Args:
-        method: with its options.
-        data: what the run records.
-        train: windows, of these data or others that are drawn from them.
-        validation: windows by which the best weights are chosen; the last ones without.
+        method: method with its options.
+        data: data set that the run records.
+        train: training windows.
+        validation: windows that select the best weights; None uses the last weights.
         out: directory of the run.
-        seed: of weights and batches.
-        steps: of training.
-        options: further ones of training, or of `dvae.fit`.
+        seed: seed of weights and batches.
+        steps: number of training steps.
+        options: further options of training or of `dvae.fit`.
     """
     torch.manual_seed(seed)
     model, recipe = method.build(data.schema), method.train(train, validation, steps)
@@ -103,7 +103,7 @@ def fitted(
 def swept(
     row: str, method: Any, data: Any, runs: Path, seeds: Sequence[int], training: Any, jobs: int = 1
 ) -> list[Path]:
-    """The run directories of a method, by seed, each fitted once.
+    """Return the run directories of a method, one per seed; missing runs are fitted.
 
     Raises:
         RuntimeError: a run failed.
@@ -116,19 +116,19 @@ def swept(
 
 
 def scores_of(clips: Mapping[str, float], rows: Mapping[str, Any]) -> dict[str, Any]:
-    """A measurement of scores by clip, and how many windows each clip has."""
+    """Return a measurement from scores by clip and the number of windows of each clip."""
     return {"clips": [*clips], "weights": [*clips.values()], "rows": rows}
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of measurements, one for each seed.
+    """One row of a table: the measurements of all seeds.
 
     Args:
-        runs: the measurements.
-        name: of the row in them.
-        part: of them that has it; the whole without.
-        trained: whether seeds differ, as those of a reference do not.
+        runs: one measurement per seed.
+        name: name of the row in the measurements.
+        part: name of the part that contains the row; "" for the whole measurement.
+        trained: whether results depend on the seed; False for reference methods.
     """
 
     runs: Sequence[Mapping[str, Any]]
@@ -137,25 +137,25 @@ class Row:
     trained: bool = True
 
     def of(self, part: str) -> Row:
-        """The same row of a part."""
+        """Return the same row of another part."""
         return replace(self, part=part)
 
     @property
     def parts(self) -> list[Mapping[str, Any]]:
-        """Of each seed."""
+        """The part of the measurement of each seed."""
         return [run[self.part] if self.part else run for run in self.runs]
 
     def values(self, score: str) -> np.ndarray | None:
-        """(S, N), by seed and sequence; None where a seed does not have the score."""
+        """Return scores (S, N) by seed and sequence; None if the score is missing for a seed."""
         rows = [part["rows"].get(self.name, {}) for part in self.parts]
         return np.array([row[score] for row in rows], float) if all(score in row for row in rows) else None
 
     def by_seed(self, score: str) -> np.ndarray:
-        """(S,), means of a score that all have."""
+        """Return weighted means (S,) of a score."""
         return np.average(self.values(score), 1, self.parts[0]["weights"])
 
     def crossed(self, score: str, minus: Row | None = None) -> Crossed | None:
-        """A score by seed and clip, or what it is more than that of the same runs in another row; None without one."""
+        """Return a score by seed and clip, or its paired difference to another row; None if a score is missing."""
         values, others = self.values(score), 0.0 if minus is None else minus.values(score)
         if values is None or others is None:
             return None
@@ -172,41 +172,41 @@ class Row:
         return found if self.trained else replace(found, seeds=0.0, rest=0.0, count=sys.maxsize)
 
     def estimate(self, score: str, other: Row | None = None) -> Estimate | None:
-        """The mean, or its paired difference to another row of other runs; None where one does not have the score."""
+        """Return the mean, or its paired difference to a row of other runs; None if a score is missing."""
         own, theirs = self.crossed(score), None if other is None else other.crossed(score)
         return None if own is None or (other is not None and theirs is None) else own.estimate(theirs)
 
     def said(self, score: str, digits: int = 1) -> str:
-        """The mean with its errors over clips and over seeds."""
+        """Format the mean with its errors over clips and over seeds."""
         return said(self.estimate(score), digits)
 
     def numbers(self, name: str) -> str:
-        """One number of each run; see `spread`."""
+        """Format one number per run by `spread`."""
         return spread([run.get(name) for run in self.runs])
 
 
 class Archive:
-    """Measurements by name, in one compressed file that is the same for the same ones."""
+    """Measurements by name in one zip file; equal measurements give equal bytes."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
 
     @property
     def names(self) -> list[str]:
-        """Of what is in it, sorted; none before the first."""
+        """Sorted names of the measurements; empty if the file does not exist."""
         if not self.file.exists():
             return []
         with zipfile.ZipFile(self.file) as opened:
             return sorted(opened.namelist())
 
     def read(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        """Measurements, whose clips are stored with their windows."""
+        """Return measurements; the file stores the number of windows of each clip."""
         with zipfile.ZipFile(self.file) as opened:
             found = [json.loads(opened.read(name)) for name in names]
         return [each | {"clips": [*each["clips"]], "weights": [*each["clips"].values()]} for each in found]
 
     def add(self, name: str, measurement: Mapping[str, Any]) -> None:
-        """Beside what there is; `clips` are of the form clip: windows."""
+        """Add a measurement, whose `clips` map each clip to its number of windows."""
         contents = {name: json.dumps(measurement, separators=(",", ":")).encode()}
         if self.file.exists():
             with zipfile.ZipFile(self.file) as opened:
@@ -217,37 +217,37 @@ class Archive:
 
 
 def read(path: Path, cases: Iterable[str], file: str = MEASURED) -> dict[str, Row]:
-    """Cases of which there are measurements, each of all its seeds."""
+    """Return the measured cases, each with all its seeds."""
     files = {case: sorted(path.glob(f"{folder(case)}-[0-9]*/{file}")) for case in cases}
     return {case: Row([json.loads(each.read_text()) for each in found]) for case, found in files.items() if found}
 
 
 def read_all(path: Path, name: str) -> Row | None:
-    """What all runs measured under one name; None where none did."""
+    """Return the measurements with one name of all runs; None if there are none."""
     found = [json.loads(file.read_text()) for file in sorted(path.glob(f"*/{name}.json"))]
     return Row(found) if found else None
 
 
 def budget(rows: Iterable[Row], steps: int) -> str:
-    """What the fits took, in a sentence."""
+    """Return a sentence about the training steps and the processor time of the fits."""
     seconds = [run["seconds"] for row in rows for run in row.runs]
     return f"{steps} steps of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
 
 
 def said(found: Estimate | None, digits: int = 1) -> str:
-    """Mean, and its errors over clips and over seeds; a dash for what is unknown."""
+    """Format a mean and its errors over clips and over seeds; a dash marks unknown numbers."""
     values = () if found is None else (found.mean, found.sequences, found.seeds)
     return " ± ".join("–" if np.isnan(value) else f"{value:.{digits}f}" for value in values) or "–"
 
 
 def cell(found: Estimate | None) -> str:
-    """The same with as many digits as the errors have, and without that over seeds of what is not trained."""
+    """Format an estimate with digits chosen by its errors; rows without training have no error over seeds."""
     text = "–" if found is None else str(found)
     return text.rpartition(" ± ")[0] if found is not None and not found.seeds else text
 
 
 def interval(found: Estimate | None, digits: int = 1, *, alone: bool = False) -> str:
-    """The interval of 95 % from both errors, or, with `alone`, from that over clips where there is one seed."""
+    """Format the 95 % interval from both errors; with `alone` and one seed, from the error over clips."""
     if found is None or (np.isnan(found.total) and not alone):
         return "–"
     low, high = found.interval(error="sequences" if np.isnan(found.total) else "total")
@@ -255,7 +255,7 @@ def interval(found: Estimate | None, digits: int = 1, *, alone: bool = False) ->
 
 
 def spread(values: Sequence[float | None], digits: int = 2) -> str:
-    """The mean, and in brackets the least and the greatest; a dash where one is unknown."""
+    """Format the mean with minimum and maximum in brackets; a dash if a value is unknown."""
     known = [value for value in values if value is not None]
     if len(known) < len(values) or not known:
         return "–"

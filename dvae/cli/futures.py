@@ -153,7 +153,7 @@ def _completed(
     if not isinstance(loaded.model, TrajectoryModel):
         raise UsageError(f"{loaded.path} holds {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
     if paths.exact and not (paths.joints or paths.paths):
-        raise UsageError("--exact has motions follow paths; say which, by --joints or --paths")
+        raise UsageError("--exact requires paths; give them by --joints or --paths")
     positions = windows.positions(windows.all().mask_to_nan()).numpy()
     chosen = _liveliest(positions, paths.window)
     pose, truth = positions[chosen, 0], positions[chosen, 1:]

@@ -25,7 +25,7 @@ class Batch(dict[str, Any]):
 
     reserved: ClassVar[tuple[str, ...]] = ("lengths", "mask", "group", "log_det", "beside")
     reader: Any = None
-    """Reader that validated the batch and will not read it again (`DynamicalVAE.read`); None after a change."""
+    """Mark of the model that has read the batch and need not read it again; None after an entry was set."""
 
     @property
     def lengths(self) -> Any:
@@ -104,6 +104,15 @@ class Batch(dict[str, Any]):
     def __setitem__(self, name: str, value: Any) -> None:
         self.reader = None
         super().__setitem__(name, value)
+
+    def update(self, *others: Any, **values: Any) -> None:
+        """Set entries, as `dict.update` does."""
+        self.reader = None
+        super().update(*others, **values)
+
+    def __ior__(self, other: Any) -> Batch:  # type: ignore[override]
+        self.update(other)
+        return self
 
     def __or__(self, other: Any) -> Batch:  # type: ignore[override]
         return Batch({**self, **other})

@@ -96,10 +96,9 @@ class View:
             return log_det
         if WHOLE not in data or log_det.shape != data[WHOLE].shape:
             raise ValueError(
-                f"{self} changes volume by a log_det {tuple(log_det.shape)}, of data with "
-                f"{' and '.join(n for n in ('lengths', 'mask') if n in data) or 'all their entries'}; it is (B,) of "
-                "complete sequences, or "
-                "(B, T, D) by entry of x, of which those that are missing or padding do not count"
+                f"log_det of {self} has shape {tuple(log_det.shape)}, for data with "
+                f"{' and '.join(n for n in ('lengths', 'mask') if n in data) or 'all entries'}; expected (B,) for "
+                "complete sequences, or (B, T, D) with a value for each entry of x"
             )
         if (mask := data.mask()) is not None:
             log_det = torch.where(mask, log_det, 0.0)
@@ -303,7 +302,7 @@ class Past(View):
         if WHOLE not in data or self.name in data or beside is not None:
             return data
         if data.lengths is not None:
-            raise ValueError("windows that go on from their first frames have one length; leave 'lengths' out")
+            raise ValueError("a view with `Past` requires windows of one length; remove 'lengths' from the batch")
         whole, masks, now = data[WHOLE], data.masks(), self.frames
         if whole.shape[1] < now:
             raise ValueError(f"this model goes on from {now} frames, and was given {whole.shape[1]}")

@@ -294,15 +294,23 @@ class GSPSModel(EnergyModel):
     def impute(
         self, batch: AnyBatch, samples: int = 1, *, draw: bool | None = None, **options: Any
     ) -> dict[str, Tensor]:
-        """Whole windows with their gaps filled in, S times, by the motion that is nearest to all that was observed.
+        """Fill missing entries of whole windows, S times, by the drawn motion nearest to all observed entries.
 
-        Ours, as there is no guide that reads what is behind a gap. Each filling is from as many draws as in training,
-        of which the best is what the model learns to have near the truth. Across a gap it is moved so that it meets
-        what was observed at both ends: by its errors there, on a straight line in time. `draw` changes nothing, as
-        the emission has no noise.
+        The paper has no such method, and the model has no guide that reads observations after a gap. Each sample is the
+        best of as many draws as in training. Inside a gap, a linear correction in time removes the errors at both ends.
+        `draw` has no effect, because the emission has no noise.
+
+        Args:
+            batch: whole windows x (B, T, D) with a mask.
+            samples: S.
+            draw: ignored.
+            options: options of `DynamicalVAE.impute`.
+
+        Returns:
+            {"x": (S, B, T, D)}.
 
         Raises:
-            ValueError: a batch without a mask, or windows of another length than the networks make.
+            ValueError: if the batch has no mask, or the windows have another length than the model.
         """
         if not isinstance(batch, Mapping) or (mask := Batch(batch).mask()) is None:
             return super().impute(batch, samples, **options)  # which says so

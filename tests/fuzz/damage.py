@@ -1,4 +1,4 @@
-"""Damage to bytes and to arrays: hypothesis draws it, and it is done."""
+"""Damage to bytes and to arrays: strategies that draw it and functions that apply it."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -9,9 +9,9 @@ VALUES = st.sampled_from([0.0, 0.5, -1.0, 3.0, 99.0, 1e3, 1e-320, 1e300, np.nan,
 
 
 def edits(words=(), most=3):
-    """Where bytes are taken out, how many (None: as many as are put in), and what is put in.
+    """Draw edits (place, number of removed bytes, inserted bytes); None removes as many bytes as are inserted.
 
-    A place is a share of all, or is counted from the end, where a zip lists what it holds.
+    A place is a share of the length, or a negative number that counts from the end, where a zip has its directory.
     """
     put = st.binary(max_size=8) | st.sampled_from(words) if words else st.binary(max_size=8)
     counts = st.none() | st.integers(0, 40) | st.just(2**40)
@@ -26,7 +26,7 @@ def edited(content, changes):
 
 
 def array_changes(names, lengths):
-    """Of arrays by their names: others put in the place of some, values, types, and some that are dropped."""
+    """Draw changes of named arrays: replace or drop an array, fill it with a value, or change its type."""
     shapes = st.lists(lengths, max_size=5).filter(lambda shape: np.prod([max(n, 1) for n in shape]) < 10**6)
     numbers = st.integers(0, 9)
     one = st.one_of(

@@ -32,7 +32,7 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
     if local.ndim != 2 or not local.size or longest < 1:
         raise ValueError(f"local costs have shape {local.shape} for at most {longest} frames; expected (M, F), none 0")
     if np.isnan(local).any():
-        raise ValueError(f"{np.isnan(local).sum()} of the local costs are NaN; leave out frames that lack joints")
+        raise ValueError(f"{np.isnan(local).sum()} of the local costs are NaN; remove frames with missing joints")
     (rows, frames), steps = local.shape, local.shape[0] + longest - 1
     # Cell (i, k) of start s is on diagonal d = i + k, where local[i, s + k] is ahead[i, s + d].
     ahead = np.full((rows, frames + steps), np.inf)

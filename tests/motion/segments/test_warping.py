@@ -48,7 +48,7 @@ def test_a_pace_within_its_limits_is_found():
 def test_what_cannot_be_warped_is_refused():
     with pytest.raises(ValueError, match="expected \\(M, F\\), none 0"):
         subsequence_costs(np.zeros((0, 4)), 3)
-    with pytest.raises(ValueError, match="leave out frames that lack joints"):
+    with pytest.raises(ValueError, match="remove frames with missing joints"):
         subsequence_costs(np.full((2, 4), np.nan), 3)
     with pytest.raises(ValueError, match="cannot be warped onto 4 at a pace"):
         alignment(np.zeros((4, 20)))
