@@ -1,17 +1,17 @@
 """Fuzzing by the clock: hypothesis draws examples, at least one, until a test's share of the time is over.
 
-All tests of this directory together take DVAE_FUZZ_SECONDS (10 where it is not set), each in proportion to the share
-that it names; shares add up to 60. DVAE_FUZZ_SEED (0) decides which examples are tried, in which order; time decides
-how far one gets.
+All tests of this directory together take DVAE_FUZZ_SECONDS (15 where it is not set), each in proportion to the share
+that it names. DVAE_FUZZ_SEED (0) decides which examples are tried, in which order; time decides how far one gets.
 
     def test_sums_are_symmetric():
         fuzz(lambda pair: check(*pair), st.tuples(st.integers(), st.integers()), seconds=5)
 
-A check that may be killed, hang or take all memory goes to another process, which all of them share:
+A check that may be killed, hang or take all memory goes to a process of its own:
 
     @limited(5)
     def test_files_are_read_or_refused(tmp_path):
-        fuzz(Isolated(read, tmp_path), files(), seconds=5)  # read(example, tmp_path), a function of a module
+        with Isolated(read, tmp_path) as isolated:  # read(example, tmp_path), a function of a module
+            fuzz(isolated, files(), seconds=5)
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from hypothesis.strategies import SearchStrategy
 
 Example = TypeVar("Example")
 
-SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "10"))
+SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "15"))
 """Of all tests together."""
 
 SEED = int(os.environ.get("DVAE_FUZZ_SEED", "0"))
@@ -99,7 +99,7 @@ def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], se
 
 
 class Isolated:
-    """A check in another process, which may fail, die or hang without taking the test along.
+    """A check in a process of its own, which may fail, die or hang without taking the test along.
 
     Beyond the check itself, a call must not hang or take more than `LARGEST` bytes; it ends by no signal,
     with no exception but `EXPECTED`, and opens nothing for writing outside its directory.
@@ -109,17 +109,22 @@ class Isolated:
         directory: the only one that may be written to.
     """
 
-    _process: Any = None
-    _pipe: Any = None
-    _loaded: Any = None
-
     def __init__(self, check: Callable[[Any, Path], None], directory: Path):
         self._check, self._directory = check, directory.resolve()
+        self._process: Any = None
+        self._pipe: Any = None
+
+    def __enter__(self) -> Isolated:
+        self._start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()
 
     def __call__(self, example: Any) -> None:
-        if self._loaded is not self:
-            self._load()
-        self._pipe.send(("example", example))
+        if self._process is None:
+            self._start()
+        self._pipe.send(example)
         try:
             if not self._pipe.poll(HANG):
                 self._stop()
@@ -133,45 +138,38 @@ class Isolated:
         if failure is not None:
             raise AssertionError(failure)
 
-    def _load(self) -> None:
-        if self._process is None:
-            context = multiprocessing.get_context("spawn")
-            Isolated._pipe, there = context.Pipe()
-            Isolated._process = context.Process(target=_serve, args=(there,), daemon=True)
-            self._process.start()
-            there.close()
-        self._pipe.send(("check", self._check, self._directory))
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, there = context.Pipe()
+        self._process = context.Process(target=_serve, args=(there, self._check, self._directory), daemon=True)
+        self._process.start()
+        there.close()
         if not self._pipe.poll(120) or self._pipe.recv() != "ready":
             self._stop()
             raise AssertionError("the process that checks did not start")
-        Isolated._loaded = self
 
-    @classmethod
-    def _stop(cls) -> None:
-        if cls._process is not None:
-            cls._process.kill()
-            cls._process.join()
-            cls._process.close()
-            cls._pipe.close()
-            cls._process = cls._loaded = None
+    def _stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._process.close()
+            self._pipe.close()
+            self._process = None
 
 
-def _serve(pipe: Any) -> None:
+def _serve(pipe: Any, check: Callable[[Any, Path], None], directory: Path) -> None:
     sys.dont_write_bytecode = True
-    watched: list[Path] = []
-    _watch(watched)
+    pipe.send("ready")
+    watched = False
     while True:
         try:
-            kind, *content = pipe.recv()
+            example = pipe.recv()
         except EOFError:
             return
-        if kind == "check":
-            check, directory = content
-            pipe.send("ready")
-            continue
-        (example,) = content
-        _bound_memory()
-        watched.append(directory)  # while it checks: what imports the check opens files of its own
+        if not watched:  # from here on: what starts a process opens files of its own
+            _bound_memory()
+            _watch(directory)
+            watched = True
         failure = None
         try:
             check(example, directory)
@@ -179,7 +177,6 @@ def _serve(pipe: Any) -> None:
             failure = None if str(error) else f"{type(error).__name__} without a word\n{traceback.format_exc()}"
         except BaseException:
             failure = traceback.format_exc()
-        watched.clear()
         pipe.send(failure)
 
 
@@ -191,11 +188,11 @@ def _bound_memory() -> None:
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * os.sysconf("SC_PAGE_SIZE") + LARGEST
-    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
-def _watch(directories: list[Path]) -> None:
-    """Let nothing outside a directory, where one is given, be written, and nothing be run."""
+def _watch(directory: Path) -> None:
+    """Let nothing outside a directory be written, and nothing be run."""
     changes = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod"}
     runs = {"os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "ctypes.dlopen"}
     writing = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -204,11 +201,9 @@ def _watch(directories: list[Path]) -> None:
         if not isinstance(path, str | bytes | os.PathLike):
             return False
         real = os.path.realpath(os.fsdecode(path))
-        return real != os.devnull and os.path.commonpath([real, directories[0]]) != str(directories[0])
+        return real != os.devnull and os.path.commonpath([real, directory]) != str(directory)
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
-        if not directories:
-            return
         if event in runs:
             raise AssertionError(f"runs something: {event} {arguments}")
         if event == "open" and arguments[2] & writing and outside(arguments[0]):

@@ -43,7 +43,7 @@ def check(example):
     torch.testing.assert_close(*gradients, rtol=1e-8, atol=1e-8)
 
 
-@limited(12)
+@limited(15)
 def test_the_bound_and_its_gradient_are_those_of_the_dense_gaussian():
     examples = st.tuples(
         factorizations(),
@@ -53,4 +53,4 @@ def test_the_bound_and_its_gradient_are_those_of_the_dense_gaussian():
         st.sampled_from([0.0, 0.5, 1.0]),
         st.booleans(),
     )
-    fuzz(check, examples, seconds=12)
+    fuzz(check, examples, seconds=15)

@@ -1,5 +1,7 @@
 """Files of what somebody has seen of segments: read, or refused in a sentence, whatever is in them."""
 
+import warnings
+
 import numpy as np
 from hypothesis import strategies as st
 
@@ -10,14 +12,29 @@ from dvae.motion.segments.embodied import SHAPE, SegmentSchema
 from dvae.motion.segments.frames import TimedFrames
 from dvae.motion.segments.recovery import LARGEST, MOST, read_seen
 
-from .damage import array_changes, changed, edited, edits
 from .engine import Isolated, fuzz, limited
+from .test_archives import mutate_bytes, of_bytes, places
 
-SHARE = 4
-KINDS = [(SURFACES, TIMES), (POINTS, TIMES), (SPOTS, TIMES), (POINTS, SPOTS, FRAMES), (SPOTS, SHAPE, FRAMES)]
+SHARE = 5
+
+values = st.sampled_from([0.0, 0.5, -1.0, 3.0, 99.0, 1e3, 1e300, np.nan, np.inf])
 lengths = st.sampled_from([0, 1, 2, 3, 16, 8, 100, MOST + 1])
-changes = array_changes([TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE, "x"], lengths)
-observations = st.tuples(st.sampled_from(KINDS), changes, edits(most=2))
+shapes = st.lists(lengths, max_size=5).filter(lambda shape: np.prod([max(n, 1) for n in shape]) < 10**6)
+dtypes = st.sampled_from(["f4", "f8", "f2", "i8", "u1", "U3", "S3", "?", "c8", "M8[D]"])
+changes = st.one_of(
+    st.tuples(st.just("put"), st.sampled_from([TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE, "x"]), shapes, dtypes),
+    st.tuples(st.just("fill"), st.integers(0, 9), places, values),
+    st.tuples(st.just("drop"), st.integers(0, 9), places, values),
+    st.tuples(st.just("cast"), st.integers(0, 9), places, dtypes),
+)
+observations = st.tuples(
+    st.sampled_from(
+        [(SURFACES, TIMES), (POINTS, TIMES), (SPOTS, TIMES), (POINTS, SPOTS, FRAMES), (SPOTS, SHAPE, FRAMES)]
+    ),
+    st.lists(changes, max_size=3),
+    st.lists(of_bytes, max_size=2),
+)
+
 
 SKELETON = bodies.fitted(simulate(clips=1, frames=30, seed=1), bodies.human()).skeleton
 MODEL = MotionLatent(latent=2, widths=(4,)).build(SegmentSchema.under(TimedFrames(SKELETON), bodies.human())).eval()
@@ -33,11 +50,30 @@ def seen(names, many=2, moments=3):
     return found | ({SHAPE: np.zeros((many, 8))} if SHAPE in names else {})
 
 
+def changed(arrays, changes):
+    for kind, first, second, third in changes:
+        names = sorted(arrays)
+        if kind == "put":
+            arrays[first] = np.zeros(second, third)
+        elif not names:
+            continue
+        elif kind == "drop":
+            del arrays[names[first % len(names)]]
+        elif kind == "cast":
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of numbers that are complex no more
+                arrays[names[first % len(names)]] = arrays[names[first % len(names)]].astype(third)
+        elif (array := arrays[names[first % len(names)]]).size and array.dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                array.reshape(-1)[int(second * array.size) :] = third
+    return arrays
+
+
 def read_changed(example, directory):
     names, changes, of_file = example
     path = directory / "seen.npz"
     np.savez_compressed(path, **changed(seen(names), changes))
-    path.write_bytes(edited(path.read_bytes(), of_file))
+    path.write_bytes(mutate_bytes(path.read_bytes(), of_file))
     try:
         found = read_seen(path, MODEL)
     except ValueError as error:
@@ -55,11 +91,12 @@ def read_changed(example, directory):
 
 
 def test_what_is_not_changed_is_read(tmp_path):
-    for names in KINDS:
+    for names in ((SURFACES, TIMES), (POINTS, SPOTS, FRAMES), (SPOTS, SHAPE, FRAMES)):
         np.savez(tmp_path / "seen.npz", **seen(names))
         assert read_seen(tmp_path / "seen.npz", MODEL).keys() == {*names}
 
 
 @limited(SHARE)
 def test_changed_observations_are_read_or_refused(tmp_path):
-    fuzz(Isolated(read_changed, tmp_path), observations, SHARE)
+    with Isolated(read_changed, tmp_path) as isolated:
+        fuzz(isolated, observations, SHARE)

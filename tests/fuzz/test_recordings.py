@@ -3,6 +3,7 @@
 import io
 import shutil
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -10,19 +11,21 @@ import roma  # noqa: F401, it makes folders as it is imported, which what is wat
 from c3d import write_c3d
 from hypothesis import strategies as st
 
-from dvae.motion import read_motion, simulate, write_motion
+from dvae.motion import MotionSet, read_motion, simulate, write_motion
 from dvae.motion.files.amc import SUBJECT_02
 from dvae.motion.geometry.skeleton import is_name
 
-from .damage import array_changes, changed, edited, edits
 from .engine import Isolated, fuzz, limited
+from .test_tables import edited
 
-SHARE = 4
-WORDS = [b"0", b"-1", b"1e308", b"1e-320", b"nan", b"inf", b"9" * 30, b"}", b"{", b"\n", b" ", b"\0", b"JOINT x\n"]
+SHARE = 3
+MUTATIONS = 100
+"""Of each format, at the least."""
 
 
 def bvh(folder):
-    write_motion(folder / "a.bvh", simulate(1, 3).with_rotations())
+    people = simulate(1, 3).with_rotations()
+    write_motion(folder / "a.bvh", people)
 
 
 def amc(folder):
@@ -40,11 +43,11 @@ def expmap(folder):
 
 
 def csv(folder):
-    write_motion(folder / "a.csv", simulate(1, 3))
+    write_motion(folder / "a.csv", MotionSet(simulate(1, 3).clips, simulate(1, 3).skeleton))
 
 
 def amass(folder):
-    write_motion(folder / "a.npz", simulate(1, 3), "amass")
+    write_motion(folder / "a.npz", MotionSet(simulate(1, 3).clips, simulate(1, 3).skeleton), "amass")
 
 
 def c3d(folder):
@@ -70,12 +73,12 @@ def test_what_was_not_changed_is_read(format, tmp_path):
 
 
 def read_changed(example, directory):
-    content, original, path = example
-    for file in original.parent.iterdir():
+    content, changed, path = example
+    for file in (directory / changed).parent.iterdir():
         (directory / "now").mkdir(exist_ok=True)
         shutil.copyfile(file, directory / "now" / file.name)
     where = directory / "now" / path
-    where.with_name(original.name).write_bytes(content)
+    where.with_name(changed.name).write_bytes(content)
     sentence = ""
     try:
         read_motion(where)
@@ -86,69 +89,173 @@ def read_changed(example, directory):
     assert is_name(sentence[:1000]), f"{sentence!r} has control characters"
 
 
+@pytest.fixture(scope="module")
+def isolated(tmp_path_factory):
+    with Isolated(read_changed, tmp_path_factory.mktemp("recordings")) as process:
+        yield process
+
+
+WORDS = [
+    b"0",
+    b"-1",
+    b"1e308",
+    b"1e-320",
+    b"nan",
+    b"inf",
+    b"9" * 30,
+    b"}",
+    b"{",
+    b"\n",
+    b" ",
+    b"\0",
+    b"\xff\xfe",
+    b"JOINT x\n",
+]
+
+
+def mutations(content, random):
+    """Bytes changed, cut, repeated; words put in the place of others; the end left away."""
+    text = content.split(b" ")
+    kind = random.integers(6)
+    if kind == 0:
+        found = bytearray(content)
+        for _ in range(random.integers(1, 8)):
+            found[random.integers(len(found))] = random.integers(256)
+        return bytes(found)
+    if kind == 1:
+        return content[: random.integers(len(content))]
+    if kind == 2:
+        start, end = sorted(random.integers(len(content), size=2))
+        return content[:start] + content[end:]
+    if kind == 3:
+        start, end = sorted(random.integers(len(content), size=2))
+        return content[:end] + content[start:end] * int(random.integers(1, 4)) + content[end:]
+    for _ in range(random.integers(1, 4)):
+        text[random.integers(len(text))] = WORDS[random.integers(len(WORDS))]
+    return b" ".join(text)
+
+
+def zipped(content, random):
+    """An npz of which one member is changed before it is zipped: its bytes, or values, shape and kind of its array."""
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    read = [name for name in members if name not in ("betas.npy", "gender.npy")]
+    name = read[random.integers(len(read))]
+    kind = random.integers(8)
+    if kind == 0:
+        members[name] = mutations(members[name], random)
+    elif kind == 1:
+        members[name] = members[read[random.integers(len(read))]]
+    elif kind == 2:
+        members[f"{name[:-4]}{random.integers(9)}.npy"] = members.pop(name)
+    else:
+        array, new = np.load(io.BytesIO(members[name])).copy(), io.BytesIO()
+        if kind < 6:
+            values = [np.nan, np.inf, -1e308, 1e-320, 1e6, -1.0, 0.0, np.pi]
+            some = random.random(array.shape) < (1 if array.ndim == 0 else random.random())
+            array = np.where(some, values[random.integers(len(values))], array)
+        elif kind == 6:
+            array = array.astype(["i8", "f2", "f4", "U3", "?", "c16", "S2"][random.integers(7)])
+        else:
+            shapes = [array[:1], array[..., :1], array[None], array.ravel(), array.T] if array.ndim else [array[None]]
+            array = shapes[random.integers(len(shapes))]
+        np.save(new, array)
+        members[name] = new.getvalue()
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as file:
+        for name, member in members.items():
+            file.writestr(name, member)
+    return made.getvalue()
+
+
+@pytest.mark.parametrize("format", SAMPLES)
+def test_changed_files_are_read_or_refused(format, isolated, tmp_path):
+    changed, path = small(format, tmp_path)
+    content, random = changed.read_bytes(), np.random.default_rng(0)
+    for number in range(MUTATIONS):
+        change = zipped if format == "amass" and number % 5 else mutations
+        isolated((change(content, random), changed, path.name))
+
+
+def test_most_changed_archives_reach_the_reader_of_their_arrays(tmp_path):
+    changed, path = small("amass", tmp_path)
+    content, random, said = changed.read_bytes(), np.random.default_rng(0), []
+    for _ in range(100):
+        changed.write_bytes(zipped(content, random))
+        try:
+            read_motion(path)
+        except ValueError as error:
+            said.append(str(error))
+    assert len(said) > 30
+    assert sum("damaged" in sentence or "npy" in sentence for sentence in said) < len(said) / 3
+
+
+edits = st.lists(
+    st.tuples(
+        st.floats(0, 1, exclude_max=True), st.integers(0, 12), st.one_of(st.binary(max_size=3), st.sampled_from(WORDS))
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
 @limited(SHARE)
-def test_damaged_files_are_read_or_refused(tmp_path):
+def test_edited_files_are_read_or_refused(isolated, tmp_path):
     there = {}
     for format in SAMPLES:
         (tmp_path / format).mkdir()
-        original, path = small(format, tmp_path / format)
-        there[format] = original.read_bytes(), original, path.name
-    arrays, check = dict(np.load(tmp_path / "amass" / "a.npz")), Isolated(read_changed, tmp_path)
-
-    def damage(example):
-        format, of_arrays, of_bytes = example
-        content, *rest = there[format]
-        if of_arrays:
-            file = io.BytesIO()
-            np.savez(file, **changed(arrays, of_arrays))
-            content = file.getvalue()
-        check((edited(content, of_bytes), *rest))
-
-    lengths = st.sampled_from([0, 1, 2, 3, 22, 66, 100])
-    with_arrays = st.tuples(st.just("amass"), array_changes(sorted(arrays), lengths), edits(most=1))
-    fuzz(damage, st.tuples(st.sampled_from(sorted(SAMPLES)), st.just(()), edits(WORDS, 4)) | with_arrays, SHARE)
+        changed, path = small(format, tmp_path / format)
+        there[format] = changed.read_bytes(), changed, path.name
+    examples = st.tuples(st.sampled_from(list(there)), edits)
+    fuzz(lambda of: isolated((edited(there[of[0]][0], of[1]), *there[of[0]][1:])), examples, SHARE)
 
 
 @pytest.mark.parametrize(
     ("old", "new"),
     [
         (b"Frames: 3", b"Frames: 999999999999"),
+        (b"Frames: 3", b"Frames: 1e300"),
         (b"OFFSET 0.0", b"OFFSET " + b"9" * 10**6),
         (b"JOINT LHip", b"JOINT x\n{\n" * 5000),
+        (b"CHANNELS 6", b"CHANNELS " + b"9" * 10**5),
     ],
-    ids=["frames", "digits", "joints"],
+    ids=["frames", "fewer frames", "digits", "joints", "channels"],
 )
-def test_what_is_announced_takes_no_memory(old, new, tmp_path):
-    original, path = small("bvh", tmp_path)
-    content = original.read_bytes()
+def test_what_is_announced_takes_no_memory(old, new, isolated, tmp_path):
+    changed, path = small("bvh", tmp_path)
+    content = changed.read_bytes()
     assert old in content
-    Isolated(read_changed, tmp_path)((content.replace(old, new, 1), original, path.name))
-    original.write_bytes(content.replace(old, new, 1))
+    isolated((content.replace(old, new, 1), changed, path.name))
+    changed.write_bytes(content.replace(old, new, 1))
     with pytest.raises(ValueError, match=r"a\.bvh"):
-        read_motion(original)
+        read_motion(changed)
 
 
-def test_parameters_without_end_take_no_time(tmp_path):
+def test_parameters_without_end_take_no_time(isolated, tmp_path):
     """Eight megabytes of them: time that grows with their square would be a minute."""
-    original, path = small("c3d", tmp_path)
-    content = original.read_bytes()
+    changed, path = small("c3d", tmp_path)
+    content = changed.read_bytes()
     one = struct.pack("<bb", 1, 1) + b"A" + struct.pack("<h", 8) + struct.pack("<bBBB", -1, 2, 1, 1) + b"x\0"
     first = content.index(b"\x04\x01USED")
     for blocks in (0, 1, 255):
         head = content[:514] + bytes([blocks]) + content[515:first]
-        changed = head + one * (2**23 // len(one)) + content[first:]
-        Isolated(read_changed, tmp_path)((changed, original, path.name))
+        isolated((head + one * (2**23 // len(one)) + content[first:], changed, path.name))
 
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
         ("poses", np.zeros((3, 65)), r"poses \(3, 65\), trans \(3, 3\), expected"),
+        ("poses", np.zeros((2, 156)), r"poses \(2, 156\)"),
+        ("poses", np.zeros(3), "expected"),
         ("poses", np.full((3, 66), np.nan), "poses holds float64, expected numbers, none NaN"),
         ("poses", np.full((3, 66), "a"), "poses holds <U1"),
         ("poses", np.full((3, 66), 1e30), "no metre, radian or rate"),
+        ("trans", np.zeros((0, 3)), r"trans \(0, 3\)"),
+        ("trans", np.full((3, 3), np.inf), "trans holds"),
         ("offsets", np.zeros((3, 3)), r"offsets \(3, 3\), expected \(22, 3\)"),
         ("offsets", np.zeros((22, 3)), "a person of"),
+        ("mocap_framerate", np.zeros(()), "needs mocap_framerate"),
         ("mocap_framerate", np.array([30, 30]), "needs mocap_framerate"),
         ("mocap_framerate", np.array("30"), "mocap_framerate holds"),
     ],

@@ -1,13 +1,12 @@
 """Run directories that somebody else made: a run goes on, or is refused in a sentence, whatever lies in them."""
 
 import contextlib
-import functools
 import hashlib
 import io
 import json
 import math
-import operator
 import os
+import pickle
 import shutil
 import warnings
 from pathlib import Path
@@ -17,6 +16,7 @@ import lightning_fabric  # noqa: F401  # before anything is watched
 import matplotlib.figure  # noqa: F401
 import torch
 from hypothesis import strategies as st
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 import dvae
@@ -27,12 +27,23 @@ from dvae.motion.data.dataset import MotionData
 from dvae.motion.segments.dataset import SegmentData
 from dvae.runs import directory as runs
 
-from .damage import edited, edits
 from .engine import Isolated, fuzz, limited
 
-SHARE = 13
+SHARE = 15
 FILES = (CONFIG, STATE, BEST, LAST, OPTIMISER, "log.jsonl", "evaluation.json", ".lock")
 FILES += (f"{STATE}.new", f"{LAST}.new", f"{OPTIMISER}.new", f"{CONFIG}.new")
+NOTHING_LEFT = (
+    SafetensorError,
+    pickle.UnpicklingError,
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+)
+"""Of a change to what an earlier one has already broken."""
 LAST_OF_ALL = ("longer", "link", "special")
 """Changes after which a file can no longer be read here either."""
 TARGETS = ("mine.txt", "nowhere", "fifo")
@@ -51,13 +62,15 @@ def values():
 
 
 def mutations():
-    places, binary = st.integers(0, 2**20), st.sampled_from([BEST, LAST, OPTIMISER])
+    places, byte = st.integers(0, 2**20), st.integers(0, 255)
+    binary = st.sampled_from([BEST, LAST, OPTIMISER])
     return st.one_of(
         st.tuples(st.just("value"), st.sampled_from([CONFIG, STATE]), places, values()),
         st.tuples(st.just("value"), st.just(CONFIG), places, values()),
         st.tuples(st.just("without"), st.sampled_from([CONFIG, STATE]), places),
-        st.tuples(st.just("bytes"), st.sampled_from([CONFIG, STATE, "log.jsonl"]), edits(), st.just(False)),
-        st.tuples(st.just("bytes"), binary, edits(), st.booleans()),
+        st.tuples(st.just("text"), st.sampled_from([CONFIG, STATE, "log.jsonl"]), places, st.binary(max_size=20)),
+        st.tuples(st.just("bytes"), binary, st.lists(st.tuples(places, byte), min_size=1, max_size=4), st.booleans()),
+        st.tuples(st.just("shorter"), binary, places, st.booleans()),
         st.tuples(st.just("longer"), st.sampled_from(FILES[:6]), st.sampled_from([1, 2**20, 2**36]), st.booleans()),
         st.tuples(st.just("link"), st.sampled_from(FILES), st.sampled_from(TARGETS)),
         st.tuples(st.just("special"), st.sampled_from(FILES), st.sampled_from(["fifo", "directory", "nothing"])),
@@ -70,9 +83,12 @@ DAMAGES = {
     "infinite": lambda value: value * math.inf,
     "huge": lambda value: value * 0 + 3e38,
     "negative": lambda value: -value - 1,
+    "whole": lambda value: value.long(),
     "complex": lambda value: value.to(torch.complex64),
+    "bfloat16": lambda value: value.to(torch.bfloat16),
     "bytes": lambda value: value.to(torch.uint8),
     "empty": lambda value: value.flatten()[:0],
+    "flat": lambda value: value.flatten(),
     "missing": None,
 }
 
@@ -81,6 +97,12 @@ def paths(value: Any, before: tuple = ()) -> list[tuple]:
     """The keys that lead to every value of a nest of dicts and lists."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path for key, each in inner for path in [(*before, key), *paths(each, (*before, key))]]
+
+
+def at(value: Any, path: tuple) -> Any:
+    for key in path:
+        value = value[key]
+    return value
 
 
 def commit(run: Path, name: str, content: bytes, signed: bool) -> None:
@@ -97,15 +119,26 @@ def mutate(run: Path, kind: str, *arguments: Any) -> None:
         name, place, *new = arguments
         content = json.loads((run / name).read_text())
         *to, last = (found := paths(content))[place % len(found)]
-        inner = functools.reduce(operator.getitem, to, content)
         if new:
-            inner[last] = new[0]
+            at(content, tuple(to))[last] = new[0]
         else:
-            del inner[last]
+            del at(content, tuple(to))[last]
         (run / name).write_text(json.dumps(content))
+    elif kind == "text":
+        name, place, text = arguments
+        content = (run / name).read_bytes()
+        place %= len(content)
+        (run / name).write_bytes(content[:place] + text + content[place + len(text) // 2 :])
     elif kind == "bytes":
         name, changes, signed = arguments
-        commit(run, name, edited((run / name).read_bytes(), changes), signed)
+        content = bytearray((run / name).read_bytes())
+        for place, byte in changes:
+            content[place % min(len(content), 4096 if place % 2 else len(content))] = byte  # where the headers are
+        commit(run, name, bytes(content), signed)
+    elif kind == "shorter":
+        name, place, signed = arguments
+        content = (run / name).read_bytes()
+        commit(run, name, content[: place % len(content)], signed)
     elif kind == "longer":
         name, size, _ = arguments
         with (run / name).open("r+b") as file:
@@ -152,7 +185,7 @@ def check(example: tuple, directory: Path) -> None:
     os.mkfifo(place / "fifo")
     before = sorted(each.name for each in place.iterdir())
     for change in sorted(changes, key=lambda change: LAST_OF_ALL.index(change[0]) if change[0] in LAST_OF_ALL else -1):
-        with contextlib.suppress(Exception):  # of a change to what an earlier one has already broken
+        with contextlib.suppress(*NOTHING_LEFT):
             mutate(run, *change)
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -191,4 +224,5 @@ def test_runs_go_on_or_are_refused(tmp_path):
     dvae.fit(latent, cut, out=tmp_path / "latent", **vars(training))
     changes = st.lists(mutations(), min_size=1, max_size=2)
     examples = st.tuples(st.sampled_from(CALLS), st.sampled_from(["fitted", "latent"]), changes)
-    fuzz(Isolated(check, tmp_path), examples, seconds=SHARE)
+    with Isolated(check, tmp_path) as isolated:
+        fuzz(isolated, examples, seconds=SHARE)

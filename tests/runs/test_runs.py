@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -84,10 +85,11 @@ def recommit(run, name, content):
 
 # Links, FIFOs, sizes --------------------
 
+WRITTEN = (".lock", f"{CONFIG}.new", f"{LAST}.new", f"{OPTIMISER}.new", f"{STATE}.new", f"{BEST}.new", "log.jsonl.new")
 READ = (CONFIG, STATE, BEST, LAST, OPTIMISER, "log.jsonl")
 
 
-@pytest.mark.parametrize("name", [".lock", f"{CONFIG}.new", f"{LAST}.new", f"{STATE}.new", "log.jsonl.new"])
+@pytest.mark.parametrize("name", WRITTEN)
 def test_nothing_is_written_through_a_link(run, canary, name):
     (run / name).unlink(missing_ok=True)
     (run / name).symlink_to(canary)
@@ -96,28 +98,29 @@ def test_nothing_is_written_through_a_link(run, canary, name):
             runs.resume(run, steps=6, progress=False)
         (run / name).unlink()
         os.link(canary, run / name)
-    if name == f"{LAST}.new":  # which is read first
+    if name in (f"{OPTIMISER}.new", f"{LAST}.new", f"{BEST}.new"):  # these are read first
         with pytest.raises(CheckpointError, match="is a link"):
             runs.resume(run, steps=6, progress=False)
     else:
         assert runs.resume(run, steps=6, progress=False).step == 6
 
 
-def test_results_take_the_place_of_a_link(run, canary):
-    names = ("evaluation.json", "scores.png", "calibration.json")
+@pytest.mark.parametrize("names", [["evaluation.json", "scores.png"], ["calibration.json"]])
+def test_results_take_the_place_of_a_link(run, canary, names):
     for name in names:
         (run / name).symlink_to(canary)
-    few = ("--simulations", "20", "--draws", "19", "--ranked-steps", "1", "--samples", "19")
-    assert main(["check", "calibration", str(run), *few]) == 0
-    assert main(["evaluate", str(run), "--samples", "1", "--figure", str(run / "scores.png")]) == 0
+    if "calibration.json" in names:
+        few = ("--simulations", "20", "--draws", "19", "--ranked-steps", "1", "--samples", "19")
+        assert main(["check", "calibration", str(run), *few]) == 0
+    else:
+        assert main(["evaluate", str(run), "--samples", "1", "--figure", str(run / "scores.png")]) == 0
     for name in names:
         assert not (run / name).is_symlink()
         assert (run / name).stat().st_size > 100
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [*zip(READ, ["link", "device", "fifo", "directory"] * 2, strict=False), (CONFIG, "fifo")]
-)
+@pytest.mark.parametrize("name", READ)
+@pytest.mark.parametrize("kind", ["link", "device", "fifo", "directory"])
 def test_what_is_no_plain_file_is_refused_at_once(run, canary, name, kind):
     path = run / name
     path.unlink()
@@ -134,9 +137,13 @@ def test_what_is_no_plain_file_is_refused_at_once(run, canary, name, kind):
             dvae.load(run)
 
 
+@pytest.mark.parametrize("path", [None, 3, b"run"])
+def test_a_run_is_named_by_a_path(path):
+    with pytest.raises(TypeError, match=f"a run is a folder that fit wrote; expected its path, got {path!r}"):
+        dvae.load(path)
+
+
 def test_the_directory_that_the_user_names_may_be_a_link(run, tmp_path):
-    with pytest.raises(TypeError, match="a run is a folder that fit wrote; expected its path, got 3"):
-        dvae.load(3)
     (tmp_path / "latest").symlink_to(run)
     assert runs.resume(tmp_path / "latest", steps=5, progress=False).step == 5
 
@@ -183,31 +190,38 @@ def test_a_state_names_no_file_but_those_of_a_checkpoint(run, canary):
     ("keys", "value", "message"),
     [
         (("method", "width"), 20_000, "width is 20000; it must be at least 1 and at most 16384"),
+        (("method", "width"), -3, "width is -3; it must be at least 1"),
+        (("method", "width"), 10**400, "width is .*; it must be at least"),
         (("method", "hidden"), [8] * 100_000, "hidden has 100000 entries; it must have 64 at most"),
         (("method", "hidden"), [8, "8"], r"hidden\[1\] is .*; it must be a whole number"),
         (("method", "residual"), float("nan"), "residual is nan; it must be"),
         (("method", "emission"), "fixd", r"unknown emission .*did you mean .*fixed"),
         (("method", "latent"), 4096, "asks for a model that is larger than its weights|weights of another model"),
         (("training", "devices"), 40, "devices is 40; it must be at least 1 and at most 32"),
-        (("training", "learning_rate"), {"schedule": "Constant", "value": -1}, "learning_rate is -1"),
+        (("training", "steps"), True, "steps is True; it must be a whole number"),
+        (("training", "batch_size"), 10**6, "batch_size is 1000000; it must be at least 1 and at most 16384"),
         (("training", "precision"), "8", "unknown precision '8'"),
+        (("training", "learning_rate"), {"schedule": "Constant", "value": -1}, "learning_rate is -1"),
         (
             ("training", "learning_rate"),
             {"schedule": "Linear", "start": 0, "end": float("inf"), "steps": 3},
             "end is inf",
         ),
+        (("schema", "length"), 10**12, "length is 1000000000000; it must be"),
         (
             ("schema",),
             {"kind": "sequences", "sizes": {"x": 48}},
             "of the kind 'motion' are poses, not 'sequences'",
         ),
         (("schema", "protocol", "fps"), 0, "fps is 0; it must be at least 0.001"),
+        (("schema", "protocol", "observed"), 10**9, "observed is 1000000000; it must be"),
         (
             ("method",),
             {"method": "equations", "generative": "p(z_t | z_{t-99999999:t-1}) p(x_t | z_t)"},
             "99999999 steps",
         ),
         (("data", "skip_bad"), "yes", "skip_bad is 'yes'; it must be true or false"),
+        (("data", "path"), ["people.npz"], "path is .*; it must be of type str"),
     ],
 )
 def test_a_config_out_of_range_is_refused_by_file_key_and_value(run, keys, value, message):
@@ -218,10 +232,10 @@ def test_a_config_out_of_range_is_refused_by_file_key_and_value(run, keys, value
     assert len(str(caught.value)) < 2000
 
 
-def test_an_option_that_a_run_does_not_tell_is_at_its_default(run, capsys):
+@pytest.mark.parametrize("key", ["steps", "seed", "devices"])
+def test_an_option_that_a_run_does_not_tell_is_at_its_default(run, capsys, key):
     config = json.loads((run / CONFIG).read_text())
-    for key in ("steps", "seed", "devices"):
-        del config["training"][key]
+    del config["training"][key]
     (run / CONFIG).write_text(json.dumps(config))
     fast = ["--no-forecasts", "--particles", "2", "--contrasts", "0", "--stride", "60"]
     assert main(["compare", str(run), *fast]) == 0, capsys.readouterr().err
@@ -269,13 +283,15 @@ def weights_with(run, name, make):
     return first
 
 
+@pytest.mark.parametrize("name", [BEST, LAST])
 @pytest.mark.parametrize(
-    ("name", "make", "message"),
+    ("make", "message"),
     [
-        (BEST, lambda value: torch.full_like(value, float("nan")), "has entries that are NaN or infinite"),
-        (LAST, lambda value: value / 0, "has entries that are NaN or infinite"),
-        (BEST, lambda value: value.long(), r"is torch.int64, the model's is torch.float32"),
-        (LAST, lambda value: value[:1], "holds the weights of another model"),
+        (lambda value: torch.full_like(value, float("nan")), "has entries that are NaN or infinite"),
+        (lambda value: value / 0, "has entries that are NaN or infinite"),
+        (lambda value: value.long(), r"is torch.int64, the model's is torch.float32"),
+        (lambda value: value.to(torch.complex64), r"is torch.complex64, the model's is|no safetensors file"),
+        (lambda value: value[:1], "holds the weights of another model"),
     ],
 )
 def test_weights_of_another_kind_or_without_a_value_are_refused(run, name, make, message):
@@ -302,14 +318,20 @@ MEAN, SQUARE, STEP = (f"optimizer/0/{key}" for key in ("exp_avg", "exp_avg_sq", 
             lambda content: content.update({"optimizer/99/step": torch.ones(1)}),
             "'optimizer/99/step' is of no parameter",
         ),
+        (
+            lambda content: content.update({"optimizer/00/step": torch.ones(1)}),
+            "'optimizer/00/step' is of no parameter",
+        ),
         (lambda content: content.pop(MEAN), "optimizer/0 has no exp_avg"),
         (damage(MEAN, lambda value: value[:1]), f"'{MEAN}' is not as the optimiser writes it"),
         (damage(MEAN, lambda value: value / 0), f"'{MEAN}' is not"),
         (damage(SQUARE, lambda value: value - 1), f"'{SQUARE}' is not"),
         (damage(MEAN, lambda value: value.long()), f"'{MEAN}' is not"),
         (damage(STEP, lambda value: -value), f"'{STEP}' is not"),
+        (damage(STEP, lambda value: 1e9 * value), f"'{STEP}' is not"),
         (lambda content: content.pop("random/torch"), "random has no torch"),
         (damage("random/torch", lambda value: value[:, :8].clone()), "'random/torch' is no"),
+        (damage("random/generator", lambda value: value.float()), "'random/generator' is no"),
         (lambda content: content["random/generator"].fill_(255), "mt19937"),
     ],
 )
@@ -326,8 +348,11 @@ def test_a_state_that_no_run_writes_is_refused_by_its_key(run, change, message):
     ("key", "value"),
     [
         ("step", -1),
+        ("step", True),
         ("best_bound", float("nan")),
+        ("waited", -1),
         ("status", "fine"),
+        ("best_step", 1.5),
     ],
 )
 def test_a_state_out_of_range_is_refused_wherever_it_is_read(run, capsys, key, value):
@@ -336,7 +361,7 @@ def test_a_state_out_of_range_is_refused_wherever_it_is_read(run, capsys, key, v
         assert f"{run / STATE} is damaged: {key} missing or not" in failure(capsys, *command)
 
 
-@pytest.mark.parametrize("line", ["3", '{"step": "one"}', '{"step": 1, "loss": "low"}', '{"step"'])
+@pytest.mark.parametrize("line", ["3", "[]", "{}", '{"step": "one"}', '{"step": 1, "loss": "low"}', '{"step"', "\0"])
 def test_a_damaged_log_is_refused_by_its_line(run, line):
     path = run / "log.jsonl"
     lines = path.read_text().splitlines()
@@ -447,12 +472,18 @@ def test_a_run_that_is_longer_than_asked_for_says_so(run, capsys):
     [
         ("fitt", "unknown command 'fitt' (did you mean 'fit'?)"),
         ("fit srn --out x", "'srn' is unknown (did you mean 'srnn'?)"),
+        ("fit --steps 3 --out x hitdvae", "'hitdvae' is unknown (did you mean 'hit-dvae'?)"),
         ("fit vae --out x --protocol cmu", "--protocol 'cmu' is unknown (did you mean 'cmu8'?)"),
+        ("fit vae --emission nrmal --out x", "--emission 'nrmal' is unknown (did you mean 'normal'?)"),
+        ("sweep vae srn --out x", "'srn' is unknown (did you mean 'srnn'?)"),
         ("data inf", "did you mean 'data info'?"),
     ],
 )
 def test_the_name_that_was_meant_is_told(capsys, arguments, meant):
     assert meant in failure(capsys, *arguments.split(), code=2)
+
+
+def test_nothing_is_suggested_where_nothing_is_near(capsys):
     assert "did you mean" not in failure(capsys, "fit", "qqqqqq", "--out", "x", code=2)
 
 
@@ -460,7 +491,10 @@ def test_the_name_that_was_meant_is_told(capsys, arguments, meant):
     ("arguments", "end"),
     [
         ("forecast RUN --out f.txt", ".npz"),
+        ("forecast RUN --out f.json", ".npz"),
         ("evaluate RUN --out scores.csv", ".json"),
+        ("check calibration RUN --out f.npz", ".json"),
+        ("compare RUN --out f.txt", ".json"),
         ("animate RUN --out f.png", ".html"),
     ],
 )
@@ -514,6 +548,41 @@ def test_without_docstrings_pyro_is_missed_in_a_sentence():
     assert program.returncode == 1
     assert error.startswith("error: dvae needs Pyro, which needs docstrings: run python without -OO")
     assert "Traceback" not in error
+
+
+# Threads --------------------
+
+
+def test_threads_take_turns(people, fitted, tmp_path):
+    """Two fits, and a forecast amid them, give what they give one after the other."""
+    data = MotionData.open(people)
+    model, x = dvae.load(fitted).model, data.windows("test").all()["x"][:2, :15]
+
+    def forecast():
+        torch.manual_seed(0)
+        return model.forecast({"x": x}, 4, 2)["x"]
+
+    found, errors = {}, []
+
+    def work(name, action):
+        try:
+            found[name] = action()
+        except BaseException as error:
+            errors.append(error)
+
+    actions = {
+        name: lambda name=name: dvae.fit(METHOD, data, out=tmp_path / name, **vars(TRAINING)) for name in ("a", "b")
+    }
+    actions["forecast"] = lambda: model.forecast({"x": x}, 4, 2)["x"].shape
+    threads = [threading.Thread(target=work, args=each) for each in actions.items()]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not errors
+    assert found["forecast"] == forecast().shape
+    for name in ("a", "b"):
+        assert (tmp_path / name / LAST).read_bytes() == (fitted / LAST).read_bytes()
 
 
 def test_what_was_valid_stays_valid():
