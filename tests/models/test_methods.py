@@ -130,30 +130,39 @@ class TestStandardised(Contract):
 
 class TestHiTDVAEWithoutAttention(Contract):
     name = "hit-dvae"
-    options: ClassVar = {"attention": False, "summary": "attention", "prior": "vamp"}
-    options |= {"prior_components": 3, "prior_steps": 4}
+    options: ClassVar = {"attention": False, "summary": "attention"}
+    missing: ClassVar = {"z": ("z_{<t}",)}
 
 
 class TestEquationsWithAttention(Contract):
     name = "equations"
-    waits = 21  # Pyro's splines look up by a mask what lies within their bounds
     options: ClassVar = {
         "generative": "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-2:t-1}, z_t)",
         "inference": "q(w | x_{1:T}) q(z_t | z_{>t}, x_{1:T}, w)",
         "network": "attention",
         "width": 8,
-        "prior": "flow",
     }
+
+
+class TestHiTDVAEWithPosteriorsAsPrior(Contract):
+    name = "hit-dvae"
+    options: ClassVar = {"prior": "vamp", "prior_components": 3, "prior_steps": 4}
+
+
+class TestEquationsWithFlow(Contract):
+    name = "equations"
+    waits = 21  # Pyro's splines look up by a mask what lies within their bounds
+    options: ClassVar = {"generative": "p(w) p(x_t | x_{t-1}, w)", "inference": "q(w | x_{1:T})", "prior": "flow"}
 
 
 class TestContext(FactorizationContract):
     def build(self, size):
-        pair = (
+        return dvae.DynamicalVAE(
             "p(w | pose) p(z_t | z_{t-1}, c_t, w) p(x_t | x_{t-1}, z_t, c_{1:T}, pose)",
             "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, c_{>=t}, pose, w)",
+            {"w": size, "z": size, "x": size, "c": size, "pose": size},
+            dvae.networks.Recurrent(4, hidden=(4,)),
         )
-        sizes = dict.fromkeys(("w", "z", "x", "c", "pose"), size)
-        return dvae.DynamicalVAE(*pair, sizes, dvae.networks.Recurrent(4, hidden=(4,)))
 
 
 def test_every_method_is_held_to_the_contract():
@@ -230,6 +239,24 @@ def test_a_method_takes_an_option_or_says_why_not(name, option):
     assert torch.isfinite(torch.cat([parameter.flatten() for parameter in model.parameters()])).all()
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("vae", {"free_bits": -0.1}, "finite"),
+        ("vae", {"prior_components": 0}, "least"),
+        ("vae", {"warm_up_shape": "step"}, "logistic"),
+        (
+            "equations",
+            {"generative": "p(v) p(w) p(x_t | w, v)", "inference": "q(v | x_{1:T}) q(w | x_{1:T}, v)", "prior": "vamp"},
+            "nothing else",
+        ),
+    ],
+)
+def test_options_that_are_none(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        dvae.method(name, **options).build({"x": 3})
+
+
 # ----------------------------------------------------------------------------- the family's published networks
 
 PUBLISHED = {  # parameters of the public implementation at its sizes for motion: x 96, z 10
@@ -252,17 +279,9 @@ def test_the_default_networks_have_the_published_size(name):
     assert sum(parameter.numel() for parameter in model.parameters()) - scales == PUBLISHED[name]
 
 
-@pytest.mark.parametrize(
-    ("name", "activation", "batch_and_steps"),
-    [
-        ("dkf", "relu", (3, 6)),
-        ("vrnn", "tanh", (3, 6)),
-        ("srnn", "relu", (1, 1)),
-        ("srnn", "tanh", (3, 6)),
-        ("rvae-causal", "tanh", (3, 6)),
-        ("rvae-noncausal", "relu", (3, 6)),
-    ],
-)
+@pytest.mark.parametrize("batch_and_steps", [(3, 6), (1, 1)])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("name", ["dkf", "vrnn", "srnn", "rvae-causal", "rvae-noncausal"])
 def test_the_fused_loop_of_a_guide_is_its_plain_loop(name, activation, batch_and_steps):
     model = small(name, 3).build({"x": 5}).double()
     for module in model.modules():
@@ -369,13 +388,6 @@ def test_a_method_survives_its_configuration(name):
         assert all(torch.equal(value, second[key]) for key, value in first.items())
 
 
-VAMP_BESIDE = {
-    "generative": "p(v) p(w) p(x_t | w, v)",
-    "inference": "q(v | x_{1:T}) q(w | x_{1:T}, v)",
-    "prior": "vamp",
-}
-
-
 @pytest.mark.parametrize(
     ("run", "message"),
     [
@@ -383,10 +395,6 @@ VAMP_BESIDE = {
         (lambda: dvae.method("srnn", latents=3), "option"),
         (lambda: dvae.method("vae", emission="gamma").build({"x": 1}), "emission"),
         (lambda: configured({"latent": 3}), "configuration names"),
-        (lambda: dvae.method("vae", free_bits=-0.1).build({"x": 3}), "finite"),
-        (lambda: dvae.method("vae", prior_components=0).build({"x": 3}), "least"),
-        (lambda: dvae.method("vae", warm_up_shape="step").build({"x": 3}), "logistic"),
-        (lambda: dvae.method("equations", **VAMP_BESIDE).build({"x": 3}), "nothing else"),
     ],
 )
 def test_methods_that_are_not(run, message):

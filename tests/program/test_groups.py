@@ -48,6 +48,15 @@ def test_a_group_has_one_value_and_its_density_once():
     assert not torch.equal(model.guide(batch)["w"][0], model.guide(batch)["w"][2])
 
 
+def test_a_group_of_one_is_a_sequence():
+    model, batch = build(), data()
+    torch.manual_seed(0)
+    alone = dvae.SequenceELBO().terms(model, {**batch, "group": torch.arange(6)})
+    torch.manual_seed(0)
+    without = dvae.SequenceELBO().terms(model, {"x": batch["x"]})
+    torch.testing.assert_close(alone.bound, without.bound)
+
+
 def test_pyros_own_bound_is_ours():
     model, batch = build(), data()
     torch.manual_seed(0)

@@ -20,9 +20,13 @@ from dvae.testing.strategies import factorizations
 B, T = 3, 5
 SIZES = {"w": 2, "v": 1, "u": 1, "z": 2, "x": 3, "y": 2, "c": 1, "pose": 2}
 PAIRS = {
+    "vae": ("p(z_t) p(x_t | z_t)", "q(z_t | x_t)"),
     "dkf": ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"),
+    "storn": ("p(z_t) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t})"),
+    "vrnn": ("p(z_t | x_{<t}, z_{<t}) p(x_t | x_{<t}, z_{<=t})", "q(z_t | x_{<=t}, z_{<t})"),
     "srnn": ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"),
     "rvae": ("p(z_t) p(x_t | z_{1:T})", "q(z_t | z_{<t}, x_{1:T})"),
+    "dsae": ("p(w) p(z_t | z_{<t}) p(x_t | w, z_t)", "q(w | x_{1:T}) q(z_t | w, x_{1:T})"),
     "hit-dvae": ("p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
     "two layers": (
         "p(w) p(u_t | u_{t-1}, w) p(z_t | z_{t-1}, u_t) p(x_t | x_{<t}, z_t)",
@@ -43,6 +47,7 @@ PAIRS = {
     ),
 }
 NETWORKS = {"recurrent": Recurrent(4, hidden=(5,)), "attention": Attention(8, heads=2)}
+CASES = [(pair, list(NETWORKS)[n % 2]) for n, pair in enumerate(PAIRS)]
 
 
 def build(pair, network="recurrent", **options):
@@ -86,7 +91,7 @@ def close(got, expected, tolerance=1e-9):
 # ------------------------------------------------------------------------------------------- sites and shapes
 
 
-@pytest.mark.parametrize("pair", ["dkf", "rvae", "statics", "body parts", "context"])
+@pytest.mark.parametrize("pair", PAIRS)
 def test_the_program_is_an_ordinary_pyro_program(pair):
     model = build(pair)
     data = draw(model)
@@ -98,9 +103,10 @@ def test_the_program_is_an_ordinary_pyro_program(pair):
     replayed = poutine.trace(poutine.replay(model.model, trace=latents)).get_trace(data)
     for name in model.latents:
         assert replayed.nodes[name]["value"] is latents.nodes[name]["value"]
-    loss = Trace_ELBO(num_particles=2)(model, model.guide)(data)
-    loss.backward()
-    assert torch.isfinite(loss)
+    for elbo in (Trace_ELBO(), Trace_ELBO(num_particles=2)):
+        loss = elbo(model, model.guide)(data)
+        loss.backward()
+        assert torch.isfinite(loss)
 
 
 # --------------------------------------------------------------------------------- one joint, many ways to it
@@ -119,6 +125,14 @@ def per_step(model, data, latents):
     return out
 
 
+@pytest.mark.parametrize(("pair", "network"), CASES)
+def test_the_vectorised_joint_is_that_of_the_per_step_program(pair, network):
+    model = build(pair, network, laws={"p(w)": distributions.FixedNormal(learned=True)} if pair == "dsae" else None)
+    data = draw(model)
+    latents = {name: value.detach() for name, value in model.guide(data).items()}
+    close(per_step(model, data, latents), model.log_joint(data, latents))
+
+
 @settings(max_examples=25)
 @given(factorizations(), st.sampled_from(["linear", *NETWORKS]), st.integers(0, 99))
 def test_random_factorizations_run_alike_in_every_way(pair, network, seed):
@@ -132,10 +146,31 @@ def test_random_factorizations_run_alike_in_every_way(pair, network, seed):
     close(guide_logs, log_guide(model, data, drawn))
 
 
-# ------------------------------------------------------------------------------------------- missing entries
+# -------------------------------------------------------------------------- ragged batches and missing entries
 
 
-@pytest.mark.parametrize(("pair", "network"), [("hit-dvae", "attention"), ("body parts", "recurrent")])
+@pytest.mark.parametrize(("pair", "network"), CASES)
+def test_padding_changes_nothing(pair, network):
+    model = build(pair, network)
+    lengths = torch.tensor([3, T, 1])
+    pad = (torch.arange(T) >= lengths[:, None])[..., None]
+    clean = draw(model)
+    padded = {n: v.masked_fill(pad, float("nan")) if v.dim() == 3 else v for n, v in clean.items()}
+    padded["lengths"] = lengths
+    latents, guide_logs = log_probs(model.guide, padded)
+    logs = model.log_joint(padded, latents)
+    for i, n in enumerate(lengths.tolist()):
+
+        def cut(values, i=i, n=n):
+            return {k: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for k, v in values.items()}
+
+        alone, drawn = cut(clean), cut(latents)
+        close({k: v[i : i + 1] for k, v in logs.items()}, model.log_joint(alone, drawn))
+        close({k: v[i : i + 1] for k, v in guide_logs.items()}, log_guide(model, alone, drawn))
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("pair", ["srnn", "hit-dvae", "body parts"])
 def test_the_value_of_a_missing_entry_changes_nothing(pair, network):
     model = build(pair, network)
     data = draw(model)
@@ -147,6 +182,10 @@ def test_the_value_of_a_missing_entry_changes_nothing(pair, network):
     close(log_guide(model, missing, latents), log_guide(model, zeros, latents))
     others = {name: data[name].masked_fill(~seen[name], 17.0) for name in model.observed}
     close(model.log_joint(missing, latents), model.log_joint({**others, "mask": seen}, latents))
+    everything = {name: torch.ones_like(mask) for name, mask in seen.items()}
+    close(model.log_joint({**data, "mask": everything}, latents), model.log_joint(data, latents))
+    nothing = {name: torch.zeros_like(mask) for name, mask in seen.items()}
+    assert all((model.log_joint({**data, "mask": nothing}, latents)[name] == 0).all() for name in model.observed)
 
 
 # --------------------------------------------------------------------------------------------------- forecasts
@@ -160,16 +199,9 @@ def means(model, values):
     }
 
 
-@pytest.mark.parametrize(  # chunks are less than the sequences, or more than all there is
-    ("pair", "network", "chunk"),
-    [
-        ("hit-dvae", "recurrent", 2),
-        ("two layers", "attention", 2048),
-        ("backward guide", "recurrent", 2048),
-        ("statics", "attention", 2),
-        ("body parts", "recurrent", 2),
-        ("context", "attention", 2),
-    ],
+@pytest.mark.parametrize(
+    ("pair", "network", "chunk"),  # chunks are less than the sequences, or more than all there is
+    [(pair, network, (2, 2048)[n % 3 // 2]) for n, (pair, network) in enumerate(CASES) if pair != "rvae"],
 )
 def test_a_forecast_continues_the_past_by_the_models_own_means(pair, network, chunk):
     model = build(pair, network)
@@ -207,10 +239,9 @@ def test_chunks_make_every_sample_of_every_sequence_once_and_no_more_at_once(siz
 # ------------------------------------------------------------------------------------------------ self-feeding
 
 
-@pytest.mark.parametrize(
-    ("pair", "network", "residual"),
-    [("srnn", "recurrent", True), ("body parts", "attention", True), ("context", "attention", False)],
-)
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("pair", ["srnn", "body parts", "context"])
+@pytest.mark.parametrize("residual", [False, True])
 def test_feeding_on_ones_own_means(pair, network, residual):
     model = build(pair, network, laws={"p(x)": distributions.Normal(residual=residual)})
     data = draw(model)

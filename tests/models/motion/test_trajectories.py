@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -56,18 +57,33 @@ def double(batch):
 
 class Contract(FactorizationContract):
     name = ""
+    options: ClassVar = {}
     steps = 4
-    test_padding_changes_nothing = None  # these networks make sequences of one length, and none is padded
 
     def build(self, size):
-        return small(self.name, latent=size).build({"x": size})
+        return small(self.name, **{"latent": size, **self.options}).build({"x": size})
 
 
-class TestTrajeVAE(Contract):
+class OfOneLength(Contract):
+    @pytest.mark.skip(reason="these networks make sequences of one length, and none is padded")
+    def test_padding_changes_nothing(self):
+        pass
+
+
+class TestTrajeVAE(OfOneLength):
     name = "trajevae"
 
 
-class TestCVAERNN(Contract):
+class TestTrajeVAEWithFewerComponents(OfOneLength):
+    name = "trajevae"
+    options: ClassVar = {"components": 2}
+
+    @pytest.mark.skip(reason="coefficients beyond those of the model are noise, and read nothing; see below")
+    def test_networks_read_the_declared_parents_and_nothing_else(self):
+        pass
+
+
+class TestCVAERNN(OfOneLength):
     name = "cvae-rnn"
 
 
@@ -107,6 +123,19 @@ def test_the_loss_is_squared_errors_and_the_weighted_divergence(windows):
     assert loss.item() == pytest.approx(expected.item(), rel=1e-7)  # the scale is kept in single precision
 
 
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        (lambda: small(emission="normal"), "trajevae"),
+        (lambda: small(components=-1), "components"),
+        (lambda: small(heads_count=3), "features"),
+    ],
+)
+def test_options_that_cannot_be(run, message):
+    with pytest.raises(ValueError, match=message):
+        run()
+
+
 # ---------------------------------------------------------------------------------------------------- what is given
 
 
@@ -119,6 +148,25 @@ def test_every_joint_is_given_over_a_whole_window_or_not_at_all(windows):
     together = shown.float().sum(1).var().item()
     assert together == pytest.approx(17 * 0.15 * 0.85, rel=0.25)  # joints are drawn apart
     assert not torch.equal(shown[0], shown[1])
+
+
+def test_hidden_entries_are_unknown_to_the_guide(windows):
+    model, x = build(windows), windows.sample(2, torch.Generator().manual_seed(0))["x"].double()
+    mask = torch.ones_like(x, dtype=torch.bool)
+    mask[:, 5:, 3:9] = False
+    path = torch.zeros_like(x)
+    path[..., 6:12] = x[..., 6:12]  # of a joint that is hidden, and of another one
+    both = model.read({"x": x, "y": path, "mask": mask})
+    assert torch.equal(both["r"], torch.where((path == 0) & mask, x, 0.0)[:, 1:])
+    assert torch.equal(model.read({"x": x, "mask": {"x": mask}})["mask"]["x"], mask[:, 1:])
+    found = model.read({"x": x, "mask": mask})
+    assert (found["r"][:, 4:, 3:9] == 0).all()
+    assert torch.equal(found["mask"]["x"], mask[:, 1:])
+    broken = x.masked_fill(~mask, torch.nan)
+    torch.manual_seed(0)
+    bound = dvae.SequenceELBO().terms(model, {"x": x, "mask": mask}).bound
+    torch.manual_seed(0)
+    assert torch.equal(dvae.SequenceELBO().terms(model, {"x": broken, "mask": mask}).bound, bound)
 
 
 # -------------------------------------------------------------------------------------------------------- forecasts
@@ -134,16 +182,25 @@ def test_with_a_heading_turned_windows_have_turned_motions(windows, name):
         joints = torch.as_tensor(values, dtype=torch.float64).unflatten(-1, (-1, 3))
         return motion.rotate_about_up(joints, angle, windows.skeleton.up).flatten(-2)
 
-    def made(batch):
-        torch.manual_seed(1)
+    def of(batch):
         first = {"s": batch["x"][:, 0], "y": batch["y"][:, 1:]}
-        forecast = model.forecast({"x": batch["x"][:, :1], "y": batch["y"]}, 20, 2)["x"]
-        return forecast, model.sample(length=20, batch=first)["x"], model.reconstruct(batch, 2)["x"]
+        runs = {
+            "forecast": lambda: model.forecast({"x": batch["x"][:, :1], "y": batch["y"]}, 20, 2)["x"],
+            "sample": lambda: model.sample(length=20, batch=first)["x"],
+            "reconstruct": lambda: model.reconstruct(batch, 2)["x"],
+        }
+        found = {}
+        for run, made in runs.items():
+            torch.manual_seed(1)
+            found[run] = made()
+        return found
 
-    ours, turned = made(batch), made({variable: turn(value) for variable, value in batch.items()})
-    for here, there in zip(ours, turned, strict=True):
-        torch.testing.assert_close(there, turn(here))
-    assert (build(windows, name, heading=False).forecast(batch["x"][:, :1], 20, 2)["x"] - ours[0]).norm() > 1e-3
+    ours, turned = of(batch), of({variable: turn(value) for variable, value in batch.items()})
+    for run in ours:
+        torch.testing.assert_close(turned[run], turn(ours[run]), msg=run)
+    assert (
+        build(windows, name, heading=False).forecast(batch["x"][:, :1], 20, 2)["x"] - ours["forecast"]
+    ).norm() > 1e-3
 
 
 # ---------------------------------------------------------------------------------------------------------- control
@@ -177,6 +234,13 @@ def test_a_motion_is_completed_where_the_pose_is(windows, walk):
     assert np.allclose(moved.positions, done.positions + away, atol=1e-9)
     missed = np.linalg.norm(done.positions[:, :, walk.skeleton.find("LWrist")] - walk.path("LWrist"), axis=-1)
     assert np.allclose(done.errors["LWrist"], missed)
+    x = torch.from_numpy(np.concatenate([walk.pose[None], walk.motion]) - walk.pose[0]).flatten(1)[None]
+    torch.manual_seed(0)
+    given = torch.zeros_like(x)
+    held = [3 * walk.skeleton.find("LWrist") + axis for axis in range(3)]
+    given[..., held] = x[..., held]
+    same = model.forecast({"x": x[:, :1], "y": given}, 20, 3)["x"][:, 0]
+    assert np.allclose(same.unflatten(-1, (-1, 3)).numpy() + walk.pose[0], done.positions, atol=1e-9)
     torch.manual_seed(0)
     short = model.complete(walk.pose, {"left_wrist": walk.path("LWrist")[:9]}, samples=3)
     assert short.positions.shape == (3, 9, 17, 3)
@@ -187,7 +251,7 @@ def test_a_motion_is_completed_where_the_pose_is(windows, walk):
     assert "within 1 cm" in str(done)
 
 
-def test_gaps_of_paths_are_bridged_from_the_first_pose_on(windows, walk, monkeypatch):
+def test_gaps_are_bridged_from_the_first_pose_on(windows, walk, monkeypatch):
     model, told = build(windows), []
     plain = model.forecast
     monkeypatch.setattr(model, "forecast", lambda data, *rest, **o: told.append(data["y"]) or plain(data, *rest, **o))
@@ -200,25 +264,38 @@ def test_gaps_of_paths_are_bridged_from_the_first_pose_on(windows, walk, monkeyp
     assert np.allclose(seen[1], walk.pose[joint] + (path[2] - walk.pose[joint]) * 2 / 3)
     assert np.allclose(seen[6], (path[4] + path[8]) / 2)
     assert np.allclose(seen[-1], path[-4])
-    assert np.array_equal(np.isfinite(done.errors["LWrist"][0]), known)
+    assert np.isnan(done.errors["LWrist"][0, ~known]).all()
+    assert np.isfinite(done.errors["LWrist"][0, known]).all()
 
 
+@pytest.mark.slow
 def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     """After some training, so that there is something that the latents move."""
     torch.manual_seed(0)
     method = small(width=32, feedforward=32, latent=16, dropout=0.0)
     model = method.build(windows)
-    options = {"batch_size": 16, "learning_rate": 3e-3, "progress": False, "accelerator": "cpu"}
-    dvae.fit(model, method.train(windows, steps=40), steps=40, **options)
+    options = {"steps": 150, "batch_size": 16, "learning_rate": 2e-3, "progress": False, "accelerator": "cpu"}
+    dvae.fit(model, method.train(windows, steps=options.pop("steps")), **options)
     walk = Straight(windows)
     paths = {joint: walk.path(joint) for joint in ("LWrist", "RFoot")}
     paths["LWrist"][8:11] = np.nan
-    done = model.complete(walk.pose, paths, samples=2, exact=True)
+    torch.manual_seed(0)
+    free = model.complete(walk.pose, paths, samples=4)
+    torch.manual_seed(0)
+    done = model.complete(walk.pose, paths, samples=4, exact=True)
     for joint, path in paths.items():
-        assert (done.errors[joint][:, ~np.isnan(path).any(1)] < 1e-5).all()
+        known = ~np.isnan(path).any(1)
+        assert free.errors[joint][:, known].mean() > 0.05
+        assert (done.errors[joint][:, known] < 1e-5).all()
     lengths, first = (windows.skeleton.bone_lengths(positions) for positions in (done.positions, walk.pose))
     assert (np.abs(lengths / first - 1) < 0.1).mean() > 0.99
     assert not np.allclose(done.positions[0], done.positions[1], atol=1e-2)  # each from its own draw
+    key = np.full((20, 3), np.nan)
+    key[10] = walk.path("LWrist")[10] + np.array([0.0, 0.2, 0.0])
+    reached = model.complete(walk.pose, {"LWrist": key}, samples=2, exact=True)
+    wrist = reached.positions[:, :, walk.skeleton.find("LWrist")]
+    assert np.allclose(wrist[:, 10], key[10], atol=1e-5)
+    assert np.linalg.norm(np.diff(wrist, axis=1), axis=-1).max() < 0.1  # the hand does not jump there and back
 
 
 @pytest.mark.parametrize(
@@ -229,12 +306,16 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
         ({"trajectories": {"LWrist": np.full((4, 3), np.nan)}}, "LWrist"),
         ({"frames": 0}, "got frames: 0"),
         ({"initial_pose": np.zeros((16, 3)), "frames": 4}, "expected"),
-        ({"initial_pose": np.full((17, 3), np.nan), "frames": 4}, "initial pose"),
+        ({"initial_pose": "broken", "frames": 4}, "initial pose"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:the path of")
 def test_poses_and_paths_that_cannot_be(windows, walk, change, message):
+    pose = change.get("initial_pose", walk.pose)
+    if isinstance(pose, str):
+        pose = walk.pose * 1000 if pose == "millimetres" else np.where(np.arange(17)[:, None] == 3, np.nan, walk.pose)
     with pytest.raises(ValueError, match=message):
-        build(windows).complete(**{"initial_pose": walk.pose, **change})
+        build(windows).complete(**{**change, "initial_pose": pose})
 
 
 # ------------------------------------------------------------------------------------------------ files and scores
@@ -249,13 +330,20 @@ def test_paths_are_read_from_files(tmp_path):
         (tmp_path / name).write_text("\n".join(rows) + "\n\n")
     for name in ("paths.npz", "paths.csv", "blank.csv"):
         assert np.array_equal(motion.read_paths(tmp_path / name)["LWrist"], path, equal_nan=True)
-    for text, message in (
-        ("LWrist_x,LWrist_y\n1,2\n", "lacks a column"),
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("LWrist_x,LWrist_y,LWrist_z\n", "expected"),
+        ("LWrist_x,LWrist_y\n1,2\n", "LWrist lacks a column"),
         ("LWrist_x,LWrist_y,LWrist_z\n1,2\n", "header"),
-    ):
-        (tmp_path / "paths.csv").write_text(text)
-        with pytest.raises(ValueError, match=message):
-            motion.read_paths(tmp_path / "paths.csv")
+    ],
+)
+def test_paths_that_cannot_be_read(tmp_path, text, message):
+    (tmp_path / "paths.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        motion.read_paths(tmp_path / "paths.csv")
 
 
 def test_scores_are_of_poses_relative_to_the_root_and_of_the_world(people):
@@ -292,14 +380,17 @@ def test_scores_are_of_poses_relative_to_the_root_and_of_the_world(people):
 def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
     windows = motion.windows(people, replace(PROTOCOL, test_stride=3), "test").given(["RFoot", "LFoot"])
     found = motion.Exchanged(windows, threshold=0.4)
-    x, y, whole, keys = found.all()["x"], found.all()["y"], windows.all(), windows.keys
+    x, y = found.all()["x"], found.all()["y"]
+    whole, keys = windows.all(), windows.keys
     feet = [windows.skeleton.find(name) for name in ("RFoot", "LFoot")]
     assert 0 < len(x) == len(found.keys) < len(keys)
+    partners = set()
     for n, key in enumerate(found.keys):
         own = keys.index(key)
         assert torch.equal(x[n, 1:], whole["x"][own, 1:])
         assert torch.equal(y[n], whole["y"][own])
         (partner,) = [m for m in range(len(keys)) if torch.equal(whole["x"][m, 0], x[n, 0])]
+        partners.add(partner)
         assert keys[partner][:2] != key[:2]
         apart = (whole["x"][partner, 0] - whole["x"][own, 0]).unflatten(-1, (-1, 3))[feet].norm(dim=-1)
         assert (apart < 0.4).all()
@@ -307,7 +398,10 @@ def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
     scores = evaluate(build(windows).float(), found, samples=2, references=False)
     assert math.isfinite(scores["model"]["path error"].mean)
     assert "MMADE" not in scores["model"]  # the windows that begin with that pose have other paths
-    assert scores.data["exchanged"]["truth"] == "path"
-    assert torch.equal(motion.Exchanged(windows, 0.4, truth="pose").all()["x"][:, 0], x[:, 0])
+    assert scores.data["exchanged"] == {"threshold": 0.4, "seed": 0, "partners": len(partners), "truth": "path"}
+    assert len(partners) > 0.3 * len(x)
+    owner = motion.Exchanged(windows, 0.4, truth="pose").all()
+    assert torch.equal(owner["y"], y)
+    assert torch.equal(owner["x"][:, 0], x[:, 0])
     with pytest.raises(ValueError, match="nearest"):
         motion.Exchanged(windows, threshold=1e-9)
