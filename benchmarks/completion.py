@@ -19,7 +19,7 @@ import dvae
 from dvae import motion
 from dvae.models.motion.motion_latent import MotionLatent
 from dvae.motion import bodies
-from dvae.motion.segments.completion import complete, glimpsed
+from dvae.motion.segments.completion import complete, simulate_observations
 from dvae.motion.segments.embodied import Segments
 
 from .speed import moved, stopwatch
@@ -34,12 +34,12 @@ TARGETS = {
 
 
 def rows(device: torch.device) -> dict[str, float]:
-    people = bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
+    people = bodies.fit_to_body(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
     segments = Segments(motion.gait_cycles(people))
     model, batch = MotionLatent().build(segments).eval(), segments.all()
     rows = list(islice(cycle(range(len(segments))), MANY))
     x, shape = batch["x"][rows], batch["beta"][rows]
-    seen = moved(glimpsed(model, x, shape, "markers", frames=range(0, 100, 20)), device)
+    seen = moved(simulate_observations(model, x, shape, "markers", frames=range(0, 100, 20)), device)
     model.to(device)
 
     clock = stopwatch()

@@ -19,7 +19,7 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.distributions.flow import QRFlowLaw
+from dvae.distributions.flow import QRFlowModule
 from dvae.models.motion.gsps import PRESETS, GSPSModel
 
 from .speed import fed_step, over_products, seconds
@@ -27,7 +27,7 @@ from .speed import fed_step, over_products, seconds
 TARGETS = {"energies": ("at most", 0.25), "prior": ("at least", 3.0), "memory": ("under", 6.7)}
 
 
-def sequential(flow: QRFlowLaw, x: torch.Tensor) -> torch.Tensor:
+def sequential(flow: QRFlowModule, x: torch.Tensor) -> torch.Tensor:
     """What the flow makes of x, by one reflection after the other."""
     for layer, (upper, bias) in enumerate(zip(flow.factors()[1], flow.bias, strict=True)):
         if layer:
@@ -56,7 +56,7 @@ def rows(device: torch.device) -> dict[str, float]:
     drawn = {name: values[name].requires_grad_() for name in ("lower", "upper")}
 
     def scored() -> None:
-        futures = model.shown(dict(drawn))
+        futures = model.to_data_space(dict(drawn))
         sum(energy.sum() for energy in model.energies(futures, batch["x"], batch).values()).backward()
 
     past = batch["x"][:, :25]

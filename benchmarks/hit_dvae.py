@@ -26,12 +26,12 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.program.rollout import SelfFeeding
+from dvae.program.rollout import ScheduledSampling
 
 from .speed import Held, fed_step, over_products, seconds, stopwatch
 
 TARGETS = {
-    "frame": ("at most", 3.0),
+    "frame": ("at most", 1.5),
     "step, exact": ("at most", 1.2),
     "cache": ("at least", 10.0),
     "growth": ("under", 5.0),
@@ -60,7 +60,7 @@ def without_caches(model: dvae.DynamicalVAE, past: Tensor, horizon: int, samples
 
 def rows(device: torch.device) -> dict[str, float]:
     windows = motion.windows(motion.simulate(), motion.PROTOCOLS["simulated"], "train")
-    method = dvae.method("hit-dvae", pose_prior=0.0, decoder=256).suited(windows)  # the paper's width
+    method = dvae.method("hit-dvae", pose_prior=0.0, decoder=256).resolve_defaults(windows)  # the paper's width
     model = method.build(windows)
     method.train(windows).prepare(model)
     model.to(device)
@@ -107,14 +107,14 @@ def rows(device: torch.device) -> dict[str, float]:
     model.train()
     draws = method.train(windows).objective.draws
 
-    def step(feeding: SelfFeeding | None) -> Callable[[], None]:
+    def step(feeding: ScheduledSampling | None) -> Callable[[], None]:
         fed = None if feeding is None else replace(feeding, start=windows.protocol.observed)
-        return fed_step(method, model, windows, 16, device, draws=draws, self_feeding=fed)[0]
+        return fed_step(method, model, windows, 16, device, draws=draws, scheduled_sampling=fed)[0]
 
     kinds = {
-        "exact": SelfFeeding(1.0, gradient=False),
-        "gradient": SelfFeeding(1.0),
-        "two passes": SelfFeeding(1.0, passes=2, gradient=False),
+        "exact": ScheduledSampling(1.0, gradient=False),
+        "gradient": ScheduledSampling(1.0),
+        "two passes": ScheduledSampling(1.0, passes=2, gradient=False),
     }
     forced, *fed = seconds(step(None), *(step(feeding) for feeding in kinds.values()), repeat=3)
     found |= {f"step, {kind}": each / forced for kind, each in zip(kinds, fed, strict=True)}

@@ -27,7 +27,7 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.motion.files.plain import save_clips
+from dvae.motion.files.arrays import save_clips
 from dvae.tables import Cut, PanelData
 
 from .speed import seconds

@@ -24,13 +24,13 @@ TARGETS = {"feeding": ("at most", 1.75), "step": ("under", None)}
 def rows(device: torch.device) -> dict[str, float]:
     protocol = replace(motion.PROTOCOLS["simulated"], representation="quaternion")
     windows = motion.windows(motion.simulate(), protocol, "train")
-    method = dvae.method("mix-and-match").suited(windows)
+    method = dvae.method("mix-and-match").resolve_defaults(windows)
     model = method.build(windows).to(device)
     objective, bound = method.train(windows).objective, dvae.SequenceELBO()
     batch = moved(windows.sample(32, torch.Generator().manual_seed(0)), device)
     own, true = seconds(
         *(
-            training_step(model, lambda p=p: objective(bound.terms(model, batch, self_feeding=p), 1000))
+            training_step(model, lambda p=p: objective(bound.terms(model, batch, scheduled_sampling=p), 1000))
             for p in (1.0, 0.0)
         ),
         repeat=5,

@@ -63,7 +63,7 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
     with mock.patch.dict(os.environ):
         del os.environ["TORCHELASTIC_RUN_ID"]
         alone = begun(name)
-    joined, spent, together = begun(name), [0.0], processes.together
+    joined, spent, together = begun(name), [0.0], processes.average_gradients
     fabric, x, go_on = joined.fabric, torch.randn(METHODS[name], FRAMES, SIZE), torch.zeros(2, dtype=torch.int)
 
     def timed(*given: object) -> tuple[Tensor, Tensor | float]:
@@ -83,7 +83,7 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
         busy = time.process_time() - busy
         last = torch.tensor([0.0, 0.0])
         last[fabric.global_rank] = time.perf_counter() - start
-        return processes.summed(fabric, last).max().item(), busy
+        return processes.sum_over_processes(fabric, last).max().item(), busy
 
     def one() -> float:
         processes.wait(fabric)

@@ -27,7 +27,7 @@ def rows(device: torch.device) -> dict[str, float]:
     protocol = replace(motion.PROTOCOLS["simulated-trajectories"], predicted=100)
     windows = motion.windows(motion.simulate(), protocol, "train")
     method = dvae.method("trajevae")
-    method = method.filled(method.preset(motion.HUMAN36M))
+    method = method.with_presets(method.preset(motion.HUMAN36M))
     model = method.build(windows).to(device).train()
     step, _ = fed_step(method, model, windows, 32, device)
     batch = {name: value[:1].to(device) for name, value in windows.given(["RFoot", "LFoot"]).all().items()}

@@ -28,22 +28,22 @@ if TYPE_CHECKING:
     from .data import views
     from .data.sequences import ArrayWindows
     from .factorization.graph import Alternatives, Audit, alternatives, audit
-    from .factorization.inversion import faithful
+    from .factorization.inversion import faithful_inverse
     from .factorization.notation import Factorization
     from .inference.bounds.annealing import annealed_bound
-    from .inference.bounds.elbo import SequenceELBO, Terms, importance_bound
-    from .inference.bounds.local import local_guide
-    from .inference.bounds.particles import particle_bound
+    from .inference.bounds.elbo import SequenceELBO, Terms, iwae_bound
+    from .inference.bounds.particles import fivo_bound
+    from .inference.bounds.semi_amortized import semi_amortized_guide
     from .inference.diagnostics.bracket import Bracket, bracket
     from .inference.diagnostics.calibration import calibrate
     from .inference.diagnostics.checks import predictive_checks
     from .inference.diagnostics.posteriors import Descent, Posterior, posterior
+    from .inference.diagnostics.reference_posterior import reference_posterior
     from .inference.diagnostics.stein import stein_discrepancy
     from .inference.diagnostics.traversal import traverse
-    from .inference.diagnostics.yardstick import reference_posterior
     from .inference.evaluation.compare import compare
     from .inference.evaluation.comparison import Comparison
-    from .inference.evaluation.conformal import Tubes, conformal
+    from .inference.evaluation.conformal import PredictionBands, conformal_bands
     from .inference.evaluation.evaluate import evaluate
     from .inference.evaluation.evaluation import Evaluation
     from .inference.training import schedules
@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     from .inference.training.options import Stage, Training
     from .inference.training.svi import SVI
     from .models.registry import method, methods
+    from .program.enumeration import Discrete
     from .program.model import DynamicalVAE
-    from .program.oracle import Oracle, arrow_prices, model_arrow_prices, model_price, price, twin
-    from .program.rollout import InputNoise, SelfFeeding
-    from .program.summed import Discrete
+    from .program.oracle import Oracle, edge_costs, kl_gap, linear_gaussian_surrogate, model_edge_costs, model_kl_gap
+    from .program.rollout import InputNoise, ScheduledSampling
     from .runs.ablation import Ablation, ablate
     from .runs.directory import load
 
@@ -79,44 +79,44 @@ __all__ = [
     "InputNoise",
     "Oracle",
     "Posterior",
-    "SelfFeeding",
+    "PredictionBands",
+    "ScheduledSampling",
     "SequenceELBO",
     "Stage",
     "Terms",
     "Training",
-    "Tubes",
     "ablate",
     "alternatives",
     "annealed_bound",
-    "arrow_prices",
     "audit",
     "bracket",
     "calibrate",
     "compare",
-    "conformal",
+    "conformal_bands",
     "distributions",
+    "edge_costs",
     "evaluate",
-    "faithful",
+    "faithful_inverse",
     "fit",
-    "importance_bound",
+    "fivo_bound",
+    "iwae_bound",
+    "kl_gap",
+    "linear_gaussian_surrogate",
     "load",
-    "local_guide",
     "method",
     "methods",
-    "model_arrow_prices",
-    "model_price",
+    "model_edge_costs",
+    "model_kl_gap",
     "motion",
     "networks",
-    "particle_bound",
     "posterior",
     "predictive_checks",
-    "price",
     "reference_posterior",
     "schedules",
+    "semi_amortized_guide",
     "stein_discrepancy",
     "tables",
     "traverse",
-    "twin",
     "views",
 ]
 
@@ -126,23 +126,23 @@ _PLACES = {
         "data": "views",
         "data.sequences": "ArrayWindows",
         "factorization.graph": "Alternatives Audit alternatives audit",
-        "factorization.inversion": "faithful",
+        "factorization.inversion": "faithful_inverse",
         "factorization.notation": "Factorization",
-        "program.oracle": "Oracle arrow_prices model_arrow_prices model_price price twin",
+        "program.oracle": "Oracle edge_costs model_edge_costs model_kl_gap kl_gap linear_gaussian_surrogate",
         "inference.bounds.annealing": "annealed_bound",
-        "inference.bounds.elbo": "SequenceELBO Terms importance_bound",
-        "inference.bounds.local": "local_guide",
-        "inference.bounds.particles": "particle_bound",
+        "inference.bounds.elbo": "SequenceELBO Terms iwae_bound",
+        "inference.bounds.semi_amortized": "semi_amortized_guide",
+        "inference.bounds.particles": "fivo_bound",
         "inference.diagnostics.bracket": "Bracket bracket",
         "inference.diagnostics.calibration": "calibrate",
         "inference.diagnostics.checks": "predictive_checks",
         "inference.diagnostics.posteriors": "Descent Posterior posterior",
         "inference.diagnostics.stein": "stein_discrepancy",
         "inference.diagnostics.traversal": "traverse",
-        "inference.diagnostics.yardstick": "reference_posterior",
+        "inference.diagnostics.reference_posterior": "reference_posterior",
         "inference.evaluation.compare": "compare",
         "inference.evaluation.comparison": "Comparison",
-        "inference.evaluation.conformal": "Tubes conformal",
+        "inference.evaluation.conformal": "PredictionBands conformal_bands",
         "inference.evaluation.evaluate": "evaluate",
         "inference.evaluation.evaluation": "Evaluation",
         "inference.training": "schedules",
@@ -153,8 +153,8 @@ _PLACES = {
         "inference.training.svi": "SVI",
         "models.registry": "method methods",
         "program.model": "DynamicalVAE",
-        "program.rollout": "InputNoise SelfFeeding",
-        "program.summed": "Discrete",
+        "program.rollout": "InputNoise ScheduledSampling",
+        "program.enumeration": "Discrete",
         "runs.ablation": "Ablation ablate",
         "runs.directory": "load",
     }.items()

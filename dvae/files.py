@@ -66,7 +66,7 @@ def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
         FileRefused: the path is not a plain file, or the file is larger.
         OSError: the file does not exist or cannot be read.
     """
-    with open_plain(path, links=links) as file, naming(path):
+    with open_plain(path, links=links) as file, with_path(path):
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise FileRefused(f"{path} has {size} bytes, and can rightly have {most} at most")
@@ -87,16 +87,16 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
     """
     path = Path(path)
     path.unlink(missing_ok=True)  # removes a link itself, not its target
-    with open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file, naming(path):
+    with open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file, with_path(path):
         try:
-            put(file, content)
+            write_all(file, content)
             os.fsync(file.fileno())
         except OSError:
             path.unlink(missing_ok=True)
             raise
 
 
-def put(file: BinaryIO, content: bytes) -> None:
+def write_all(file: BinaryIO, content: bytes) -> None:
     """Write all content to an unbuffered file, which may accept it in several parts."""
     left = memoryview(content)
     while left:
@@ -104,7 +104,7 @@ def put(file: BinaryIO, content: bytes) -> None:
 
 
 @contextmanager
-def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a temporary file that replaces the file or link at `path` on success; create the folder if needed.
 
     Raises:
@@ -114,11 +114,11 @@ def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     path = Path(path)
     if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
         raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
-    with made(path.parent):
+    with create_folder(path.parent):
         _remove_leftovers(path.parent)
         new = path.with_name(f"{temporary()}{uuid4().hex}")
         try:
-            with naming(path, new):
+            with with_path(path, new):
                 number = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | _PLAIN, 0o666)
                 with os.fdopen(number, "w+b") as file:
                     yield file
@@ -129,7 +129,7 @@ def written(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def made(folder: Path) -> Iterator[None]:
+def create_folder(folder: Path) -> Iterator[None]:
     """Create a folder and its parents; if the block fails, remove the created folders that are empty."""
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
@@ -172,7 +172,7 @@ def _is_running(process: int) -> bool:
 
 
 @contextmanager
-def naming(path: str | os.PathLike[str], temporary: Path | None = None) -> Iterator[None]:
+def with_path(path: str | os.PathLike[str], temporary: Path | None = None) -> Iterator[None]:
     """Add the path to an OSError raised in the block, such as for a full disk, missing permissions or a disk error.
 
     Args:

@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from .turns import no_fork
+from .locking import no_fork
 
 
 def importing(package: str, places: Mapping[str, str] | None = None) -> Callable[[str], Any]:

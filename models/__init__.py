@@ -1,4 +1,4 @@
-"""The methods of the literature, one file each: equations, networks, sizes, schedules."""
+"""Methods of the literature, one file each: equations, networks, sizes and schedules."""
 
 from typing import TYPE_CHECKING
 

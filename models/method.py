@@ -1,4 +1,4 @@
-"""What a method is: two equations, a model built for data, and a recipe of how that is trained."""
+"""Methods: two equations, a model built for data, and a training recipe."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing_extensions import override
 
 from ..data.batch import WHOLE
 from ..data.schema import Schema
-from ..data.sequences import Hiding, bridged
+from ..data.sequences import RandomMasking, interpolate_missing
 from ..data.views import View
-from ..distributions import FixedNormal, Flow, LawSpec, Mixture, Normal, StudentT, Vamp
-from ..distributions.priors import VampLaw
+from ..distributions import DistributionSpec, FixedNormal, Flow, Mixture, Normal, StudentT, Vamp
+from ..distributions.priors import VampModule
 from ..factorization.inversion import guide
 from ..factorization.notation import Factorization
 from ..inference.training.objectives import Evidence, Objective
@@ -25,17 +25,18 @@ from ..inference.training.schedules import Cosine, Logistic, Ramp, Schedule
 from ..networks import NetworkSpec
 from ..options import Amount, Delay, Range, Share, Size
 from ..program.model import DynamicalVAE
-from ..program.rollout import SelfFeeding
+from ..program.rollout import ScheduledSampling
 
 SHAPES: dict[str, type[Ramp | Cosine | Logistic]] = {"linear": Ramp, "cosine": Cosine, "logistic": Logistic}
 
 
 @dataclass(frozen=True)
 class Method(Trainable):
-    """A method of the literature; a subclass is one file of this package, and its fields are its options.
+    """A method of the literature. Each subclass is one file of this package, and its fields are its options.
 
-    It has four hooks: `equations`, `suited` (options that are left open, chosen for the data), `build` (the model) and
-    `train` (the recipe). Most models follow from their equations, `sizes`, `networks` and `laws`.
+    A method has four hooks: `equations`, `resolve_defaults` (chooses unset options for the data), `build` (returns the
+    model) and `train` (returns the recipe). Most models follow from their equations, `sizes`, `networks` and
+    `distributions`.
 
     Args:
         latent: size of z.
@@ -47,68 +48,68 @@ class Method(Trainable):
     latent: Size | None = 16
 
     def equations(self) -> tuple[Factorization, Factorization]:
-        """The generative model and the guide, which has no factor where there are no latents."""
+        """Return the generative model and the guide; the guide of a model without latents has no factors."""
         generative = Factorization.parse(self.generative)
         return generative, guide(generative, self.inference)
 
     def sizes(self) -> dict[str, int]:
-        """Sizes of the latents."""
+        """Return the sizes of the latents."""
         return {"z": self.latent or 0}
 
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Networks by factor."""
+        """Return the networks by factor."""
         raise NotImplementedError(
-            f"{type(self).__name__} says nothing of its networks; give it `def networks(self)` that returns them by "
-            'factor, such as {"default": Recurrent(64)}, or a `build` of its own'
+            f"{type(self).__name__} defines no networks; define `networks(self)`, which returns them by factor, such "
+            'as {"default": Recurrent(64)}, or override `build`'
         )
 
-    def laws(self) -> Mapping[str, LawSpec]:
-        """Laws by factor; normal where nothing is said."""
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return the distributions by factor; factors without an entry are normal."""
         return {}
 
-    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
-        """What a `DynamicalVAE` is built from, for data of these sizes."""
+    def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """Return the arguments of `DynamicalVAE` for data of these sizes."""
         generative, inference = self.equations()
         given = {"generative": generative, "inference": inference, "sizes": {**self.sizes(), **sizes}}
-        return {**given, "network": self.networks(), "laws": dict(self.laws())}
+        return {**given, "network": self.networks(), "distributions": dict(self.distributions())}
 
 
 @dataclass(frozen=True)
 class LikelihoodMethod(Method):
-    """A method with a likelihood whose model follows from its networks and laws, and is trained on the evidence.
+    """A method with a likelihood, trained on the evidence; its model follows from its networks and distributions.
 
-    A subclass gives `networks`, and `sizes` and `laws` where these are other ones.
+    A subclass defines `networks`, and overrides `sizes` and `distributions` where it differs.
 
     Args:
         emission: distribution of x: "fixed" (normal, one learned scale per coordinate), "unit" (normal, variance 1),
-            "normal" (scale read from the parents) or "student" (Student t). Where it is left open, what the columns of
-            a table say, or "fixed".
-        residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1, an offset, one step
-            ahead is sharp, but a free run can drift without bound; somewhat less forgets where it was.
-        self_feeding: scheduled sampling: final probability that a frame of x's history is the model's own mean. It
-            rises from 0 over a third of training, after the first tenth, and carries no gradient. Nothing is fed to a
-            model that reads no x. Where it is left open, 1 for data with a horizon and 0 for others
-            (docs/results/tuning.md).
+            "normal" (scale read from the parents) or "student" (Student t). By default the distributions of a table's
+            columns, or "fixed".
+        residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
+            an offset: one-step forecasts are sharp, but free runs can drift without bound. A smaller share limits the
+            drift.
+        scheduled_sampling: final probability that a frame of x's history is the model's own mean. It rises from 0 over
+            a third of training, after the first tenth. No gradient flows through these means. Models that read no x
+            ignore it. By default 1 for data with a horizon and 0 for others (docs/results/tuning.md).
     """
 
-    apart: ClassVar[tuple[str, ...]] = ()
+    without_covariates: ClassVar[tuple[str, ...]] = ()
     """Factors that read no covariates, such as "p(z)"."""
 
     emission: Literal["fixed", "unit", "normal", "student"] | None = None
     residual: Share = 0.0
-    self_feeding: Share | None = 0.0
+    scheduled_sampling: Share | None = 0.0
 
     @override
-    def suited(self, data: Any) -> Self:
-        """With the scheduled sampling chosen for these data, where it is left open."""
-        if self.self_feeding is not None:
+    def resolve_defaults(self, data: Any) -> Self:
+        """Return the method with an unset `scheduled_sampling` chosen for the data."""
+        if self.scheduled_sampling is not None:
             return self
-        return replace(self, self_feeding=float(Schema.of(data).observed is not None))
+        return replace(self, scheduled_sampling=float(Schema.of(data).observed is not None))
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """Laws by factor: that of x, where the data say none."""
-        emissions: dict[str, LawSpec] = {
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return the distribution of x by factor; the data may replace it."""
+        emissions: dict[str, DistributionSpec] = {
             "normal": Normal(residual=self.residual),
             "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
             "unit": FixedNormal(residual=self.residual),
@@ -118,82 +119,85 @@ class LikelihoodMethod(Method):
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model of these equations, whose factors read the covariates of the data too."""
-        model = self.suited_to(Schema.of(data), extended=True)
-        model.feeding = SelfFeeding(0.0, gradient=False)
+        """Return the model of these equations, whose factors also read the covariates of the data."""
+        model = self.build_for_data(Schema.of(data), extended=True)
+        model.feeding = ScheduledSampling(0.0, gradient=False)
         return model
 
-    def suited_to(
+    def build_for_data(
         self, schema: Schema, extended: bool, kind: type[DynamicalVAE] = DynamicalVAE, view: View | None = None
     ) -> DynamicalVAE:
-        """The model for data, with their law and their units.
+        """Return the model for data, with their distribution and their units.
 
         Args:
-            schema: of the data.
-            extended: whether factors read the covariates of the data too, whatever the equations say.
-            kind: of the model.
-            view: of the model, in place of the data's own.
+            schema: schema of the data.
+            extended: whether factors also read the covariates of the data, in addition to their parents.
+            kind: class of the model.
+            view: view of the model, in place of the data's own.
         """
         generative, inference = self.equations()
         names = {name for part in (generative, inference) for name in (*part.variables, *part.context)}
         if extended:
-            generative, inference = (part.given(*schema.covariates, self.apart) for part in (generative, inference))
+            generative, inference = (
+                part.given(*schema.covariates, self.without_covariates) for part in (generative, inference)
+            )
             names |= {name for part in schema.covariates for name in part}
-        described = self.described({name: size for name, size in schema.sizes.items() if name in names})
-        described |= {"generative": generative, "inference": inference}
+        model_arguments = self.model_arguments({name: size for name, size in schema.sizes.items() if name in names})
+        model_arguments |= {"generative": generative, "inference": inference}
         if schema.emission is not None and self.emission is None:
-            described["laws"]["p(x)"] = self.of_columns(schema.emission)
-        model = kind(**{"indicators": schema.indicators, **described}, view=view or schema.view)
+            model_arguments["distributions"]["p(x)"] = self.of_columns(schema.emission)
+        model = kind(**{"indicators": schema.indicators, **model_arguments}, view=view or schema.view)
         model.per = schema.per
         for name, coordinates in schema.units.items():
             model.standardise(name, coordinates)
         return model
 
-    def of_columns(self, law: LawSpec) -> LawSpec:
-        """The law of x where the columns of a table say one: theirs.
+    def of_columns(self, distribution: DistributionSpec) -> DistributionSpec:
+        """Return the distribution of x for a table whose columns define one.
 
         Raises:
-            ValueError: a residual, which theirs have not.
+            ValueError: if `residual` is not 0, because distributions of columns have no residual.
         """
         if self.residual:
             raise ValueError(
-                f"residual is {self.residual}, but the law of x is that of its columns, which adds no previous "
-                'value; leave residual at 0, or give all columns one law that does, by emission="normal"'
+                f"residual is {self.residual}, but the table's columns define the distribution of x, which adds no "
+                "previous "
+                'value; leave residual at 0, or give all columns one distribution with emission="normal"'
             )
-        return law
+        return distribution
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """One stage that minimises the negative evidence, with self-feeding as the options say."""
+        """Return one stage that minimises the negative evidence, with the scheduled sampling of the options."""
         return Recipe(train, validation, [Stage(steps, self.objective())], self._feeding(steps))
 
     def objective(self) -> Objective:
-        """What training minimises."""
+        """Return the objective of training."""
         return Evidence()
 
     def _feeding(self, steps: int) -> Schedule | float:
-        """Probability of self-feeding over a run of `steps`; 0 for a model that reads no data, where nothing is fed."""
+        """Return the probability of scheduled sampling over a run of `steps`; 0 for a model that reads no data."""
         p, q = self.equations()
         reads = {parent.name for factor in p.factors for parent in factor.parents}
-        if not self.self_feeding or not reads & (set(p.variables) - set(q.variables)):
+        if not self.scheduled_sampling or not reads & (set(p.variables) - set(q.variables)):
             return 0.0
-        return rising(self.self_feeding, steps)
+        return rising(self.scheduled_sampling, steps)
 
 
 @dataclass(frozen=True)
 class LatentMethod(LikelihoodMethod):
-    """A method with latents and a likelihood; see `LikelihoodMethod`.
+    """A `LikelihoodMethod` with latents.
 
     Args:
         prior: distribution of the static latents without parents: "standard" (normal, nothing learned), "mixture" (of
-            normals), "vamp" (of the guide's posteriors of learned pseudo-sequences) or "flow".
-        prior_components: of "mixture" and "vamp".
-        prior_steps: length of the pseudo-sequences of "vamp"; at most that of the training windows.
+            normals), "vamp" (mixture of the guide's posteriors of learned pseudo-sequences) or "flow".
+        prior_components: number of components of "mixture" and "vamp".
+        prior_steps: length of the pseudo-sequences of "vamp"; at most the length of the training windows.
         warm_up: steps over which the KL weight rises from 0 to 1.
-        warm_up_shape: form of that rise.
-        free_bits: nats per frame below which the KL of a latent, averaged over the batch, costs nothing more.
-        hide: share of the entries of training windows that are hidden from the guide and the likelihood, anew in every
-            batch, so that the guide learns to do without them; it then reads indicators of what was observed.
+        warm_up_shape: shape of the rise.
+        free_bits: nats per frame below which the KL of a latent, averaged over the batch, is not penalised.
+        hide: share of the entries of training windows to hide from the guide and the likelihood, drawn anew for every
+            batch. The guide learns to handle missing entries, and reads indicators of the observed ones.
     """
 
     latent: Size = 16
@@ -206,21 +210,21 @@ class LatentMethod(LikelihoodMethod):
     hide: Annotated[float, Range(0, 1, below=True)] = 0.0
 
     @override
-    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
-        """With indicators of x, where entries of it are hidden."""
-        return {**super().described(sizes), **({"indicators": ("x",)} if self.hide else {})}
+    def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """Return the arguments, with indicators of x if entries are hidden."""
+        return {**super().model_arguments(sizes), **({"indicators": ("x",)} if self.hide else {})}
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """Laws by factor: that of x, and of static latents without parents, where `prior` is not "standard".
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return the distributions of x and, unless `prior` is "standard", of static latents without parents.
 
         Raises:
-            ValueError: a prior without such a latent.
+            ValueError: if `prior` is given but no latent is static and without parents.
         """
-        laws = super().laws()
+        distributions = super().distributions()
         if self.prior == "standard":
-            return laws
-        priors: dict[str, LawSpec] = {
+            return distributions
+        priors: dict[str, DistributionSpec] = {
             "mixture": Mixture(self.prior_components),
             "vamp": Vamp(self.prior_components, self.prior_steps),
             "flow": Flow(),
@@ -229,42 +233,45 @@ class LatentMethod(LikelihoodMethod):
         latents = [f.child for f in p.factors if f.child in q.variables and not (f.local or f.parents)]
         if not latents:
             raise ValueError(
-                f"prior={self.prior!r} is for a static latent without parents, such as p(w), which {p.text} does not "
-                'have; use prior="standard"'
+                f"prior={self.prior!r} needs a static latent without parents, such as p(w), but {p.text} does not "
+                'have one; use prior="standard"'
             )
-        return {**laws, **{f"p({name})": priors[self.prior] for name in latents}}
+        return {**distributions, **{f"p({name})": priors[self.prior] for name in latents}}
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """One stage that minimises the negative evidence, with warm-up, free bits and self-feeding as the options say.
+        """Return one stage that minimises the negative evidence.
+
+        The options set its warm-up, free bits and scheduled sampling.
 
         Raises:
-            ValueError: on preparing the model, the pseudo-sequences of a prior are longer than the windows.
-            SchemaError: entries are to be hidden of data of which nobody knows which are observed together.
+            ValueError: when the recipe prepares the model, if pseudo-sequences of the prior are longer than the
+                windows.
+            SchemaError: if `hide` is set and the schema does not define which entries are observed together.
         """
-        batches = Hiding(train, self.hide, Schema.of(train, self.name).together) if self.hide else train
+        batches = RandomMasking(train, self.hide, Schema.of(train, self.name).together) if self.hide else train
         return replace(super().train(batches, validation, steps), prepare=partial(start_priors, train=train))
 
     @override
     def objective(self) -> Objective:
-        """What training minimises."""
+        """Return the objective of training."""
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
         return Evidence(kl_weight=weight, free_bits=self.free_bits)
 
 
 def rising(level: float, steps: int) -> Ramp:
-    """From 0 to a level over a third of a run of `steps`, after its first tenth."""
+    """Return a ramp from 0 to `level` over a third of a run of `steps`, after its first tenth."""
     return Ramp(0.0, level, steps=max(steps // 3, 1), delay=steps // 10)
 
 
 def fit_units(model: DynamicalVAE, train: Any) -> None:
-    """Takes the units of x from 1024 windows of the training data, as the model sees them."""
+    """Fit the units of x to 1024 windows of the training data, as the model sees them."""
     seen = model.read(train.sample(1024, torch.default_generator), precise=True)
-    model.units[WHOLE].fit(bridged(seen[WHOLE], seen.mask()))
+    model.units[WHOLE].fit(interpolate_missing(seen[WHOLE], seen.mask()))
 
 
 def start_priors(model: DynamicalVAE, train: Any) -> None:
-    """Has the pseudo-sequences of Vamp priors start at windows of the training data, as the model sees them."""
-    for law in model.modules():
-        if isinstance(law, VampLaw):
-            law.start_at(model.read(train.sample(law.components, torch.default_generator)))
+    """Initialise the pseudo-sequences of Vamp priors with windows of the training data, as the model sees them."""
+    for distribution in model.modules():
+        if isinstance(distribution, VampModule):
+            distribution.start_at(model.read(train.sample(distribution.components, torch.default_generator)))

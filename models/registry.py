@@ -1,4 +1,4 @@
-"""Methods by name, of this package and of installed ones; the file of a method loads when it is used."""
+"""Registry of the methods of this package and of installed packages; a method's file is imported on first use."""
 
 from __future__ import annotations
 
@@ -51,29 +51,29 @@ METHODS = {
     "motion-latent": "dvae.models.motion.motion_latent:MotionLatent",
     "equations": "dvae.models.family.equations:Equations",
 }
-JUDGES = {
-    "pose-prior": "dvae.motion.judges.pose_prior:PosePrior",
-    "action-classifier": "dvae.motion.judges.action_classifier:ActionClassifier",
+METRIC_MODELS = {
+    "pose-prior": "dvae.motion.metric_models.pose_prior:PosePrior",
+    "action-classifier": "dvae.motion.metric_models.action_classifier:ActionClassifier",
 }
-"""What is fitted as methods are, and judges what they make."""
+"""Models that are fitted like methods and that evaluate what methods generate."""
 
 
 class Registry(UserDict[str, Any]):
-    """Names to classes, each imported when it is asked for.
+    """A mapping from names to classes, each imported on access.
 
     Args:
-        own: name to "module:class".
-        group: entry points of installed packages that add to them.
+        own: mapping from name to "module:class".
+        group: entry-point group through which installed packages add classes.
 
     Raises:
-        ValueError: an entry point with a name that exists.
+        ValueError: if an entry point has a name that already exists.
     """
 
     def __init__(self, own: Mapping[str, str], group: str) -> None:
         super().__init__({name: EntryPoint(name, place, group) for name, place in own.items()})
         for entry in entry_points(group=group):
             if entry.name in own:
-                raise ValueError(f"the entry point {entry.value} has a name that is taken in {group}: {entry.name}")
+                raise ValueError(f"the name of entry point {entry.value} is already taken in {group}: {entry.name}")
             self[entry.name] = entry
 
     @override
@@ -81,11 +81,11 @@ class Registry(UserDict[str, Any]):
         return self.data[name].load()  # type: ignore[no-any-return]
 
     def texts(self, name: str, *attributes: str) -> list[str | None]:
-        """Return attributes of a class, read from its file if they are literals: importing torch takes seconds.
+        """Return attributes of a class, read from its file if they are literals, because importing torch takes seconds.
 
         Args:
-            name: of a method or judge.
-            attributes: of the class or of its bases, such as "source".
+            name: name of a method or metric model.
+            attributes: attributes of the class or of its bases, such as "source".
 
         Returns:
             Their texts; None for an option of the method, which is a field of the dataclass.
@@ -137,7 +137,7 @@ def _literals(module: str, name: str) -> dict[str, str | None]:
 
 @cache
 def methods() -> Registry:
-    """Every known method by name: those of this package and of installed packages (entry points "dvae.methods").
+    """Return every known method by name: from this package and from installed ones (entry points "dvae.methods").
 
     Example:
         >>> "hit-dvae" in dvae.methods(), dvae.methods()["vae"].generative
@@ -147,16 +147,16 @@ def methods() -> Registry:
 
 
 @cache
-def judges() -> Registry:
-    """Every known judge by name (and by entry points "dvae.judges")."""
-    return Registry(JUDGES, "dvae.judges")
+def metric_models() -> Registry:
+    """Return every known metric model by name, including entry points "dvae.metric_models"."""
+    return Registry(METRIC_MODELS, "dvae.metric_models")
 
 
 def method(name: str, **options: Any) -> Method:
-    """A method by its name, with options in place of its defaults.
+    """Return a method by its name, with options in place of its defaults.
 
     Raises:
-        ValueError: an unknown name or option, with the nearest known one.
+        ValueError: if the name or an option is unknown; the message names the nearest known one.
 
     Example:
         >>> dvae.method("srnn", latent=8).build({"x": 48}).sizes["z"]
@@ -165,9 +165,9 @@ def method(name: str, **options: Any) -> Method:
     return _chosen(methods(), "method", name, options)  # type: ignore[no-any-return]
 
 
-def judge(name: str, **options: Any) -> Trainable:
-    """A judge by its name, likewise."""
-    return _chosen(judges(), "judge", name, options)  # type: ignore[no-any-return]
+def metric_model(name: str, **options: Any) -> Trainable:
+    """Return a metric model by its name, with options in place of its defaults."""
+    return _chosen(metric_models(), "metric model", name, options)  # type: ignore[no-any-return]
 
 
 def _chosen(table: Mapping[str, type[Any]], what: str, name: str, options: Mapping[str, Any]) -> Any:
@@ -184,9 +184,9 @@ def _chosen(table: Mapping[str, type[Any]], what: str, name: str, options: Mappi
 
 
 def configured(config: Mapping[str, Any]) -> Trainable:
-    """The method or judge that `Trainable.config` wrote."""
+    """Return the method or metric model of a configuration written by `Trainable.config`."""
     if "method" not in config:
-        raise ValueError(f"the configuration names no method: it holds {', '.join(config) or 'nothing'}")
+        raise ValueError(f"the configuration has no key 'method'; its keys are {', '.join(config) or '(none)'}")
     options = tuples(config)
     name = options.pop("method")
-    return judge(name, **options) if name in judges() else method(name, **options)
+    return metric_model(name, **options) if name in metric_models() else method(name, **options)

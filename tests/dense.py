@@ -13,7 +13,7 @@ import networkx as nx
 import numpy as np
 import torch
 
-from dvae.distributions import Law
+from dvae.distributions import ConditionalDistribution
 from dvae.factorization.notation import Factorization
 from dvae.factorization.relations import Relation
 from dvae.inference.bounds.elbo import SequenceELBO
@@ -59,7 +59,7 @@ def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):
                 for column in np.flatnonzero(factorization.mask(name, parent.name, padded)[row]):
                     value = values[parent.name, column + 1 if parent.local else None]
                     mean = mean + value @ network.weights[parent.name][row, column].T
-            log_scale = conditionals[name].law.log_scale
+            log_scale = conditionals[name].head.log_scale
             make(name, t, mean, (log_scale if log_scale.dim() == 1 else log_scale[row]).exp())
 
     bound = x.new_zeros(())
@@ -120,12 +120,14 @@ def library_bound(model, x, *, lengths=None, seen=None, fed=None, feeding=None):
         return points[:, used - width : used].reshape(shape)
 
     with ExitStack() as patched:
-        patched.enter_context(mock.patch.object(Law, "noise", lambda self, shape, like: take(shape)))
+        patched.enter_context(
+            mock.patch.object(ConditionalDistribution, "noise", lambda self, shape, like: take(shape))
+        )
         patched.enter_context(mock.patch("torch.distributions.normal._standard_normal", take))
         if fed is not None:  # frames with 0 are fed, those with 1 are not
             frames = (~fed).to(x.dtype).repeat(2 * noise, 1)[..., None]
             patched.enter_context(mock.patch("torch.rand", return_value=frames))
-        terms = SequenceELBO().terms(model, rows, self_feeding=feeding)
+        terms = SequenceELBO().terms(model, rows, scheduled_sampling=feeding)
     assert used == noise
     return terms.bound.unflatten(0, (2 * noise, batch)).mean(0)
 

@@ -32,10 +32,10 @@ LAYERS = {
 }
 # Motion is an application: beside itself, the methods and commands for it import it, and nothing else does.
 MOTION = re.compile(
-    r"dvae\.(motion|models\.motion|models\.baselines)\b|dvae\.cli\.(checks|data|fitting|futures|judging|opening|report|segments)$"
+    r"dvae\.(motion|models\.motion|models\.baselines)\b|dvae\.cli\.(checks|data|fitting|futures|assessment|loading|report|segments)$"
 )
 # Tables likewise, but that any method is fitted to them.
-TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(checks|data|fitting|futures|judging|opening|report|tables)$")
+TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(checks|data|fitting|futures|assessment|loading|report|tables)$")
 
 
 @cache
@@ -124,8 +124,8 @@ def test_registries_alone_name_motion():
     }
     assert {module: targets for module, targets in naming.items() if targets} == {
         "dvae.models.registry": {
-            "dvae.motion.judges.pose_prior.PosePrior",
-            "dvae.motion.judges.action_classifier.ActionClassifier",
+            "dvae.motion.metric_models.pose_prior.PosePrior",
+            "dvae.motion.metric_models.action_classifier.ActionClassifier",
         },
         "dvae.runs.kinds": {
             "dvae.motion.data.protocols.Poses",

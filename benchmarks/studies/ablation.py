@@ -1,4 +1,4 @@
-"""Writes the tables and the picture of docs/ablation.md: what arrows are worth, on twins and fitted."""
+"""Writes the tables and the picture of docs/ablation.md: what edges are worth, on surrogates and fitted."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import tyro
 
 import dvae
 from dvae.inference.evaluation.estimates import number
-from dvae.runs.ablation import Arrow
+from dvae.runs.ablation import AblatedEdge
 
 from .audits import FAMILY, spread
 from .pages import DOCS, code, words, write
@@ -21,12 +21,12 @@ SENSORS = (1.0, 0.7, 0.5)
 KEEPS, MOVES, NOISE, STEPS = 0.95, 0.3, 0.5, 20
 
 
-def twins(names: tuple[str, ...], steps: int, seeds: int) -> str:
-    """What each arrow of some models is worth."""
+def surrogates(names: tuple[str, ...], steps: int, seeds: int) -> str:
+    """What each edge of some models is worth."""
     models = {name: FAMILY[name][0] for name in names}
-    prices = {name: dvae.model_arrow_prices(model, steps=steps, seeds=seeds) for name, model in models.items()}
-    rows = [(n, code(models[n]), code(arrow), spread(price)) for n in names for arrow, price in prices[n].items()]
-    return words("", "model", "arrow", "price of leaving it out", rows=rows)
+    costs = {name: dvae.model_edge_costs(model, steps=steps, seeds=seeds) for name, model in models.items()}
+    rows = [(n, code(models[n]), code(edge), spread(cost)) for n in names for edge, cost in costs[n].items()]
+    return words("", "model", "edge", "cost of leaving it out", rows=rows)
 
 
 def sensors(path: Path, sequences: int = 600) -> dvae.tables.PanelData:
@@ -41,35 +41,35 @@ def sensors(path: Path, sequences: int = 600) -> dvae.tables.PanelData:
     return dvae.tables.PanelData.open(path, cut=dvae.tables.Cut(observed=15, horizon=5, split="sequence"))
 
 
-def exact(arrow: Arrow, found: dvae.Ablation) -> float:
-    """What an arrow is worth with the weights by which the data are made, in nats a step."""
-    if arrow.kind == "p":
+def exact(edge: AblatedEdge, found: dvae.Ablation) -> float:
+    """What an edge is worth with the weights by which the data are made, in nats a step."""
+    if edge.kind == "p":
         moves = MOVES**2 / (1 - KEEPS**2) * KEEPS ** np.abs(np.subtract.outer(range(STEPS), range(STEPS)))
         covariance = np.kron(moves, np.outer(SENSORS, SENSORS)) + NOISE**2 * np.eye(STEPS * len(SENSORS))
-        size = len(SENSORS) if arrow.child == "z" else 1  # of the blocks that are independent without it
+        size = len(SENSORS) if edge.child == "z" else 1  # of the blocks that are independent without it
         blocks = [covariance[k : k + size, k : k + size] for k in range(0, len(covariance), size)]
         return (sum(np.linalg.slogdet(b)[1] for b in blocks) - np.linalg.slogdet(covariance)[1]) / 2 / STEPS
-    less = found.inference.without(arrow.child, arrow.parent)
-    model = dvae.twin(found.generative, less, {"z": 1, "x": len(SENSORS)}, STEPS)
+    less = found.inference.without(edge.child, edge.parent)
+    model = dvae.linear_gaussian_surrogate(found.generative, less, {"z": 1, "x": len(SENSORS)}, STEPS)
     with torch.no_grad():
         z, x = model.generator["z"], model.generator["x"]
         z.network.bias.zero_(), x.network.bias.zero_()
         z.network.weights["z"].fill_(KEEPS)  # of those at t-1, as others are masked
         x.network.weights["z"][..., 0] = torch.tensor(SENSORS)
-        z.law.log_scale.fill_(np.log(MOVES))[0] = np.log(MOVES / np.sqrt(1 - KEEPS**2))
-        x.law.log_scale.fill_(np.log(NOISE))
+        z.head.log_scale.fill_(np.log(MOVES))[0] = np.log(MOVES / np.sqrt(1 - KEEPS**2))
+        x.head.log_scale.fill_(np.log(NOISE))
     return dvae.Oracle(model, STEPS).fit_guide() / STEPS
 
 
 def fitted(found: dvae.Ablation) -> str:
-    """All prices of each arrow."""
+    """All costs of each edge."""
     lines = []
-    for arrow in found.arrows:
-        costs, estimate = torch.tensor(found.prices[arrow.run]), found.differences[arrow.run]
+    for edge in found.edges:
+        costs, estimate = torch.tensor(found.costs[edge.run]), found.differences[edge.run]
         low, high = map(number, estimate.interval())
-        cells = [spread(costs), str(estimate), f"{low} to {high}", number(found.p_values[arrow.run])]
-        lines.append([code(arrow.name), arrow.of, *cells, f"{exact(arrow, found):.3f}"])
-    head = ("arrow", "of", "on twins, nats a sequence", "fitted, nats a step", "95 %", "p", "exact, nats a step")
+        cells = [spread(costs), str(estimate), f"{low} to {high}", number(found.p_values[edge.run])]
+        lines.append([code(edge.name), edge.of, *cells, f"{exact(edge, found):.3f}"])
+    head = ("edge", "of", "on surrogates, nats a sequence", "fitted, nats a step", "95 %", "p", "exact, nats a step")
     return words(*head, rows=lines)
 
 
@@ -88,17 +88,17 @@ def main(
         runs: directory of the fits, which are continued where they stopped.
         page: where the tables go.
         picture: where the drawing goes.
-        steps: of the sequences on twins.
-        seeds: twins of random weights.
+        steps: of the sequences on surrogates.
+        seeds: surrogates of random weights.
         fitting: steps of a fit.
         jobs: fits at a time.
     """
-    write(page, twins(NAMES, steps, seeds), name="twins")
+    write(page, surrogates(NAMES, steps, seeds), name="surrogates")
     generative, inference = LEVEL
     method = dvae.method("equations", generative=generative, inference=inference, latent=1, width=16, warm_up=100)
     data = sensors(runs / "sensors.npz")
-    on_twins = {"sizes": {"z": 1, "x": len(SENSORS)}, "steps": steps, "twins": seeds}
-    found = dvae.ablate(method, data, runs, (0, 1, 2), {**TRAINING, "steps": fitting}, jobs, **on_twins)
+    on_surrogates = {"sizes": {"z": 1, "x": len(SENSORS)}, "steps": steps, "surrogates": seeds}
+    found = dvae.ablate(method, data, runs, (0, 1, 2), {**TRAINING, "steps": fitting}, jobs, **on_surrogates)
     found.save(runs / "edges.json")
     write(page, fitted(found), name="fitted")
     found.plot().savefig(picture, dpi=100)

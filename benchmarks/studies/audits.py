@@ -14,26 +14,26 @@ from .pages import DOCS, code, table, words, write
 
 FAMILY: dict[str, tuple[str, str]] = settings(__file__)
 DERIVED = ("DKF", "SRNN", "DSAE", "HiT-DVAE", "two layers")
-"""Whose guides are derived, and their arrows priced."""
+"""Whose guides are derived, and their edges priced."""
 
 
-def spread(price: torch.Tensor) -> str:
+def spread(cost: torch.Tensor) -> str:
     """Mean, least and largest over random models."""
-    mean, least, largest = (number(float(value)) for value in (price.mean(), price.min(), price.max()))
+    mean, least, largest = (number(float(value)) for value in (cost.mean(), cost.min(), cost.max()))
     return f"{mean} ({least} to {largest})"
 
 
 def derived(names: Sequence[str]) -> str:
     """The guides of some models that miss nothing, by what they cost."""
     rows = [(name, code(guide), *rest) for name in names for guide, *rest in dvae.alternatives(FAMILY[name][0]).rows]
-    return table(["", "guide", "drawn", "arrows", "looped", "KL by draws"], rows, "|---|---|---|---:|---|---|")
+    return table(["", "guide", "drawn", "edges", "looped", "KL by draws"], rows, "|---|---|---|---:|---|---|")
 
 
-def arrows(names: Sequence[str], steps: int, seeds: int) -> str:
-    """What each arrow of the derived guide is worth by itself."""
-    prices = {name: dvae.arrow_prices(FAMILY[name][0], steps=steps, seeds=seeds) for name in names}
-    rows = [(name, code(arrow), spread(price)) for name, each in prices.items() for arrow, price in each.items()]
-    return words("", "arrow", "price of leaving it out", rows=rows)
+def edge_rows(names: Sequence[str], steps: int, seeds: int) -> str:
+    """What each edge of the derived guide is worth by itself."""
+    costs = {name: dvae.edge_costs(FAMILY[name][0], steps=steps, seeds=seeds) for name in names}
+    rows = [(name, code(edge), spread(cost)) for name, each in costs.items() for edge, cost in each.items()]
+    return words("", "edge", "cost of leaving it out", rows=rows)
 
 
 def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> list[str]:
@@ -44,8 +44,8 @@ def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> l
         for found in (audit.missing, audit.redundant)
     )
     sizes = dict.fromkeys((*audit.generative.variables,), 1)
-    price = dvae.price(generative, inference, sizes, steps=steps, seeds=seeds)
-    return [name, code(generative), code(inference), missing, redundant, spread(price)]
+    cost = dvae.kl_gap(generative, inference, sizes, steps=steps, seeds=seeds)
+    return [name, code(generative), code(inference), missing, redundant, spread(cost)]
 
 
 def main(page: Path = DOCS / "audits.md", steps: int = 5, seeds: int = 5) -> None:
@@ -53,14 +53,14 @@ def main(page: Path = DOCS / "audits.md", steps: int = 5, seeds: int = 5) -> Non
 
     Args:
         page: where.
-        steps: of the sequences whose price is computed.
+        steps: of the sequences whose cost is computed.
         seeds: models of random weights.
     """
     rows = [row(name, *equations, steps, seeds) for name, equations in FAMILY.items()]
-    write(page, words("", "model", "guide", "missing", "redundant", "price", rows=rows))
+    write(page, words("", "model", "guide", "missing", "redundant", "cost", rows=rows))
     names = [name for name in DERIVED if name in FAMILY]
     write(page, derived(names), name="derived")
-    write(page, arrows(names, steps, seeds), name="arrows")
+    write(page, edge_rows(names, steps, seeds), name="edges")
 
 
 if __name__ == "__main__":

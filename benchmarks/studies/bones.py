@@ -39,7 +39,7 @@ def joined(files: Sequence[Path]) -> dvae.Evaluation:
     found = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
     first = next(iter(found.values()))
     if any(same(each) != same(first) for each in found.values()):
-        sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or judges")
+        sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or metric models")
     if len(found) < len(files):
         sys.exit("two of these runs have one name; a row has the name of its directory")
     rows = {name: row for name, row in first.rows.items() if not row.config}

@@ -23,7 +23,7 @@ TEMPERATURES = (10, 30, 100)
 
 def fitted(inference: str, steps: int, fitting: int, scale: float = 0.5) -> tuple[dvae.DynamicalVAE, dvae.Oracle]:
     """The best guide of a factorization."""
-    model = dvae.twin(MODEL, inference, {"z": 1, "x": 1}, steps, scale=scale)
+    model = dvae.linear_gaussian_surrogate(MODEL, inference, {"z": 1, "x": 1}, steps, scale=scale)
     oracle = dvae.Oracle(model, steps)
     oracle.fit_guide(fitting)
     torch.manual_seed(0)
@@ -49,8 +49,8 @@ def row(name: str, inference: str, steps: int, sequences: int, particles: int, f
     x = model.sample(sequences, steps)["x"]
     evidence = oracle.evidence(x)
     exact = (evidence - oracle.bound(x)).mean()
-    bounds = [dvae.importance_bound(model, x, particles).bound]
-    bounds += [dvae.particle_bound(model, x, particles, resample_below=share).bound for share in (0.25, 0.5, 1.0)]
+    bounds = [dvae.iwae_bound(model, x, particles).bound]
+    bounds += [dvae.fivo_bound(model, x, particles, resample_below=share).bound for share in (0.25, 0.5, 1.0)]
     gaps = [evidence - bound for bound in bounds]
     cells = [f"{gap.mean():.2f} ± {gap.std() / sequences**0.5:.2f}" for gap in gaps]
     return [f"{code(inference)}, {name}", f"{exact:.2f}", *cells]

@@ -11,7 +11,7 @@ import torch
 import tyro
 
 import dvae
-from dvae.inference.diagnostics.bracket import told
+from dvae.inference.diagnostics.bracket import format_estimate
 
 from .bounds import GUIDES, fitted
 from .pages import DOCS, code, loaded, table, write
@@ -28,9 +28,15 @@ def known(name: str, inference: str, steps: int, count: int, fitting: int) -> li
     order = torch.randperm(count, generator=torch.Generator().manual_seed(found.seed))
     off = torch.as_tensor(found.bounds["real"]["AIS"]) - evidence[order]
     gap, width = found.gap(), found.gap("simulated")["unknown"]
-    parts = [told(gap[part]) for part in ("amortisation", "missing arrows", "family")]
+    parts = [format_estimate(gap[part]) for part in ("amortisation", "missing edges", "family")]
     error = f"{off.mean():.3f} ± {off.std() / count**0.5:.3f}"
-    return [f"{code(inference)}, {name}", f"{(evidence - oracle.bound(x)).mean():.2f}", *parts, error, told(width)]
+    return [
+        f"{code(inference)}, {name}",
+        f"{(evidence - oracle.bound(x)).mean():.2f}",
+        *parts,
+        error,
+        format_estimate(width),
+    ]
 
 
 def bracketed(run: Path, kept: Path, count: int, fitting: int, reach: int) -> dvae.Bracket:
@@ -49,8 +55,8 @@ def row(name: str, found: dvae.Bracket) -> list[str]:
     above = [
         found.estimate(bound, "ELBO") if bound in found.bounds["real"] else None for bound in ("IWAE", "FIVO", "AIS")
     ]
-    parts = [real.get(part) for part in ("amortisation", "missing arrows", "family")]
-    cells = ["–" if each is None else told(each) for each in (*above, *parts, simulated["unknown"])]
+    parts = [real.get(part) for part in ("amortisation", "missing edges", "family")]
+    cells = ["–" if each is None else format_estimate(each) for each in (*above, *parts, simulated["unknown"])]
     return [f"{name}, {code(found.equations['inference'])}", *cells]
 
 
@@ -76,7 +82,7 @@ def main(
     """
     torch.set_num_threads(1)
     kept.mkdir(parents=True, exist_ok=True)
-    parts = ["amortisation", "missing arrows", "family"]
+    parts = ["amortisation", "missing edges", "family"]
     rows = [known(name, inference, steps, count, fitting) for name, inference in GUIDES.items()]
     write(page, table(["", "evidence - ELBO", *parts, "AIS - evidence", "upper - AIS"], rows), name="parts")
     rows = [row(run.name, bracketed(run, kept, count, fitting, reach)) for run in runs]

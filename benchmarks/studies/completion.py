@@ -30,7 +30,7 @@ from torch import Tensor
 import dvae
 from dvae import motion
 from dvae.data.batch import WHOLE
-from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.result import new_figure
 from dvae.motion import bodies
 from dvae.motion.geometry.rotations import to_matrix
 from dvae.motion.geometry.skeleton import rotate_about_up
@@ -40,11 +40,11 @@ from dvae.motion.segments.completion import (
     chamfer,
     complete,
     error_by_time,
-    glimpsed,
-    scanned,
+    sample_surfaces,
+    simulate_observations,
     surfaces_at,
 )
-from dvae.motion.segments.dataset import SegmentData, thinned
+from dvae.motion.segments.dataset import SegmentData, subsample_clips
 from dvae.motion.segments.embodied import SHAPE, Segments
 
 from .engine import OURS, Row, fitted, folder, interval, kept, read_all, spread
@@ -115,7 +115,7 @@ class Sight:
         kinds = ["points"] * bool(self.points) + ["markers"] * self.markers
         seen = {"times": model.timed.times(x)[:, frames]}
         for kind in kinds:
-            seen |= glimpsed(model, x, batch[SHAPE], kind, frames=frames.tolist(), points=self.points)
+            seen |= simulate_observations(model, x, batch[SHAPE], kind, frames=frames.tolist(), points=self.points)
         return seen
 
 
@@ -135,7 +135,7 @@ class Beginning:
     def of(self, model: Any, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """At the rate of the data."""
         fps = model.timed.skeleton.fps
-        seen = glimpsed(model, batch[WHOLE], batch[SHAPE], "surfaces", fps=fps, seconds=SECONDS)
+        seen = simulate_observations(model, batch[WHOLE], batch[SHAPE], "surfaces", fps=fps, seconds=SECONDS)
         return {**seen, SHAPE: batch[SHAPE]} if self.told else seen
 
 
@@ -206,7 +206,7 @@ class Held:
     def segments(self) -> Segments:
         """Those of the test, evenly over all."""
         clips = self.split("test")[:: self.budget.every]
-        return self.seen(thinned(clips, self.budget.some) if self.some else clips)
+        return self.seen(subsample_clips(clips, self.budget.some) if self.some else clips)
 
     @cached_property
     def batch(self) -> Mapping[str, Tensor]:
@@ -217,7 +217,7 @@ class Held:
         self, seen: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
     ) -> Completed:
         """From what was seen, and known segments for training."""
-        known = self.seen(thinned(self.split("train"), self.budget.known)).all()
+        known = self.seen(subsample_clips(self.split("train"), self.budget.known)).all()
         how: dict[str, Any] = {"deviations": deviations, "descent": descent, "aggregate": aggregate}
         return complete(self.model, seen, **how, known=known)
 
@@ -276,7 +276,7 @@ def recurrent(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
     """Residual-sup, fitted, or gone on with where it was stopped."""
     segments = data.segments
     sources = {clip.labels["source"] for clip in segments if clip.split == "train"}
-    takes = bodies.fitted(data.motion, bodies.human())
+    takes = bodies.fit_to_body(data.motion, bodies.human())
     takes = replace(takes, clips=[clip for clip in takes if clip.split == "train" and clip.name in sources])
     opened = motion.MotionData(str(data.path), takes, protocol(takes.skeleton.fps))
     training = {"steps": steps, "validate_every": max(steps // 3, 1), **TRAINING}
@@ -350,7 +350,7 @@ def completed(held: Held, sight: Sight) -> dict[str, Any]:
     for n in range(len(batch[WHOLE])):
         one = slice(n, n + 1)
         made, truth = model.vertices(done.x[one], done.shape[one]), model.vertices(batch[WHOLE][one], batch[SHAPE][one])
-        points = scanned(truth, model.body.faces, held.budget.dense, generator)
+        points = sample_surfaces(truth, model.body.faces, held.budget.dense, generator)
         found["chamfer"].append(chamfer(points, made).mean(-1))
         found["floor"].append(chamfer(points, truth).mean(-1))
         found["vertices"].append(bodies.vertex_error(made, truth))
@@ -511,7 +511,7 @@ def draw(out: Path, file: Path) -> None:
     drawn, crossed = curves(out), of_sights(out, [sight for sights in SIGHTS.values() for sight in sights])
     if not drawn and not crossed:
         return
-    figure = canvas(14, 3.4)
+    figure = new_figure(14, 3.4)
     first, *panels = figure.subplots(1, 3)
     highest = 0.0  # of all but the last frame held, which leaves the picture
     for name, row in drawn.items():

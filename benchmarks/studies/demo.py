@@ -53,7 +53,7 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
     for name, run in runs.items():
         steps = max(round(share * STEPS[name]), 1)
         loss = {"loss": "evidence"} if name == "hit-dvae" else {}  # its paper's takes longer
-        method = dvae.method(name, latent=8, self_feeding=1.0, warm_up=steps // 3, **loss)
+        method = dvae.method(name, latent=8, scheduled_sampling=1.0, warm_up=steps // 3, **loss)
         print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
         training = dvae.Training(steps=steps, batch_size=32, learning_rate=RATES[name], decay=0.5)
         result = fitted(method, data, run, training)

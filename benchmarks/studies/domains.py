@@ -32,7 +32,7 @@ FORECASTS = 100
 BASELINE = "autoregressive"
 AT_ONCE, HELD = 2**14, 2**17
 """Steps of sequences, padding included, to score at once, and to hold times particles."""
-BOUND, ELBO, FIVO, SDR, KHAT = "importance bound", "ELBO", "FIVO", "SI-SDR", "k-hat"
+BOUND, ELBO, FIVO, SDR, KHAT = "IWAE bound", "ELBO", "FIVO", "SI-SDR", "k-hat"
 UNFILTERED = ("rvae-noncausal",)
 """Whose observations read latents after them, so that no filter can run."""
 REVIEW = {
@@ -98,7 +98,7 @@ class Data:
     def cut(self, cut: Cut) -> PanelData:
         """Cut otherwise."""
         panel = self.training.panel
-        return PanelData(self.name, panel, PanelSchema.under(panel, cut))
+        return PanelData(self.name, panel, PanelSchema.from_data(panel, cut))
 
     @cached_property
     def whole(self) -> PanelData:
@@ -163,13 +163,13 @@ def measured(model: Any, case: str, data: Data, part: str, seed: int) -> dict[st
     sound, clips = np.zeros(count), [key[1] for key in windows.keys]
     torch.manual_seed(seed)
     for rows, some in pieces(batch):
-        bound = dvae.importance_bound(model, some, particles=particles, chunk=HELD // some["x"].shape[1])
+        bound = dvae.iwae_bound(model, some, particles=particles, chunk=HELD // some["x"].shape[1])
         with torch.no_grad():
             terms = dvae.SequenceELBO(num_particles=10 if model.latents else 1).terms(model, some)
         found = {BOUND: bound.bound, KHAT: bound.khat, ELBO: terms.bound}
         found |= {f"KL {latent}": terms.kl[latent] for latent in model.latents}
         if FIVO in scores:
-            found[FIVO] = dvae.particle_bound(model, some, particles, chunk=AT_ONCE).bound
+            found[FIVO] = dvae.fivo_bound(model, some, particles, chunk=AT_ONCE).bound
         for name, values in found.items():
             scores[name][rows] = values.double() / (1 if name == KHAT else lengths[rows])
         if data.name == "speech":
@@ -201,7 +201,7 @@ def run(data: Data, part: str, case: str, seed: int, out: Path) -> dict[str, Any
     """Fits and scores a case."""
     section, opened = SECTIONS[data.name], data.training
     chosen = section.cases[case]
-    method = dvae.method(case, **{"self_feeding": 0.0, **chosen["options"]})
+    method = dvae.method(case, **{"scheduled_sampling": 0.0, **chosen["options"]})
     training = {**section.training, **chosen.get("training", {})}
     windows, validation = opened.windows("train"), opened.windows("validation")
     source = Alike(windows) if "lengths" in windows.all() else windows

@@ -27,7 +27,7 @@ import torch
 
 import dvae
 from dvae import files
-from dvae.inference.evaluation.estimates import Crossed, Estimate
+from dvae.inference.evaluation.estimates import Estimate, TwoWayErrors
 from dvae.inference.evaluation.record import plain
 from dvae.inference.training.checkpoints import Run
 from dvae.inference.training.fit import Fit
@@ -154,7 +154,7 @@ class Row:
         """Return weighted means (S,) of a score."""
         return np.average(self.values(score), 1, self.parts[0]["weights"])
 
-    def crossed(self, score: str, minus: Row | None = None) -> Crossed | None:
+    def crossed(self, score: str, minus: Row | None = None) -> TwoWayErrors | None:
         """Return a score by seed and clip, or its paired difference to another row; None if a score is missing."""
         values, others = self.values(score), 0.0 if minus is None else minus.values(score)
         if values is None or others is None:
@@ -166,9 +166,9 @@ class Row:
         values, clips, weights = values[:, there], np.array(first["clips"])[there], np.array(first["weights"])[there]
         order = {clip: place for place, clip in enumerate(dict.fromkeys(clips))}
         if len(order) == len(clips):  # no sum that is divided again, so that equal seeds have no error
-            found = Crossed.of(values, weights)
+            found = TwoWayErrors.of(values, weights)
         else:
-            found = Crossed.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))
+            found = TwoWayErrors.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))
         return found if self.trained else replace(found, seeds=0.0, rest=0.0, count=sys.maxsize)
 
     def estimate(self, score: str, other: Row | None = None) -> Estimate | None:
@@ -211,9 +211,12 @@ class Archive:
         if self.file.exists():
             with zipfile.ZipFile(self.file) as opened:
                 contents = {name: opened.read(name) for name in opened.namelist()} | contents
-        with files.written(self.file) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as out:
+        with (
+            files.atomic_write(self.file) as new,
+            zipfile.ZipFile(new, "w", zipfile.ZIP_LZMA) as out,
+        ):
             for name in sorted(contents):
-                out.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_DEFLATED, 9)
+                out.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_LZMA)
 
 
 def read(path: Path, cases: Iterable[str], file: str = MEASURED) -> dict[str, Row]:
@@ -247,7 +250,7 @@ def cell(found: Estimate | None) -> str:
 
 
 def interval(found: Estimate | None, digits: int = 1, *, alone: bool = False) -> str:
-    """Format the 95 % interval from both errors; with `alone` and one seed, from the error over clips."""
+    """Format the 95 % interval from both errors; with `serialized` and one seed, from the error over clips."""
     if found is None or (np.isnan(found.total) and not alone):
         return "–"
     low, high = found.interval(error="sequences" if np.isnan(found.total) else "total")

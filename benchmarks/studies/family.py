@@ -29,7 +29,7 @@ def tables(comparison: dvae.Comparison) -> list[str]:
         )
 
     forced: dict[str, Callable[[str], str]] = {
-        f"importance bound, K = {comparison.particles}": lambda name: said(comparison[name]["importance bound"], 2),
+        f"IWAE bound, K = {comparison.particles}": lambda name: said(comparison[name]["IWAE bound"], 2),
         "difference to the best": lambda name: said(None if name == best else comparison.difference(name, best), 2),
         "ELBO": lambda name: f"{comparison[name]['ELBO'].mean:.2f}",
         "k-hat > 0.7": lambda name: f"{100 * comparison.rows[name].unreliable:.0f} %",

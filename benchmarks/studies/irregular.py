@@ -18,7 +18,7 @@ import tyro
 
 import dvae
 from dvae import distributions
-from dvae.data.sequences import gaps
+from dvae.data.sequences import time_since_previous
 from dvae.data.units import Coordinate
 from dvae.inference.training.checkpoints import Run
 from dvae.networks import Dense, LinearSDE, LinearSDEGuide, Recurrent
@@ -58,7 +58,7 @@ def batch_of(sequences: Utterances, share: float, seed: int) -> dict[str, torch.
     for row, (one, places) in enumerate(zip(sequences, kept, strict=True)):
         x[row, : len(places)] = torch.from_numpy(one[places])
         times[row, : len(places)] = torch.from_numpy(places)
-    return {"x": x, "d": gaps(times, lengths), "lengths": lengths}
+    return {"x": x, "d": time_since_previous(times, lengths), "lengths": lengths}
 
 
 def frames(batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -101,7 +101,7 @@ def run(latent: int, part: str, fitted_on: str, seed: int, out: Path) -> dict[st
     found: dict[str, Any] = {"seconds": fit.processor_seconds}
     for judged_on, share in KEPT.items():
         batch = batch_of(utterances(part), share, JUDGED)
-        bound = dvae.particle_bound(model, batch, particles=PARTICLES).bound.double() / batch["lengths"]
+        bound = dvae.fivo_bound(model, batch, particles=PARTICLES).bound.double() / batch["lengths"]
         weights, rows = batch["lengths"].tolist(), {OURS: {"bound": bound.tolist()}}
         found[judged_on] = {"clips": [*range(len(weights))], "weights": weights, "rows": rows}
     return found
@@ -110,9 +110,9 @@ def run(latent: int, part: str, fitted_on: str, seed: int, out: Path) -> dict[st
 def apart(part: str) -> dict[str, float]:
     """The density of frames of a part under the normal of training frames, each apart from the others."""
     known = torch.from_numpy(np.concatenate(utterances("train")))
-    law = torch.distributions.MultivariateNormal(known.mean(0), known.T.cov())
+    distribution = torch.distributions.MultivariateNormal(known.mean(0), known.T.cov())
     return {
-        judged_on: float(law.log_prob(frames(batch_of(utterances(part), share, JUDGED)).double()).mean())
+        judged_on: float(distribution.log_prob(frames(batch_of(utterances(part), share, JUDGED)).double()).mean())
         for judged_on, share in KEPT.items()
     }
 

@@ -22,14 +22,14 @@ from torch.distributions import Normal
 
 import dvae
 from dvae import motion
-from dvae.inference.bounds.probe import Redrawn
-from dvae.inference.evaluation.held import reproducibly
+from dvae.inference.bounds.probe import RedrawnModel
+from dvae.inference.evaluation.evaluation_windows import seeded_evaluation
 from dvae.inference.evaluation.record import plain
-from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.result import new_figure
 from dvae.inference.evaluation.scores import Measure
 from dvae.models.motion.codes import CodeDiversity, code_diversity
 from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
-from dvae.motion.judges.quality import STILL, RealOrMade, quality
+from dvae.motion.metric_models.quality import STILL, RealOrGenerated, quality
 
 from .engine import OURS, Row, budget, fitted, folder, measure, read, scores_of, settings, spread
 from .pages import DOCS, table, tabled, write
@@ -44,8 +44,8 @@ FUTURES = 500
 WATCHED = 50
 """Observations whose codes are."""
 JUDGED: dict[str, Any] = {"width": 64}
-JUDGE: dict[str, Any] = {"optimizer": "adam", "learning_rate": 2e-3, "momentum": 0.0, "batch_size": 128}
-JUDGE |= {"examples": 4000, "steps": 400}
+METRIC_MODEL: dict[str, Any] = {"optimizer": "adam", "learning_rate": 2e-3, "momentum": 0.0, "batch_size": 128}
+METRIC_MODEL |= {"examples": 4000, "steps": 400}
 PROBE, NOTHING = {"z": Normal(50.0, 50**0.5)}, {"z": Normal(0.0, 1e-6)}
 SCORES = ("APD", "ADE", "FDE", "jerk")
 PROBED, UNSAID = "probed", "unsaid"
@@ -133,9 +133,9 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
     how = {"seed": seed, "progress": False}
     forecasts = {**how, "scores": some_scores, "batch_size": 64}
     samples = SAMPLES if noise else 1
-    models = {OURS: model, **({PROBED: Redrawn(model, PROBE)} if noise and full else {})}
+    models = {OURS: model, **({PROBED: RedrawnModel(model, PROBE)} if noise and full else {})}
     scored = dvae.evaluate(models, test, samples=samples, **forecasts)
-    told = {"method": RealOrMade(**JUDGED), "seeds": (seed,), "references": case == "mix", **how, **JUDGE}
+    told = {"method": RealOrGenerated(**JUDGED), "seeds": (seed,), "references": case == "mix", **how, **METRIC_MODEL}
     judged = quality({OURS: model}, train, test, **told)
     futures = {
         name: {score: row[score][0] for score in row} | {score: scored.rows[name].clip_means[score] for score in SCORES}
@@ -157,9 +157,9 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
     if method.noise == "mix" and noise:
         # the diversity of codes with indices drawn once, in units of that with all drawn, and that of futures with z at
         # 0, whose indices alone differ, likewise
-        with reproducibly(model, seed):
+        with seeded_evaluation(model, seed):
             drawn, once = (code_diversity(model, batch).mean() for batch in (past, model.read(past)))
-        unsaid = dvae.evaluate({OURS: model, UNSAID: Redrawn(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts)
+        unsaid = dvae.evaluate({OURS: model, UNSAID: RedrawnModel(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts)
         found |= {"latent": float(once / drawn), "indices": unsaid.ratio(UNSAID, OURS, "APD").mean}
     return found
 
@@ -228,7 +228,7 @@ def tables(name: str, found: Mapping[str, Row]) -> list[str]:
 def draw(found: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None:
     """Codes over training, one panel for each way; and quality against diversity."""
     ways = {name: row.of("futures") for name, row in heard(found).items()}
-    figure = canvas(14, 3)
+    figure = new_figure(14, 3)
     *panels, last = figure.subplots(1, len(ways) + 1)
     for panel, (name, way) in zip(panels, ways.items(), strict=True):
         for run in way.runs:

@@ -19,7 +19,8 @@ import tyro
 
 import dvae
 from dvae import motion
-from dvae.inference.evaluation.result import canvas
+from dvae.data import Batch
+from dvae.inference.evaluation.result import new_figure
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate
@@ -31,7 +32,7 @@ from .pages import DOCS, tabled, write
 TUNING, HELD = "tuning", "held out"
 SAME, OTHER = "same source", "other source"
 GROUPS = {"A": "train", "B": "test"}
-"""Of bandai2: what trains and what judges where options are chosen, whatever the file's own split."""
+"""Of bandai2: what trains and what tests where options are chosen, whatever the file's own split."""
 TRAINING: dict[str, Any] = {"batch_size": 64, "validate_every": 250}
 PAIRS, STEPS = 200, 9
 """Of walks and runs that are interpolated, and the steps of each, both ends included."""
@@ -75,7 +76,7 @@ def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
     for side in ("left", "right"):
         own = [np.flatnonzero([kind == (content, side) for kind in kinds]) for content in ("walk", "run")]
         ends.append(np.stack([generator.choice(those, PAIRS // 2) for those in own]))
-    first, second = (test.all().rows(some) for some in np.concatenate(ends, 1))
+    first, second = (Batch(test.all()).rows(some) for some in np.concatenate(ends, 1))
     found = interpolate(model, first, second, STEPS)
     lasts = [test.timed.lasts(batch["x"]) for batch in (first, second)]
     falling, shorter = falls(found.durations), (lasts[1] < lasts[0]).to(found.durations.device)
@@ -156,7 +157,7 @@ def tables(section: str, cases: Mapping[str, Row]) -> list[str]:
 def draw(held: Mapping[str, Row], tuned: Mapping[str, Row], file: Path) -> None:
     """Boxes by Tukey of both test sets and of what is varied; and how long steps from walks to runs last."""
     tests, swept = next(iter(held.values())).runs[0]["tests"] if held else [], CASES["swept"]
-    figure = canvas(3.2 * (len(tests) + len(swept) + 1), 3.4)
+    figure = new_figure(3.2 * (len(tests) + len(swept) + 1), 3.4)
     panels = iter(figure.subplots(1, len(tests) + len(swept) + 1))
 
     def boxes(title: str, rows: Mapping[str, np.ndarray]) -> None:

@@ -31,7 +31,7 @@ CLEAR = "%reset -f\nimport matplotlib.pyplot, pyro\nmatplotlib.pyplot.close('all
 SHORT = """
 from functools import partial
 from dvae.models.motion import energies
-from dvae.motion.judges.pose_prior import fit_pose_prior
+from dvae.motion.metric_models.pose_prior import fit_pose_prior
 energies.fit_pose_prior = partial(fit_pose_prior, steps={steps})
 %reset -f"""
 """And where it trains less: methods that fit a pose prior first do not tell its steps."""

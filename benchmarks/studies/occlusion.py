@@ -16,16 +16,17 @@ from torch import Tensor
 
 import dvae
 from dvae import motion
-from dvae.data.sequences import bridged
-from dvae.inference.evaluation.held import clip_places
+from dvae.data import Batch
+from dvae.data.sequences import interpolate_missing
+from dvae.inference.evaluation.estimates import clustered_variance, linearised
+from dvae.inference.evaluation.evaluation_windows import clip_index
 from dvae.inference.evaluation.references import distances
-from dvae.inference.evaluation.uncertainty import clustered_variance, linearised
 
 from .pages import DOCS, table, write
 
 METHODS: dict[str, dict[str, Any]] = {
-    "srnn": {"residual": 0.9, "self_feeding": 0.0},
-    "hit-dvae": {"loss": "evidence", "heading": True, "self_feeding": 0.0},
+    "srnn": {"residual": 0.9, "scheduled_sampling": 0.0},
+    "hit-dvae": {"loss": "evidence", "heading": True, "scheduled_sampling": 0.0},
 }
 """With options that suit teacher-forced filling; the rest are the presets."""
 STEPS = {"srnn": 1500, "hit-dvae": 250}
@@ -47,12 +48,12 @@ def neighbours(windows: motion.Windows, training: motion.Windows, batch: Mapping
     view = motion.Heading(windows.skeleton, windows.protocol.observed)
 
     def turned(each: Mapping[str, Tensor]) -> dict[str, Any]:
-        return view({**each, "mask": {"x": each["mask"]}})
+        return view(Batch({**each, "mask": {"x": each["mask"]}}))
 
     given, known = turned(batch), turned(training.all())
     gaps = [each["mask"]["x"].flatten(1) for each in (given, known)]
     nearest = distances(given["x"].flatten(1), known["x"].flatten(1), *gaps).topk(NEIGHBOURS, largest=False).indices
-    filled = bridged(known["x"], known["mask"]["x"])
+    filled = interpolate_missing(known["x"], known["mask"]["x"])
     means = torch.stack([filled[some].mean(0) for some in nearest])
     return view.inverse({"x": means, "heading": given["heading"]})["x"]
 
@@ -89,7 +90,7 @@ def fitted(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
     """A method, fitted to what is not hidden."""
     train = data.windows("train")
     torch.manual_seed(seed)
-    method = dvae.method(name, **METHODS[name], warm_up=steps // 3).suited(train)
+    method = dvae.method(name, **METHODS[name], warm_up=steps // 3).resolve_defaults(train)
     model = method.build(data.schema)
     recipe = method.train(train, None, steps)
     dvae.fit(model, recipe, batch_size=32, learning_rate=2e-3, decay=0.5, seed=seed, progress=False)
@@ -124,7 +125,7 @@ def main(
     opened = motion.MotionData(str(data), motion.occlude(whole, share, length), motion.PROTOCOLS[protocol])
     test, training = opened.windows("test"), opened.windows("train+validation")
     batch, truth = test.all(stride), motion.windows(whole, opened.protocol, "test").all(stride)["x"]
-    places = clip_places(test.index(stride)).numpy()
+    places = clip_index(test.index(stride)).numpy()
     gaps = bursts(batch["mask"]).unflatten(-1, (-1, 3))[..., 0]
 
     weights = sums(torch.ones_like(gaps), gaps, places)
@@ -136,7 +137,7 @@ def main(
         return means((x - truth).unflatten(-1, (-1, 3)).norm(dim=-1))
 
     made = {
-        "straight line": [errors(bridged(batch["x"], batch["mask"]))],
+        "straight line": [errors(interpolate_missing(batch["x"], batch["mask"]))],
         f"{NEIGHBOURS} neighbours": [errors(neighbours(test, training, batch))],
     }
     spreads: dict[str, list[np.ndarray]] = {}

@@ -35,7 +35,7 @@ def main(out: Path = DOCS / "img" / "overview.png", steps: int = 6000, clips: in
         inference="q(w | x_{1:T}) q(z_t | x_{1:T}, w)",
         sizes={"w": 16, "z": 16, "x": train.size},
         network=dvae.networks.Recurrent(width=64),
-        laws={"p(x)": dvae.distributions.FixedNormal(scale=0.1, learned=True)},
+        distributions={"p(x)": dvae.distributions.FixedNormal(scale=0.1, learned=True)},
     )
     dvae.fit(model, train, validation, steps=steps, batch_size=16, learning_rate=6e-3, decay=0.5)
 

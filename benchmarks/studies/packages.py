@@ -1,6 +1,6 @@
-"""Draws docs/img/packages.png, the picture of docs/walk.md: packages as boxes, who imports whom as arrows.
+"""Draws docs/img/packages.png, the picture of docs/walk.md: packages as boxes, who imports whom as edges.
 
-It is drawn from the imports in the files. Every box is above all that it imports; an arrow that others make
+It is drawn from the imports in the files. Every box is above all that it imports; an edge that others make
 superfluous is left out, and one upward, which there should not be, is red.
 """
 
@@ -19,7 +19,7 @@ from matplotlib.patches import FancyBboxPatch
 from .pages import DOCS
 
 ROOT = DOCS.parent / "dvae"
-EVERYWHERE = {"command", "files", "options", "turns", "lazy", "constants"}
+EVERYWHERE = {"command", "files", "options", "locking", "lazy", "constants"}
 """Small modules that many use and nobody looks for."""
 
 WALK = {
@@ -77,7 +77,7 @@ def storeys(graph: nx.DiGraph) -> list[list[str]]:
 
 
 def draw(graph: nx.DiGraph, ax: Axes) -> None:
-    """Boxes on their floors, arrows down."""
+    """Boxes on their floors, edges down."""
     floors, width, height = storeys(graph), 2.3, 0.62
     places: dict[str, tuple[float, float]] = {}
     for level, floor in enumerate(floors):

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.result import new_figure
 
 from .engine import Row, cell, settings
 from .pages import DOCS, refuse_unknown, table, write
@@ -189,7 +189,7 @@ PATHED = ("ADE", "FDE", "energy score")
 
 def drawn(found: Found, paper: Paper) -> Figure:
     """Scores by how many paths are given, of the seeds that have all, with intervals over clips, and these seeds."""
-    figure = canvas(11, 3)
+    figure = new_figure(11, 3)
     for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
         for row in (NEIGHBOURS, *paper.rows):
             own = {view.given: rows[row] for view, rows in found.items() if row in rows}
@@ -235,7 +235,7 @@ def main(
         rows: of these alone; all of a paper where none is named.
         seeds: of every row.
         samples: futures of a window.
-        stored: the folder of scores and judges.
+        stored: the folder of scores and metric models.
         accelerator: on which to train and to forecast, as of `benchmarks.studies.ranking`.
         pages: the folder of the pages; without one tables are printed.
         pictures: the folder of the pictures, which are drawn with the pages.

@@ -1,9 +1,11 @@
-"""Writes the table of TrajeVAE's priors of docs/results/trajevae.md: how they fit the posteriors, and other laws.
+"""Writes the table of TrajeVAE's priors of docs/results/trajevae.md: how they fit the posteriors, and other
+distributions.
 
 z, drawn from a window's posterior, is as far from the prior's mean as a draw of the prior where the prior is as wide as
 the posteriors ask: one, in units of the prior's deviation, root mean square. Below it the prior is too wide, above it
-too narrow. What that does is told by the same decoder with other laws of z: the prior with its deviations multiplied,
-and with the mean, the deviation, or both, of the posteriors of all training windows together, number by number.
+too narrow. What that does is told by the same decoder with other distributions of z: the prior with its deviations
+multiplied, and with the mean, the deviation, or both, of the posteriors of all training windows together, number by
+number.
 """
 
 from __future__ import annotations
@@ -37,13 +39,13 @@ LAWS: dict[str, tuple[float, tuple[str, ...]]] = {
 """By their columns: what the prior's deviations are multiplied by, and what is the posteriors' together."""
 BETWEEN = (0.05, 0.95)
 """Quantiles over the numbers of z."""
-Law = tuple[Tensor, Tensor]
+Distribution = tuple[Tensor, Tensor]
 
 
 @torch.no_grad()
-def law(model: Any, factor: Any, windows: Any) -> Law:
+def distribution(model: Any, factor: Any, windows: Any) -> Distribution:
     """Means and deviations of z, (N, T, D), by the guide or the prior; of the coefficients that are read."""
-    found: list[Law] = []
+    found: list[Distribution] = []
     batch = windows.all()
     for start in range(0, len(batch["x"]), CHUNK):
         data = model.read(rows(batch, slice(start, start + CHUNK)))
@@ -59,17 +61,19 @@ def rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())
 
 
-def together(posterior: Law) -> Law:
+def together(posterior: Distribution) -> Distribution:
     """Mean and deviation of draws of the posteriors of all windows, (T, D)."""
     mean, deviation = posterior
     return mean.mean(0), (mean.var(0, correction=0) + deviation.square().mean(0)).sqrt()
 
 
-def with_common(prior: Callable[..., Law], common: Law, what: tuple[str, ...]) -> Callable[..., Law]:
+def with_common(
+    prior: Callable[..., Distribution], common: Distribution, what: tuple[str, ...]
+) -> Callable[..., Distribution]:
     """A prior with what is said to be common to all windows."""
     mean, deviation = common
 
-    def changed(*arguments: Any, **options: Any) -> Law:
+    def changed(*arguments: Any, **options: Any) -> Distribution:
         loc, scale = (values.clone() for values in prior(*arguments, **options))
         if "mean" in what:
             loc[:, : len(mean)] = mean
@@ -94,11 +98,13 @@ def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
     guide, prior = model.encoder["z"], model.generator["z"]
     for count in counts:
         windows = judged.given(JOINTS[:count])
-        (mean, deviation), (prior_mean, prior_deviation) = (law(model, each, windows) for each in (guide, prior))
+        (mean, deviation), (prior_mean, prior_deviation) = (
+            distribution(model, each, windows) for each in (guide, prior)
+        )
         off = torch.hypot(mean - prior_mean, deviation) / prior_deviation
         low, high = off.square().mean(0).sqrt().quantile(torch.tensor(BETWEEN)).tolist()
         widths = [rms(mean - mean.mean(0)), rms(deviation), rms(prior_mean - prior_mean.mean(0)), rms(prior_deviation)]
-        common = together(law(model, guide, trained.given(JOINTS[:count])))
+        common = together(distribution(model, guide, trained.given(JOINTS[:count])))
         cells = []
         for scale, what in LAWS.values():
             with patch.object(prior, "forward", with_common(prior.forward, common, what)):

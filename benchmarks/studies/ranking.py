@@ -1,9 +1,10 @@
 """Fits every method for motion on every set, scores it on the test windows, and ranks them.
 
 Methods have the options and the training of their presets, which the tuning protocol chose (docs/results/tuning.md);
-runs lie in `RUNS/SET/METHOD-seedN`. What tables are made of, scores by clip, is kept in `SCORES/SET` beside the judges
+runs lie in `RUNS/SET/METHOD-seedN`. What tables are made of, scores by clip, is kept in `SCORES/SET` beside the metric
+models
 that gave them: the script goes on where it was stopped, there or on another machine, a further method is scored by the
-same judges, and without `--data` nothing is fitted.
+same metric models, and without `--data` nothing is fitted.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from torch import nn
 
 import dvae
 from dvae import Evaluation, Training, files, motion
-from dvae.inference.evaluation.estimates import Crossed
+from dvae.inference.evaluation.estimates import TwoWayErrors
 from dvae.inference.evaluation.metrics import average_pairwise_distance
-from dvae.inference.evaluation.result import canvas
+from dvae.inference.evaluation.multiple_comparisons import confidence_set
+from dvae.inference.evaluation.result import new_figure
 from dvae.inference.evaluation.scores import Measure
 from dvae.inference.training.checkpoints import Run
-from dvae.inference.training.many import confidence_set
 from dvae.models import registry
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.geometry.parts import UNIONS, body_parts
@@ -61,9 +62,9 @@ class View:
         exchanged: metres within which the given joints are in another window's pose, from which motions begin; 0 for
             the window's own.
         own: of the windows that have such another one, with their own poses.
-        truth: see `motion.Exchanged`.
+        truth: see `motion.ExchangedWindows`.
         observed: frames, in place of the protocol's.
-        judges: names with + between, in place of the set's.
+        metric_models: names with + between, in place of the set's.
         parts: how diverse the parts of the body are, alone, in "free" futures, in those that have the lower body's
             draw "held", that of the first, or in those of many whose lower body is "nearest" the first one's.
     """
@@ -74,7 +75,7 @@ class View:
     own: bool = False
     truth: Literal["path", "pose"] = "path"
     observed: int | None = None
-    judges: str = ""
+    metric_models: str = ""
     parts: Literal["", "free", "held", "nearest"] = ""
 
     def windows(self, data: MotionData, split: str) -> Any:
@@ -87,7 +88,7 @@ class View:
         told = windows.given([*JOINTS, *others][: self.given])
         if not self.exchanged or split != "test":
             return told
-        return motion.Exchanged(told, self.exchanged, own=self.own, truth=self.truth)
+        return motion.ExchangedWindows(told, self.exchanged, own=self.own, truth=self.truth)
 
     def evaluate(self, samples: int) -> dict[str, Any]:
         """Arguments of `dvae.evaluate`."""
@@ -107,24 +108,24 @@ class Set:
         file: of the clips.
         methods: by the rows that they are.
         views: in which each is scored.
-        judges: of `JUDGES`.
-        like: the set whose protocol, fitted judges and reference rows it shares; its own where empty.
+        metric_models: of `METRIC_MODELS`.
+        like: the set whose protocol, fitted metric models and reference rows it shares; its own where empty.
     """
 
     file: str
     methods: Mapping[str, Mapping[str, Any]]
     views: tuple[View, ...] = (View(),)
-    judges: tuple[str, ...] = ()
+    metric_models: tuple[str, ...] = ()
     like: str = ""
 
 
 BANDAI, CMU = "bandai/bandai2.npz", "cmu/cmu8.npz"
 GIVEN = tuple(View(count) for count in range(5))
 SETS = {
-    "bandai2-by-style": Set(BANDAI, FUTURES, judges=("prior", "content")),
-    "bandai2-by-style-alike": Set(BANDAI, ALIKE, judges=("prior", "content"), like="bandai2-by-style"),
-    "bandai2-by-take": Set(BANDAI, ALIKE, judges=("prior", "content")),
-    "cmu8": Set(CMU, ALIKE, judges=("prior", "content")),
+    "bandai2-by-style": Set(BANDAI, FUTURES, metric_models=("prior", "content")),
+    "bandai2-by-style-alike": Set(BANDAI, ALIKE, metric_models=("prior", "content"), like="bandai2-by-style"),
+    "bandai2-by-take": Set(BANDAI, ALIKE, metric_models=("prior", "content")),
+    "cmu8": Set(CMU, ALIKE, metric_models=("prior", "content")),
     "bandai2-trajectories": Set(BANDAI, PATHS, GIVEN),
     "bandai2-trajectories-alike": Set(BANDAI, ALIKE_PATHS, GIVEN, like="bandai2-trajectories"),
     "cmu8-trajectories": Set(CMU, ALIKE_PATHS, GIVEN),
@@ -132,12 +133,12 @@ SETS = {
 JOINTS = ("RToe", "LToe", "LWrist", "RWrist")
 """Whose paths are given first, as in TrajeVAE's tables."""
 CLASSIFIER = Training(steps=3000, learning_rate=3e-3, decay=0.5, validate_every=250)
-JUDGES: dict[str, tuple[str, dict[str, Any], Training]] = {
+METRIC_MODELS: dict[str, tuple[str, dict[str, Any], Training]] = {
     "prior": ("pose-prior", {"heading": True}, Training(steps=1000, learning_rate=0.01, decay=0.8)),
     "content": ("action-classifier", {}, CLASSIFIER),
     "group": ("action-classifier", {"label": "group"}, CLASSIFIER),
 }
-"""Methods that judge, their options and their training."""
+"""Metric models, their options and their training."""
 COLUMNS = ("energy score", "ADE", "FDE", "ADEm", "MMADE", "APD", "APDE", "CMD", "limb stretch", "limb jitter")
 JUDGED = ("ACC content", "FID content", "pose NLL")
 OTHERS = ("FDEm", "MMFDE", "MMADEm", "MMFDEm", "path error", "global ADE")
@@ -158,8 +159,9 @@ def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
     """What is kept of an evaluation: scores by clip of a run, or of all reference rows.
 
     Returns:
-        `basis`, windows, draws and judges, which all rows of a table share; windows by clip; scores, of four digits, by
-        row and clip; `minutes` of processor time that the fit took; and `config`, method and training, without paths.
+        `basis`, windows, draws and metric models, which all rows of a table share; windows by clip; scores, of four
+        digits, by row and clip; `minutes` of processor time that the fit took; and `config`, method and training,
+        without paths.
     """
     rows = {
         name: {
@@ -178,18 +180,20 @@ def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
     return found
 
 
-def fitted_judges(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
-    """Run directories of judges of the training clips, fitted once."""
+def fitted_metric_models(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
+    """Run directories of metric models of the training clips, fitted once."""
     for name in names:
-        method, options, training = JUDGES[name]
+        method, options, training = METRIC_MODELS[name]
         clips = grouped(data) if options.get("label") == "group" else data
-        (judge,) = swept(name, registry.judges()[method](**options), clips, runs / "judges", (0,), training)
-        config = judge / "config.json"  # is kept, and says nothing of this machine
+        (metric_model,) = swept(
+            name, registry.metric_models()[method](**options), clips, runs / "metric_models", (0,), training
+        )
+        config = metric_model / "config.json"  # is kept, and says nothing of this machine
         text = config.read_text(encoding="utf-8")
         if (placeless := text.replace(json.dumps(data.path), json.dumps(Path(data.path).name))) != text:
-            with files.written(config) as new:  # whole at any time, as other processes may read it
+            with files.atomic_write(config) as new:  # whole at any time, as other processes may read it
                 new.write(placeless.encode())
-    return {name: runs / "judges" / f"{name}-seed0" for name in names}
+    return {name: runs / "metric_models" / f"{name}-seed0" for name in names}
 
 
 def grouped(data: MotionData) -> MotionData:
@@ -200,7 +204,7 @@ def grouped(data: MotionData) -> MotionData:
 
 
 def judging(judged: Mapping[str, Path]) -> Any:
-    """The scores of motion that tables show, with those of judges where there are some."""
+    """The scores of motion that tables show, with those of metric models where there are some."""
     models = {name: load(path).model for name, path in judged.items()}
     prior = models.pop("prior", None)
 
@@ -233,7 +237,7 @@ def fit(
 def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Options of a method, and those of its training."""
     # methods have options of that name, which make the schedule of training's
-    training = Training.__dataclass_fields__.keys() - {"self_feeding"}
+    training = Training.__dataclass_fields__.keys() - {"scheduled_sampling"}
     return (
         {name: value for name, value in options.items() if name not in training},
         {name: value for name, value in options.items() if name in training},
@@ -268,14 +272,14 @@ def work(
         require_gpu("accelerator")
     own, like = archive(stored, name), SETS[name].like or name
     opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like])
-    judged = fitted_judges(opened, stored / like, SETS[name].judges)
+    judged = fitted_metric_models(opened, stored / like, SETS[name].metric_models)
 
     def score(path: Path | None, row: str, view: View) -> dict[str, Any]:
         data, by = opened, judged
-        if view.judges:
-            data, by = grouped(opened), fitted_judges(opened, stored / like, view.judges.split("+"))
+        if view.metric_models:
+            data, by = grouped(opened), fitted_metric_models(opened, stored / like, view.metric_models.split("+"))
         elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
-            by = {judge: run for judge, run in judged.items() if judge != "prior"}
+            by = {metric_model: run for metric_model, run in judged.items() if metric_model != "prior"}
         models = {} if path is None else {row: load(path).model.to(accelerator)}
         known: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
         options = {"references": False} if models else known
@@ -367,7 +371,7 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
     """What has been scored on a set: the reference rows, and methods with their seeds.
 
     Raises:
-        ValueError: scores of other windows, samples, or judges.
+        ValueError: scores of other windows, samples, or metric models.
     """
     found, basis = dict[str, Row](), None
     own, like = archive(stored, name), archive(stored, SETS[name].like or name)
@@ -381,7 +385,7 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
             scored = own.read(chosen)
             basis = basis or scored[0]["basis"]
             if any(alike(each["basis"]) != alike(basis) for each in scored):
-                raise ValueError(f"scores of {row} in {own.file} are of other windows, samples, seed or judges")
+                raise ValueError(f"scores of {row} in {own.file} are of other windows, samples, seed or metric models")
             found[row] = Row(scored, row)
     return found
 
@@ -397,7 +401,7 @@ EMISSION = 3
 
 
 def alike(basis: Sequence[Any]) -> list[Any]:
-    """What rows of a table must share: all but whether a model's law has a mean to forecast."""
+    """What rows of a table must share: all but whether a model's distribution has a mean to forecast."""
     return [*basis[:EMISSION], *basis[EMISSION + 1 :]]
 
 
@@ -420,7 +424,7 @@ def trained(entry: Row) -> tuple[str, str]:
     return str(len(entry.runs)), f"{statistics.fmean(here):.1f}" if here else "GPU"
 
 
-def ranked(found: Mapping[str, Row]) -> dict[str, Crossed]:
+def ranked(found: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
     """The energy score of all but the truth, the best first."""
     scores = {name: entry.crossed(RANKED) for name, entry in found.items() if name != "real motion"}
     known = {name: score for name, score in scores.items() if score is not None}  # all motion has it
@@ -451,7 +455,7 @@ def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
     """How far above the neighbours' the energy scores of each set are; rows of all in the first one's order."""
     ranks = {name: ranked(found) for name, found in sets.items()}
     order = list(dict.fromkeys(row for scores in ranks.values() for row in scores if row != NEIGHBOURS))
-    figure = canvas(1.8 + 3.4 * len(sets), 0.8 + 0.22 * len(order))
+    figure = new_figure(1.8 + 3.4 * len(sets), 0.8 + 0.22 * len(order))
     panels = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for panel, (name, scores) in zip(panels, ranks.items(), strict=True):
         panel.axvline(0, color="0.6", lw=0.8)
@@ -490,7 +494,7 @@ def main(
         methods: of these alone; all of a set where none is named.
         seeds: of every method.
         samples: futures of a window.
-        scores: the folder of scores and judges; in another than the project's own, all is fitted anew.
+        scores: the folder of scores and metric models; in another than the project's own, all is fitted anew.
         accelerator: on which to train and to forecast; runs on a GPU tell no minutes.
         page: whose tables; without one they are printed.
         picture: of all sets that tell no paths, drawn with a page.
@@ -506,7 +510,7 @@ def main(
         for view in chosen.views:
             if rows := rows_of(scores, name, view):
                 heading = "" if view.given is None else f"With {view.given} path{'s' * (view.given != 1)} given:\n\n"
-                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if chosen.judges else ())]))
+                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if chosen.metric_models else ())]))
         if tables:
             write(page, *tables, name=name)
     sought = {name: rows_of(scores, name, View()) for name, chosen in SETS.items() if View() in chosen.views}

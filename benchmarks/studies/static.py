@@ -22,8 +22,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dvae.inference.diagnostics.checks import decode
-from dvae.inference.evaluation.estimates import Crossed
-from dvae.inference.evaluation.held import clip_places, on_device_of, reproducibly
+from dvae.inference.evaluation.estimates import TwoWayErrors
+from dvae.inference.evaluation.evaluation_windows import clip_index, on_device_of, seeded_evaluation
 from dvae.motion import Windows
 from dvae.program.batch import rows
 
@@ -38,7 +38,7 @@ SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 def posterior_means(model: Any, batch: Mapping[str, Any], seed: int) -> dict[str, Tensor]:
     """Means of the guide's draws, (N, D) of a static latent and (N, T, D) of a local one."""
     found: dict[str, list[Tensor]] = {}
-    with reproducibly(model, seed):
+    with seeded_evaluation(model, seed):
         for start in range(0, len(batch["x"]), CHUNK):
             data = on_device_of(model, model.read(rows(batch, slice(start, start + CHUNK))))
             drawn = [model.guide(data) for _ in range(DRAWS)]
@@ -100,7 +100,7 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
     inferred, x = posterior_means(model, batch, seed), batch["x"]
     features = {name: value if value.dim() == 2 else value.mean(1) for name, value in inferred.items()}
     features["mean and spread of poses"] = torch.cat([x.mean(1), x.std(1)], 1)
-    places = clip_places(windows.keys)
+    places = clip_index(windows.keys)
     lengths = windows.skeleton.bone_lengths(windows.positions(x)).mean(1).double()
     told = {label: windows.labels(label) for label in labels}
     lines = []
@@ -119,7 +119,7 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
 def share(right: Tensor, places: Tensor) -> str:
     """A mean over windows with its standard error, clustered by clip."""
     _, clips = np.unique(places.numpy(), return_inverse=True)
-    found = Crossed.by_clip(right.numpy()[None], np.ones(len(clips)), clips).estimate()
+    found = TwoWayErrors.by_clip(right.numpy()[None], np.ones(len(clips)), clips).estimate()
     return f"{found.mean:.3f} ± {found.sequences:.3f}"
 
 
@@ -132,7 +132,7 @@ def swaps(model: Any, windows: Windows, label: str, count: int, seed: int) -> li
     ours, theirs = (rows(batch, torch.from_numpy(places)) for places in (first, second))
     goal = windows.positions(theirs["x"]).mean(1)
     lines = []
-    with reproducibly(model, seed):
+    with seeded_evaluation(model, seed):
         own, other = (model.guide(on_device_of(model, model.read(each))) for each in (ours, theirs))
 
         def made(latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:

@@ -82,7 +82,7 @@ def _law(
     pairs = {p: torch.stack([last[p], now.get(p, last[p])], 1) for p in conditional.parents}
     given = {p: value[:, 1:] if first else value for p, value in pairs.items()}
     parameters = conditional(given, len(last["x"]), 2 - first)
-    return conditional.law.joint(tuple(p[:, -1] for p in parameters))
+    return conditional.head.joint(tuple(p[:, -1] for p in parameters))
 
 
 def told(model: dvae.DynamicalVAE, x: Tensor, states: Tensor) -> str:
@@ -108,9 +108,9 @@ def row(
     per = x.shape[1]
     with torch.no_grad():
         elbo = dvae.SequenceELBO(8).terms(model, x).bound / per
-    weighted = dvae.importance_bound(model, x, particles).bound / per
+    weighted = dvae.iwae_bound(model, x, particles).bound / per
     few = x[:filtering]
-    gap = dvae.importance_bound(model, few, particles).bound / per - filtered(model, few, 10_000) / per
+    gap = dvae.iwae_bound(model, few, particles).bound / per - filtered(model, few, 10_000) / per
     cells = [f"{value.mean():.3f} ± {value.std() / len(value) ** 0.5:.3f}" for value in (elbo, weighted, gap)]
     return [f"{name}, {code(generative)}", *cells, told(model, x, states)]
 

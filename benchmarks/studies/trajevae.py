@@ -12,8 +12,8 @@ import numpy as np
 import torch
 import tyro
 
-from dvae.inference.evaluation.estimates import Crossed
-from dvae.inference.evaluation.held import clip_places
+from dvae.inference.evaluation.estimates import TwoWayErrors
+from dvae.inference.evaluation.evaluation_windows import clip_index
 from dvae.models.motion.trajectories import Completion, TrajectoryModel
 
 from .pages import DOCS, loaded, table, write
@@ -48,7 +48,7 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
         sys.exit(str(error))
     chosen = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
     motions = windows.positions(windows.all()["x"][chosen]).numpy()
-    _, clips = np.unique(clip_places(windows.keys)[chosen].numpy(), return_inverse=True)
+    _, clips = np.unique(clip_index(windows.keys)[chosen].numpy(), return_inverse=True)
     rows = []
     for number, exact in product(range(1, len(joints) + 1), (False, True)):
         torch.manual_seed(0)
@@ -59,7 +59,9 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
             made = run.model.complete(motion[0], paths, samples=samples, exact=exact)
             found.append(figures(made, windows.skeleton.bone_lengths(motion[:1])))
         spent = (time.perf_counter() - begun) / (len(motions) * samples)
-        means = [Crossed.by_clip(each[None], np.ones(len(motions)), clips).estimate() for each in np.transpose(found)]
+        means = [
+            TwoWayErrors.by_clip(each[None], np.ones(len(motions)), clips).estimate() for each in np.transpose(found)
+        ]
         told = [
             "–" if np.isnan(mean.mean) else f"{mean.mean:{form}} ± {mean.sequences:{form}}"
             for mean, form in zip(means, METRICS.values(), strict=True)

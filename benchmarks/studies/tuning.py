@@ -1,8 +1,8 @@
 """Fits and scores what options of methods for motion are chosen by, and writes the tables of docs/results/tuning.md.
 
 Everything is under one protocol, bandai2-tuning: clips of group A train, those of group B, whose styles are not
-those of training, judge, on every fourth window of each; no clip of the test group C is seen. Scores are kept, by
-section, in `benchmarks/scores/tuning`: the script goes on where it was stopped, and tables are of what is there.
+those of training, test, on every fourth window of each; no clip of the test group C is seen. Scores are kept,
+by section, in `benchmarks/scores/tuning`: the script goes on where it was stopped, and tables are of what is there.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from dvae.runs.directory import load
 
 from .engine import settings, swept
 from .pages import refuse_unknown, table, tabled, write
-from .ranking import JOINTS, JUDGES, SCORES, SETS, entries, fitted_judges, judging, parted
+from .ranking import JOINTS, METRIC_MODELS, SCORES, SETS, entries, fitted_metric_models, judging, parted
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
 REFERENCES = ("zero velocity", "nearest neighbours")
-COLUMNS_OF_JUDGES = ("log density", "pose NLL", "ACC content")
+COLUMNS_OF_METRIC_MODELS = ("log density", "pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
 """Scores that pages show, where there are."""
 SEEDS, TESTED = "seeds", ("bandai2-by-style", "bandai2-trajectories")
@@ -72,7 +72,9 @@ class Section:
         """The method of a case, and its training."""
         options, told = parted({**self.options, **self.cases[case]})
         method = options.pop("method", self.method)
-        if self.judged and options.get("pose_prior") != 0 and options.get("heading", True):  # as the judge has it
+        if (
+            self.judged and options.get("pose_prior") != 0 and options.get("heading", True)
+        ):  # as the metric model has it
             options["pose_prior_run"] = str(prior)
         return dvae.method(method, **options), replace(self.training, **told)
 
@@ -89,9 +91,9 @@ SECTIONS = {
 
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
-"""Of judges, which are to know poses and contents of styles that they have not seen."""
+"""Of metric models, which are to know poses and contents of styles that they have not seen."""
 SEEDS_OF = {"prior": (0, 1, 2), "content": (0,)}
-OF_JUDGES = [f"{judge} {steps} steps" for judge, tried in STEPS.items() for steps in tried]
+OF_METRIC_MODELS = [f"{metric_model} {steps} steps" for metric_model, tried in STEPS.items() for steps in tried]
 
 
 Kept = dict[str, dict[str, dict[str, float]]]
@@ -123,19 +125,19 @@ class Store:
         return str(seed) not in self.found.get(case, {})
 
 
-def of_judges(data: MotionData, runs: Path, store: Store) -> None:
-    """Fits judges for other numbers of steps, and scores real motion of the judging group by each."""
-    for row in OF_JUDGES:
+def of_metric_models(data: MotionData, runs: Path, store: Store) -> None:
+    """Fits metric models for other numbers of steps, and scores real motion of the judging group by each."""
+    for row in OF_METRIC_MODELS:
         name, steps, _ = row.split()
-        method, options, training = JUDGES[name]
+        method, options, training = METRIC_MODELS[name]
         for seed in [seed for seed in SEEDS_OF[name] if store.lacks(row, seed)]:
             told = replace(training, steps=int(steps))
-            (path,) = swept(row, registry.judges()[method](**options), data, runs, (seed,), told)
-            store.add(row, seed, of_judge(name, path, seen(data)))
+            (path,) = swept(row, registry.metric_models()[method](**options), data, runs, (seed,), told)
+            store.add(row, seed, of_metric_model(name, path, seen(data)))
 
 
-def of_judge(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
-    """What a judge says of the predicted frames of real windows."""
+def of_metric_model(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
+    """What a metric model says of the predicted frames of real windows."""
     if name == "prior":
         prior, motions = load(run).model, windows.all()["x"]
         poses = prior.facing(motions)[:, windows.protocol.observed :]
@@ -214,13 +216,13 @@ def spread() -> str:
 def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
     """Fits and scores what is not there yet."""
     opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
-    asked = [SECTIONS[name].protocol for name in sections if name != "judges"]
-    judged = fitted_judges(opened[TUNING.name], runs) if any(each.root == "drop" for each in asked) else {}
+    asked = [SECTIONS[name].protocol for name in sections if name != "metric_models"]
+    judged = fitted_metric_models(opened[TUNING.name], runs) if any(each.root == "drop" for each in asked) else {}
     prior = judged.get("prior", Path()).absolute()
     for name in sections:
         store = Store(stored, name)
-        if name == "judges":
-            of_judges(opened[TUNING.name], runs / name, store)
+        if name == "metric_models":
+            of_metric_models(opened[TUNING.name], runs / name, store)
             continue
         section = SECTIONS[name]
         own = opened[section.protocol.name]
@@ -236,7 +238,7 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
 def main(
     runs: tyro.conf.Positional[Path],
     data: Path | None = None,
-    sections: tuple[str, ...] = ("judges", SEEDS, *SECTIONS),
+    sections: tuple[str, ...] = ("metric_models", SEEDS, *SECTIONS),
     jobs: int = 1,
     stored: Path = SCORES / "tuning.json",
     page: Path | None = None,
@@ -251,7 +253,7 @@ def main(
         stored: the file of scores.
         page: whose tables; without one they are printed.
     """
-    refuse_unknown("section", sections, ("judges", SEEDS, *SECTIONS))
+    refuse_unknown("section", sections, ("metric_models", SEEDS, *SECTIONS))
     tried = [name for name in sections if name != SEEDS]
     if data is not None:
         work(data, runs, stored, tried, jobs)
@@ -259,8 +261,8 @@ def main(
         write(page, spread(), name=SEEDS)
     known = Store(stored, "references").found
     for name in tried:
-        columns, cases, beside = COLUMNS_OF_JUDGES, OF_JUDGES, {}
-        if name != "judges":
+        columns, cases, beside = COLUMNS_OF_METRIC_MODELS, OF_METRIC_MODELS, {}
+        if name != "metric_models":
             section = SECTIONS[name]
             columns, cases = section.columns, [*section.cases]
             beside = {row: known.get(f"{section.protocol.name}: {row}") for row in REFERENCES}
@@ -268,7 +270,8 @@ def main(
         scored = {
             row: [*seeds.values()] for row, seeds in {**beside, **{c: found.get(c) for c in cases}}.items() if seeds
         }
-        write(page, tabled(scored, {column: partial(shown, column) for column in columns}, name), name=name)
+        head = name.replace("_", " ")
+        write(page, tabled(scored, {column: partial(shown, column) for column in columns}, head), name=name)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""The command line: list and show methods, fit and resume runs, evaluate, compare and criticise them, look into data.
+"""The command line: list and show methods, describe data, fit and resume runs, evaluate, compare and check them.
 
-Torch is imported by the commands that compute: not for `dvae --help`, nor to refuse what is no command.
+Only commands that compute import torch; `dvae --help` and errors about unknown commands do not.
 """
 
 from .app import command, main

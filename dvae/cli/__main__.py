@@ -1,4 +1,4 @@
-"""`python -m dvae.cli`."""
+"""Run the command line with `python -m dvae.cli`."""
 
 import sys
 

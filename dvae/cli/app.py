@@ -1,7 +1,7 @@
-"""The program: which command is meant, what it leaves, and how it fails.
+"""The program `dvae`: finds and runs the command, prints its errors, and returns the exit code.
 
-Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 after Ctrl-C, 141 when nobody reads what is printed, 143 after
-SIGTERM. A fit that a signal stopped can be resumed.
+Exit codes: 0 success, 1 failure, 2 wrong arguments, 130 after Ctrl-C, 141 when the reader of the output has closed it,
+143 after SIGTERM. A fit stopped by a signal can be resumed.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import tyro
 
 from .. import __version__
-from ..inference.evaluation.result import Plain, reason
+from ..inference.evaluation.result import PlainConsole, error_message
 from ..options import nearest
-from .console import ERROR, OUT, UsageError, note, speaks
+from .console import ERROR, OUT, UsageError, is_first_process, note
 
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)
-"""The exit code that a shell gives to a program whose output nobody reads."""
+"""The exit code of a program whose output pipe is closed, as shells report it."""
 
 GROUPS = {
     "start": {
@@ -35,9 +35,9 @@ GROUPS = {
         "data get": ("data:get", "Download and verify public recordings."),
     },
     "fit": {
-        "fit": ("fitting:fit", "Fit a method, or equations of your own, to motion or to a table."),
+        "fit": ("fitting:fit", "Fit a method, or your own equations, to motion or to a table."),
         "resume": ("fitting:resume", "Continue a run from its last checkpoint."),
-        "sweep": ("fitting:sweep", "Fit methods with several seeds and options, several runs at a time."),
+        "sweep": ("fitting:sweep", "Fit methods with several seeds and options, several runs in parallel."),
     },
     "use": {
         "forecast": ("futures:forecast", "Draw forecasts, or motion along given paths of some joints."),
@@ -45,27 +45,27 @@ GROUPS = {
         "animate": ("futures:animate", "Play forecasts or a clip as moving skeletons."),
     },
     "assess": {
-        "evaluate": ("judging:evaluate", "Score runs on test windows."),
-        "compare": ("judging:compare", "Compare runs: bounds, paired differences with errors, use of latents."),
+        "evaluate": ("assessment:evaluate", "Score runs on test windows."),
+        "compare": ("assessment:compare", "Compare runs: bounds, paired differences with errors, use of latents."),
         "check calibration": ("checks:calibration", "Calibrate the guide by simulation, and check predictions."),
         "check posterior": ("checks:posterior", "Compare the guide with NUTS samples of the posterior."),
-        "check gap": ("checks:gap", "Bound the evidence from both sides and divide the gap of the ELBO."),
+        "check gap": ("checks:gap", "Bound the evidence from both sides and decompose the gap of the ELBO."),
         "check coverage": ("checks:coverage", "Widen forecasts to bands with a given coverage, and test it."),
-        "check edges": ("checks:edges", "Leave out each edge of model and guide in turn."),
-        "report": ("report:report", "Write one page of all that is known of some runs."),
+        "check edges": ("checks:edges", "Measure the cost of each edge of model and guide, left out in turn."),
+        "report": ("report:report", "Write all results of some runs to one page."),
     },
 }
-"""Commands by group: name to "module:function", imported when it is called, and its line in `dvae --help`."""
+"""Commands by group: {name: ("module:function", imported when it is called, line in `dvae --help`)}."""
 COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 FAMILIES = {name.partition(" ")[0] for name in COMMANDS if " " in name}
 """First words of commands of two words."""
 
 
 def named(given: Sequence[str]) -> str | None:
-    """Return the command that the arguments name; None if they name none.
+    """Return the name of the command in the arguments; None without a command.
 
     Raises:
-        UsageError: an unknown command.
+        UsageError: the command is unknown.
     """
     words = given[: 2 if given and given[0] in FAMILIES else 1]
     if not words or words[-1].startswith("-") or (len(words) < 2 and words[0] in FAMILIES):
@@ -78,10 +78,10 @@ def named(given: Sequence[str]) -> str | None:
 
 
 def command(given: Sequence[str]) -> Callable[..., None] | None:
-    """Return the command that the arguments name, imported; None if they name none.
+    """Import and return the command in the arguments; None without a command.
 
     Raises:
-        UsageError: an unknown command.
+        UsageError: the command is unknown.
     """
     if (name := named(given)) is None:
         return None
@@ -93,14 +93,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
     Args:
-        arguments: those of the process by default.
+        arguments: arguments of the command line; by default the arguments of the process.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     warnings.showwarning = note
-    OUT.quiet = ERROR.quiet = not speaks()
-    Plain.unread = False
+    OUT.quiet = ERROR.quiet = not is_first_process()
+    PlainConsole.unread = False
     return _ended(given, debug) or (UNREAD if _is_unread() else 0)
 
 
@@ -108,9 +108,9 @@ def exit_code(run: Callable[[], int]) -> int:
     """Run the program and return its exit code, which a further Ctrl-C no longer changes."""
     try:
         code = run()
-    except KeyboardInterrupt:  # another one, amid what the first one prints
+    except KeyboardInterrupt:  # a second one, while the message of the first one is printed
         code = 128 + signal.SIGINT
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python ends as a signal does if one comes while it shuts down
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C during Python's shutdown would change the exit code
     return code
 
 
@@ -121,11 +121,11 @@ def _is_unread(line: str = "") -> bool:
         sys.stdout.flush()
     except BrokenPipeError:
         OUT.on_broken_pipe()
-    return Plain.unread
+    return PlainConsole.unread
 
 
 def _ended(given: list[str], debug: bool) -> int:
-    """Run the command with its arguments, print how it fails, and return its exit code."""
+    """Run the command with its arguments, print its error if it fails, and return its exit code."""
     try:
         _run(given)
         return 0
@@ -140,13 +140,13 @@ def _ended(given: list[str], debug: bool) -> int:
     except Exception as error:
         if isinstance(error, BrokenPipeError) and _is_unread("\n"):
             return UNREAD
-        ERROR.quiet = False  # it may be this process alone that fails
+        ERROR.quiet = False  # this process may be the only one that fails
         if debug:
             traceback.print_exc()
         expected = isinstance(error, ValueError | OSError | RuntimeError | FloatingPointError | ImportError)
         hint = "" if expected or debug else " (this looks like a bug: --debug shows the traceback)"
         ERROR.print("error: ", style="bold red", end="")
-        ERROR.print((reason(error) or type(error).__name__) + hint)
+        ERROR.print((error_message(error) or type(error).__name__) + hint)
         return 2 if isinstance(error, UsageError) else 1
 
 
@@ -157,9 +157,9 @@ def _run(given: list[str]) -> None:
         rest = given[len(name.split()) :]
         config: tuple[Any, ...] = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes)
         if HELP & {*rest}:
-            from .help import described
+            from .help import command_stub
 
-            meant, method = described(meant, rest, everything="--help-all" in rest)
+            meant, method = command_stub(meant, rest, everything="--help-all" in rest)
             name, rest, config = name + method, ["--help"], (*config, tyro.conf.DisallowNone)
         tyro.cli(meant, prog=f"dvae {name}", args=rest, config=config)
     elif given == ["--version"]:
@@ -176,7 +176,7 @@ HELP = {"-h", "--help", "--help-all"}
 
 
 def _overview(family: str) -> None:
-    """Print the commands by group, or those of a family such as `dvae check`."""
+    """Print the commands by group, or the commands of a family such as `dvae check`."""
     OUT.print(f"usage: dvae {family or '[--version]'} COMMAND [--help] [--help-all] [options]\n", highlight=False)
     if not family:
         OUT.print("Dynamical variational autoencoders from their factorizations.\n", highlight=False)
@@ -190,16 +190,16 @@ def _overview(family: str) -> None:
 
 
 def _meant(given: Sequence[str]) -> Iterator[str]:
-    """Sentences on names that are none, but near to one: of options, of methods, and the choices of options."""
+    """Yield suggestions for misspelt options, methods and choices of options."""
     if (called := command(given)) is None:
         return
-    from ..models.registry import judges, methods
+    from ..models.registry import methods, metric_models
 
     name = named(given) or ""
     rest = given[len(name.split()) :]
     hints = get_type_hints(called)
     kinds = [*filter(is_dataclass, hints.values()), *(methods().values() if name in ("fit", "sweep") else ())]
-    for kind in kinds:  # which grows by the dataclasses in it
+    for kind in kinds:  # nested dataclasses are appended during the loop
         hints = (own := get_type_hints(kind)) | hints
         kinds += filter(is_dataclass, own.values())
     options = {f"--{option.replace('_', '-')}" for option in [*hints, "from", "help", "help-all"]}
@@ -207,7 +207,7 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
         if word not in options and (meant := nearest(word, options)):
             yield f"{word} is no option of dvae {name}{meant}"
     choices = {option: _choices(hint) for option, hint in hints.items()}
-    names = {"fit": [*methods(), *judges()], "sweep": choices.get("method")}.get(name)
+    names = {"fit": [*methods(), *metric_models()], "sweep": choices.get("method")}.get(name)
     for before, word in pairwise(["", *rest]):
         option = before if before.startswith("--") else ""
         known = choices.get(option.removeprefix("--").replace("-", "_")) if option else names
@@ -216,7 +216,7 @@ def _meant(given: Sequence[str]) -> Iterator[str]:
 
 
 def _choices(hint: Any) -> list[str]:
-    """The names that a type allows, wherever in it they are."""
+    """Return the names that a type allows, at any depth."""
     if get_origin(hint) is Literal:
         return [name for name in get_args(hint) if isinstance(name, str)]
     return [name for part in get_args(hint) for name in _choices(part)]

@@ -16,16 +16,17 @@ from ..factorization.inversion import FAITHFUL
 from ..inference.diagnostics.bracket import bracket
 from ..inference.diagnostics.calibration import calibrate
 from ..inference.diagnostics.checks import predictive_checks
+from ..inference.diagnostics.reference_posterior import reference_posterior
 from ..inference.diagnostics.stein import stein_discrepancy
-from ..inference.diagnostics.yardstick import reference_posterior
-from ..inference.evaluation.conformal import conformal
+from ..inference.evaluation.conformal import conformal_bands
 from ..models import registry
 from ..models.family.equations import Equations
 from ..models.method import LatentMethod
 from ..models.motion.trajectories import TrajectoryModel
 from ..runs import directory as runs
 from ..runs.ablation import ablate, as_equations
-from . import opening, tables
+from . import loading, tables
+from .assessment import save_and_print
 from .console import (
     ERROR,
     Failed,
@@ -38,7 +39,6 @@ from .console import (
 )
 from .fitting import DataOptions, MethodOptions, SweepOptions, given_options, options_of
 from .help import Expert
-from .judging import keep
 
 if TYPE_CHECKING:
     EquationOptions = Any
@@ -74,7 +74,7 @@ def calibration(
         ranked_steps: number of time steps, evenly spaced, at which local latents are ranked.
         samples: number of replicates of each test window, at least 19.
         draw_emission: replicate draws of x, or its means, which have no emission noise. Methods that follow given
-            paths (trajevae, cvae-rnn, motion-infilling) always give means.
+            paths (trajevae, cvae-rnn, motion-infilling) always return means.
         seed: seed of the draws.
         batch_size: number of windows replicated at once.
         out: file to write instead of calibration.json in the run.
@@ -83,14 +83,14 @@ def calibration(
     at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
     at_least(19, samples=samples)
     check_files(out, figure, ".json")
-    loaded, opened = opening.forecaster(run, data, missing, failed)
-    model, windows = loaded.model, opening.windows_to_test(loaded, opened, whole=False)
+    loaded, opened = loading.forecaster(run, data, missing, failed)
+    model, windows = loaded.model, loading.windows_to_test(loaded, opened, whole=False)
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     document: dict[str, Any] = {}
-    path = out or run / f"{opening.record('calibration', loaded, opened)}.json"
+    path = out or run / f"{loading.record('calibration', loaded, opened)}.json"
     if model.context:
         given = ", ".join(model.context)
-        ERROR.print(f"no calibration: {loaded.method.name} is given {given}, which nothing simulates")
+        ERROR.print(f"no calibration: {loaded.method.name} conditions on {given}, which cannot be simulated")
     elif not model.latents:
         ERROR.print(f"no calibration: {loaded.method.name} has no latents, and so no guide")
     else:
@@ -146,14 +146,14 @@ def posterior(
     at_least(2, chains=chains, stein_draws=stein_draws)
     at_least(4, draws=draws)
     check_files(out, figure, ".json")
-    loaded, opened = opening.forecaster(run, data, missing, failed)
+    loaded, opened = loading.forecaster(run, data, missing, failed)
     batch = opened.windows("test").all()
     some = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
     kept = batch.map(lambda value: value[some, :frames] if value.dim() == 3 else value[some])
     if kept.lengths is not None and frames is not None:
         kept["lengths"] = kept.lengths.clamp(max=frames)
     document: dict[str, Any] = {"windows": some.tolist(), "frames": frames}
-    path = out or run / f"{opening.record('posterior', loaded, opened)}.json"
+    path = out or run / f"{loading.record('posterior', loaded, opened)}.json"
     stein = stein_discrepancy(loaded.model, kept, draws=stein_draws, seed=seed)
     _add(document, "stein", stein, path, figure, "stein")
     reference = reference_posterior(loaded.model, kept, draws=draws, chains=chains, warmup=warmup, seed=seed)
@@ -163,10 +163,10 @@ def posterior(
 def _add(document: dict[str, Any], part: str, result: Any, path: Path, figure: Path | None, suffix: str) -> None:
     """Add a part to a document, write it, and print the part."""
     document[part] = result.document()
-    with files.written(path) as file:
+    with files.atomic_write(path) as file:
         file.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
     ERROR.print(f"wrote {path}: {part}")
-    keep(result, [], figure and figure.with_stem(f"{figure.stem}-{suffix}"))
+    save_and_print(result, [], figure and figure.with_stem(f"{figure.stem}-{suffix}"))
 
 
 def gap(
@@ -185,7 +185,7 @@ def gap(
     out: Path | None = None,
     figure: Path | None = None,
 ) -> None:
-    """Bound a run's evidence from both sides, and divide the gap of its ELBO: amortisation, dependencies, family.
+    """Bound a run's evidence from both sides, and decompose the gap of its ELBO: amortisation, dependencies, family.
 
     Prints bounds of some test windows and of as many windows simulated from the model, and the parts of the gap.
     Writes them to gap.json in the run, or to --out.
@@ -207,10 +207,10 @@ def gap(
     at_least(1, count=count, particles=particles, temperatures=temperatures, chains=chains, batch_size=batch_size)
     at_least(0, fitting=fitting, reach=reach)
     check_files(out, figure, ".json")
-    loaded, opened = opening.forecaster(run, data, missing, failed)
+    loaded, opened = loading.forecaster(run, data, missing, failed)
     result = bracket(
         loaded.model,
-        opening.windows_to_test(loaded, opened),
+        loading.windows_to_test(loaded, opened),
         count=count,
         particles=particles,
         temperatures=temperatures,
@@ -220,7 +220,7 @@ def gap(
         seed=seed,
         batch_size=batch_size,
     )
-    keep(result, [out or run / f"{opening.record('gap', loaded, opened)}.json"], figure)
+    save_and_print(result, [out or run / f"{loading.record('gap', loaded, opened)}.json"], figure)
 
 
 def coverage(
@@ -239,10 +239,10 @@ def coverage(
 ) -> None:
     """Widen a run's forecasts to bands that contain whole futures with a given probability, and test them.
 
-    Calibrates on the validation windows, by which training chose its weights, and tests on the test windows. With
-    --label style --values feminine it calibrates on the test clips of these styles and tests on the others. Prints the
-    factors and the coverage before and after. Writes coverage.json and coverage-test.json in the run, or to --out:
-    `dvae.Tubes.load` reads the first, and its `tube` gives the band of forecasts.
+    Calibrates on the validation windows, which also selected the weights, and tests on the test windows. With --label
+    style --values feminine it calibrates on the test clips of these styles and tests on the others. Prints the factors
+    and the coverage before and after. Writes coverage.json and coverage-test.json in the run, or to --out.
+    `dvae.PredictionBands.load` reads the first, and its `apply` returns the band of forecasts.
 
     Args:
         run: the run directory.
@@ -259,20 +259,26 @@ def coverage(
     at_least(1, samples=samples, batch_size=batch_size)
     check_files(out, figure, ".json")
     if bool(values) != (label is not None):
-        raise UsageError("--label and --values are given together, to say which test clips calibrate")
-    loaded, opened = opening.forecaster(run, data, missing, failed)
+        raise UsageError("--label and --values select the test clips for calibration; give both")
+    loaded, opened = loading.forecaster(run, data, missing, failed)
     kept, tested = _kept_and_tested(loaded, opened, label, values)
-    found = conformal(loaded.model, kept, level, samples=samples, seed=seed, batch_size=batch_size)
-    path = out or run / f"{opening.record('coverage', loaded, opened)}.json"
-    keep(found, [path], figure)
-    keep(found.coverage({loaded.method.name: loaded.model}, tested), [path.with_stem(f"{path.stem}-test")], None)
+    found = conformal_bands(loaded.model, kept, level, samples=samples, seed=seed, batch_size=batch_size)
+    path = out or run / f"{loading.record('coverage', loaded, opened)}.json"
+    save_and_print(found, [path], figure)
+    save_and_print(
+        found.coverage({loaded.method.name: loaded.model}, tested), [path.with_stem(f"{path.stem}-test")], None
+    )
 
 
 def _kept_and_tested(loaded: runs.Loaded, opened: Any, label: str | None, values: Sequence[str]) -> Any:
-    """Windows to calibrate on, and to test on."""
+    """Return windows to calibrate on and windows to test on.
+
+    Raises:
+        UsageError: the label divides no test clips.
+    """
     if loaded.config.kind == "panel":
         if label is not None:
-            raise UsageError(f"--label is of clips of motion, and {loaded.path} is of a table")
+            raise UsageError(f"--label is for motion, and {loaded.path} was fitted on a table; leave it out")
         return [tables.windows(loaded, opened, split) for split in ("validation", "test")]
     if label is None:
         return [opened.windows(split) for split in ("validation", "test")]
@@ -283,7 +289,7 @@ def _kept_and_tested(loaded: runs.Loaded, opened: Any, label: str | None, values
     test = motion.MotionSet(clips, whole.skeleton, opened.path, missing=whole.missing)
     others = tuple(sorted(found - {*values}))
     if not others:
-        raise UsageError(f"all test clips would calibrate, of {label} {', '.join(values)}; leave some to test on")
+        raise UsageError(f"--values {' '.join(values)} selects all test clips; leave some {label} to test on")
     return [
         motion.windows(test, replace(opened.protocol, split_by=label, train=(), test=part), "test")
         for part in (tuple(values), others)
@@ -304,38 +310,38 @@ def edges(
     seeds: tuple[int, ...] = (0, 1, 2),
     jobs: int = 2,
     bound_particles: Expert[int] = 64,
-    twin_steps: Expert[int] = 5,
-    twins: Expert[int] = 5,
+    surrogate_steps: Expert[int] = 5,
+    surrogates: Expert[int] = 5,
     figure: Path | None = None,
 ) -> None:
-    """Leave out every edge of a model and its guide in turn, and report what each is worth in nats.
+    """Leave out every edge of a model and its guide in turn, and report the cost of each in nats.
 
-    Without --out this is computed on linear-Gaussian surrogates alone. With --out every reduced pair of equations is
+    Without --out, costs are computed on linear-Gaussian surrogates only. With --out, every reduced pair of equations is
     also fitted to data, with networks of one kind, and compared on the test windows. The table is written to edges.json
     there. The same command continues after an interruption and keeps finished runs.
 
     Args:
-        method: name of a method, or give --generative instead.
+        method: name of a method, unless --generative is given.
         model: options of all models, in place of the method's.
         networks: options of the networks of every factor.
         training: options of the runs.
-        source: the data.
-        generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
-        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; by default "faithful", a guide with all dependencies
-            of the posterior, derived anew for every reduced model; "" of a model without latents.
+        source: data to fit to.
+        generative: equation of the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
+        inference: equation of the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; by default "faithful", a guide with all
+            dependencies of the posterior, derived again for every reduced model; "" for a model without latents.
         latent: size of the latents.
         out: directory of the run directories, such as whole-seed0 and model-without-z_t-1-to-z_t-seed0.
-        seeds: seeds of initial weights, batches and draws, a run for each.
-        jobs: number of runs at a time.
-        bound_particles: number of particles of the importance-weighted bound.
-        twin_steps: time steps of the linear-Gaussian surrogates.
-        twins: number of random linear-Gaussian surrogates.
-        figure: save model and guide of one step, with edges as thick as their worth.
+        seeds: seeds of initial weights, batches and draws, one run for each.
+        jobs: number of runs in parallel.
+        bound_particles: number of particles of the IWAE bound.
+        surrogate_steps: time steps of the linear-Gaussian surrogates.
+        surrogates: number of random linear-Gaussian surrogates.
+        figure: save model and guide of one step, with the width of each edge proportional to its cost.
     """
-    at_least(1, jobs=jobs, bound_particles=bound_particles, twin_steps=twin_steps, twins=twins)
+    at_least(1, jobs=jobs, bound_particles=bound_particles, surrogate_steps=surrogate_steps, surrogates=surrogates)
     check_figure(figure, "figure")
     if (method is None) == (generative is None):
-        raise UsageError("give the name of a method, or --generative, with --inference for a guide of your own")
+        raise UsageError("give the name of a method, or --generative, with --inference for your own guide")
     if method is not None and inference is not None:
         raise UsageError(f"--inference is the guide of --generative; {method} has its own")
     trained = [value for value in vars(training).values() if value not in (None, False)]
@@ -352,6 +358,6 @@ def edges(
         how = given_options(training)
     opened = None if out is None else source.open(named)
     whole = replace(as_equations(named, None if opened is None else opened.schema), **chosen)
-    settings: dict[str, Any] = {"steps": twin_steps, "twins": twins, "bound_particles": bound_particles}
+    settings: dict[str, Any] = {"steps": surrogate_steps, "surrogates": surrogates, "bound_particles": bound_particles}
     result = ablate(whole, opened, out, seeds, how, jobs, **settings)
-    keep(result, [] if out is None else [out / "edges.json"], figure)
+    save_and_print(result, [] if out is None else [out / "edges.json"], figure)

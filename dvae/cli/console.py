@@ -1,4 +1,4 @@
-"""What commands share: two consoles, what is refused before any work, and how figures are written."""
+"""Shared parts of the commands: two consoles, checks of arguments before any work, and writing of figures."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from .. import files
-from ..inference.evaluation.result import Plain
+from ..inference.evaluation.result import PlainConsole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 for stream in ("stdout", "stderr"):
-    if getattr(sys, stream) is None:  # it is closed, as in `dvae list >&-`, and the next file would take its number
+    if getattr(sys, stream) is None:  # closed, as in `dvae list >&-`; the next file would reuse its descriptor
         setattr(sys, stream, open(os.devnull, "w"))  # noqa: SIM115
-# Both keep to the width of the terminal; a file or a pipe gets lines as long as they need to be.
-OUT = Plain(width=None if sys.stdout.isatty() else 200)
-ERROR = Plain(stderr=True, soft_wrap=True, highlight=False)
+# Lines fit the width of a terminal; in a file or a pipe they are not wrapped.
+OUT = PlainConsole(width=None if sys.stdout.isatty() else 200)
+ERROR = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
 
 Missing = Annotated[
     bool,
-    tyro.conf.arg(help="keep clips that lack joints, which are NaN where they were not observed"),
+    tyro.conf.arg(help="keep clips with missing joints; their positions are NaN"),
 ]
-"""The option of every command that reads motion."""
+"""Option of every command that reads motion."""
 
 Failed = Annotated[
     bool,
-    tyro.conf.arg(help="use the weights of a run that failed, or has made no step, as they are"),
+    tyro.conf.arg(help="use the current weights of a run that failed or has made no step"),
 ]
-"""The option of every command that uses runs."""
+"""Option of every command that uses runs."""
 
 
-def speaks() -> bool:
-    """Whether this process is the first of a run's, which it is where there is one; known before torch is imported."""
+def is_first_process() -> bool:
+    """Return whether this is the only or the first process of a run, without importing torch."""
     return os.environ.get("RANK" if "TORCHELASTIC_RUN_ID" in os.environ else "LOCAL_RANK", "0") == "0"
 
 
 class UsageError(ValueError):
-    """Arguments that do not fit together."""
+    """Error for wrong or incompatible arguments."""
 
 
 def note(message: Warning | str, *_: object, **__: object) -> None:
-    """A warning as a user of the command line reads it, without the place in the code."""
+    """Print a warning for a user of the command line, without the place in the code."""
     ERROR.print(f"note: {message}", markup=False)
 
 
 @contextmanager
 def arguments() -> Iterator[None]:
-    """What is refused within it is an argument."""
+    """Turn a ValueError in the block into a `UsageError`."""
     try:
         yield
     except ValueError as error:
@@ -61,23 +61,27 @@ def arguments() -> Iterator[None]:
 
 
 def at_least(smallest: int, **options: int | None) -> None:
-    """Refuse options below what makes sense."""
+    """Check that options are None or at least `smallest`.
+
+    Raises:
+        UsageError: an option is smaller.
+    """
     for name, value in options.items():
         if value is not None and value < smallest:
             raise UsageError(f"--{name.replace('_', '-')} is {value}; it must be at least {smallest}")
 
 
 def _check_file(path: Path | None, option: str, *suffixes: str) -> None:
-    """Refuse, before any work, a path that cannot become a file, or whose name ends as that of another kind of file."""
+    """Check, before any work, that a path is not a directory and that its suffix is one of `suffixes`."""
     if path is not None and path.is_dir():
         raise UsageError(f"--{option} {path} is a directory; name a file")
     if path is not None and path.suffix.lower() not in (suffixes or (path.suffix.lower(),)):
-        kinds = " or ".join(filter(None, suffixes)) + (", or in nothing for a folder" if "" in suffixes else "")
-        raise UsageError(f"--{option} {path}: the end of a name says what is written; end its name in {kinds}")
+        kinds = " or ".join(filter(None, suffixes)) + (", or use no suffix for a folder" if "" in suffixes else "")
+        raise UsageError(f"--{option} {path}: the suffix selects the format; end the name in {kinds}")
 
 
 def check_figure(path: Path | None, option: str) -> None:
-    """Refuse, before any work, a path that cannot become a figure."""
+    """Check, before any work, that a path can become a figure."""
     _check_file(path, option)
     if path is not None:
         from matplotlib.backend_bases import FigureCanvasBase
@@ -88,13 +92,13 @@ def check_figure(path: Path | None, option: str) -> None:
 
 
 def check_files(out: Path | None, figure: Path | None, *suffixes: str) -> None:
-    """Refuse, before any work, what cannot be written."""
+    """Check, before any work, that both paths can be written; `suffixes` are the allowed suffixes of `out`."""
     _check_file(out, "out", *suffixes)
     check_figure(figure, "figure")
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, and say so."""
-    with files.written(path) as file:
+    """Write a figure, and report its path."""
+    with files.atomic_write(path) as file:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=150)
     ERROR.print(f"wrote {path}")

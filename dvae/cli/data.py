@@ -29,8 +29,8 @@ def info(
 ) -> None:
     """Describe motion files or tables.
 
-    Of motion: splits, clips, skeleton, units, axes, bone lengths and labels. Of a table: guesses the columns and prints
-    a schema; --out riders.toml writes it to a file that you can edit.
+    For motion, prints splits, clips, skeleton, units, axes, bone lengths and labels. For a table, guesses the type of
+    each column and prints a schema; --out riders.toml writes it to a file that you can edit.
 
     Args:
         files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), "simulated", or tables.
@@ -44,9 +44,9 @@ def info(
     files = files or (SIMULATED,)
     found = [file for file in files if tables.is_table(file)]
     if table != tables.ColumnOptions() and len(found) < len(files):
-        raise UsageError("options of columns are about tables")
+        raise UsageError("options of columns are for tables; leave them out for motion files")
     if out and len(found) < len(files):
-        raise UsageError("--out takes the schema that info proposes for a table; of motion info writes nothing")
+        raise UsageError("--out writes the schema of a table; for motion files, leave it out")
     if found:
         tables.info(found, out, table)
     for file in files:
@@ -84,9 +84,9 @@ def convert(
     known = _skeleton(onto)
     if files in ((), (SIMULATED,)):
         if metres or up or recorded:
-            raise UsageError("--metres, --up and --recorded are of files, which may be wrong about them")
+            raise UsageError("--metres, --up and --recorded correct what files state; simulated motion has no files")
         people = motion.simulate() if fps is None else motion.simulate().resampled(fps)
-        people = people if known is None else reading.chosen(people, onto=known)
+        people = people if known is None else reading.select_joints(people, onto=known)
         said = f"{len(writing.write_motion(out, people, format))} files"
     else:
         told = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad, "missing": missing}
@@ -107,7 +107,7 @@ def get(
         out: folder to write.
         url: address to download from, instead of the original site.
     """
-    from ..motion.files.getting import get as downloaded
+    from ..motion.files.download import get as downloaded
 
     got = downloaded(collection, out, url)
     ERROR.print(f"{len(got)} files of {collection} in {out}; dvae data info {out}", markup=False)
@@ -122,7 +122,7 @@ def _read(
 
 
 def _skeleton(name: str | None) -> motion.Skeleton | None:
-    """A skeleton by its name or file."""
+    """Return a skeleton by its name or file."""
     if name is None or name in ONTO:
         return ONTO.get(name or "")
     if not name.endswith(".json"):

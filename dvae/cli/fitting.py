@@ -1,4 +1,4 @@
-"""Commands that fit: fit, resume, sweep. Their options are the fields of methods and of `Training`."""
+"""Commands that fit models: fit, resume and sweep. Their options are the fields of methods and of `Training`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from ..inference.training.checkpoints import Run
 from ..inference.training.fit import Fit, Interrupted
 from ..inference.training.fit import fit as fit_method
 from ..inference.training.options import Accelerator, Training
-from ..inference.training.processes import restartable
+from ..inference.training.processes import is_restartable
 from ..inference.training.recipe import Trainable
 from ..inference.training.schedules import Schedule
 from ..inference.training.trackers import TensorBoard
 from ..models import registry
 from ..models.method import LatentMethod
 from ..models.motion.trajectories import TrajectoryMethod
-from ..models.registry import judges, methods
+from ..models.registry import methods, metric_models
 from ..motion.data.dataset import SIMULATED
 from ..motion.data.protocols import Representation
 from ..motion.segments.dataset import Segmentation
@@ -42,14 +42,14 @@ from .tables import ColumnOptions, is_table
 
 
 def options_of(name: str, kind: type[Any], *aside: str, common: Collection[str] | None = None) -> Any:
-    """A dataclass of the options of another that can be written as words, but those that are left aside.
+    """Return a dataclass with the fields of another one that can be given on a command line.
 
-    Options are None where they are not given, and flags False.
+    An option that is not given is None, or False for a flag.
 
     Args:
-        name: of the class.
-        kind: whose options.
-        aside: names of options.
+        name: name of the new class.
+        kind: dataclass with the options.
+        aside: names of options to omit.
         common: names of the options that `--help` shows; all by default.
     """
     hints = get_type_hints(kind, include_extras=True)
@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     TrainingOptions = Any
     SweepOptions = Any
 else:
-    KNOWN = {**methods(), **judges()}
+    KNOWN = {**methods(), **metric_models()}
     MethodChoice = tyro.extras.subcommand_type_from_defaults(
         {name: kind() for name, kind in KNOWN.items()},
         descriptions={name: kind.source for name, kind in KNOWN.items()},
@@ -83,8 +83,10 @@ else:
     SweptMethod = tyro.extras.literal_type_from_choices([name for name in methods() if name != "equations"])
     MethodOptions = options_of("MethodOptions", LatentMethod, "latent")
     COMMON = ("steps", "batch_size", "learning_rate", "patience", "seed", "accelerator")
-    TrainingOptions = options_of("TrainingOptions", Training, "self_feeding", "progress", common=COMMON)
-    SweepOptions = options_of("SweepOptions", Training, "self_feeding", "progress", "seed", "devices", common=COMMON)
+    TrainingOptions = options_of("TrainingOptions", Training, "scheduled_sampling", "progress", common=COMMON)
+    SweepOptions = options_of(
+        "SweepOptions", Training, "scheduled_sampling", "progress", "seed", "devices", common=COMMON
+    )
 
 
 @dataclass(frozen=True)
@@ -92,23 +94,25 @@ class DataOptions(ColumnOptions):
     """Data to fit to: motion, or a table.
 
     Args:
-        data: a motion file or a folder of them, or "simulated"; or a table: CSV, TSV, Parquet or npz; or an npy file or
-            a folder of them, which may be larger than memory.
-        skip_bad: leave out clips that cannot be used instead of refusing the file.
-        protocol: how windows are cut, by default as suits the skeleton.
-        representation: what the model sees: positions; or turns of joints in this form, and bones then keep their
-            lengths.
-        cut: of motion-latent: segments are gait cycles, or clips as they are, where they last 0.3 to 3 seconds.
-        scaling: of motion-latent: of turns, less no turn, or less their mean and by their deviation.
-        warped: of motion-latent: time goes along the most typical gait cycles, instead of evenly.
-        bodies: of motion-latent: deviation of shapes of bodies that are drawn for training segments; 0 for their own.
-        observed: of a table: steps that a forecast is given.
-        horizon: of a table: steps to forecast.
-        stride: of a table: steps from one test window to the next.
-        split: of a table: what is divided into training, validation and test.
-        validation: of a table: share by which weights are chosen.
-        test: of a table: share to be judged on.
-        season: of a table: its period in steps, which a reference repeats.
+        data: motion file or folder of motion files, or "simulated"; or a table: CSV, TSV, Parquet or npz; or an npy
+            file or folder of npy files, which may be larger than memory.
+        skip_bad: leave out clips that cannot be used, instead of refusing the file.
+        protocol: protocol that cuts windows; by default the protocol of the skeleton.
+        representation: input of the model: positions of joints, or rotations of joints in this form, which keep the
+            lengths of bones.
+        cut: for motion-latent: use gait cycles as segments, or whole clips of 0.3 to 3 seconds.
+        scaling: for motion-latent: encode rotations relative to the identity, or relative to their mean in units of
+            their standard deviation.
+        warped: for motion-latent: align segments in time with the most typical gait cycles.
+        bodies: for motion-latent: standard deviation of the body shapes drawn for training segments; 0 keeps the
+            recorded bodies.
+        observed: for a table: number of observed steps before a forecast.
+        horizon: for a table: number of steps to forecast.
+        stride: for a table: steps from one test window to the next.
+        split: for a table: divide sequences, time or groups into training, validation and test.
+        validation: for a table: share of the data for validation, which selects the weights.
+        test: for a table: share of the data for the test.
+        season: for a table: period in steps, which the seasonal reference forecast repeats.
     """
 
     data: str = SIMULATED
@@ -129,22 +133,22 @@ class DataOptions(ColumnOptions):
     season: Frames | None = None
 
     def open(self, *methods: Trainable) -> Any:
-        """The data on which methods are fitted, of one kind.
+        """Open the data on which methods are fitted.
 
         Raises:
-            UsageError: they are of several, or an option is of another kind than that of the methods.
+            UsageError: the methods are fitted on different kinds of data, or an option is for another kind of data.
         """
         kinds = {method.fitted_on: method.name for method in methods}
         if len(kinds) > 1:
             said = " and ".join(f"{name} on {SAID.get(kind, kind)}" for kind, name in kinds.items())
-            raise UsageError(f"methods are fitted on data of their kind, {said}; give those of one kind")
+            raise UsageError(f"these methods are fitted on different kinds of data, {said}; give methods of one kind")
         ((kind, name),) = kinds.items()
         given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
         told = [option for option in OF_KINDS["panel"] if option in given]
         if kind == "windows":
             kind = "panel" if is_table(self.data) or told else "motion"
             if kind == "panel" and self.data == SIMULATED:
-                raise UsageError(f"--{told[0]} is about tables; name one by --data")
+                raise UsageError(f"--{told[0]} is about tables; name one with --data")
         for other, options in OF_KINDS.items():
             if other != kind and (strange := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
                 raise UsageError(
@@ -152,13 +156,13 @@ class DataOptions(ColumnOptions):
                 )
         columns = {field.name for field in fields(ColumnOptions)}
         given = {name: value for name, value in given.items() if name not in columns} | self.given()
-        with arguments() if kind == "panel" else nullcontext():  # of which columns are arguments
+        with arguments() if kind == "panel" else nullcontext():  # the columns of a table are arguments
             opened = DATA[kind].open(given.pop("data", SIMULATED), **given)
         if isinstance(opened, PanelData | motion.MotionData):
             for said in opened.parts().values():
                 ERROR.print(said, markup=False)
         if isinstance(opened, PanelData):
-            warnings.filterwarnings("ignore", "training leaves out")  # which the lines above list
+            warnings.filterwarnings("ignore", "training leaves out")  # the lines above list the omitted parts
         return opened
 
 
@@ -170,7 +174,7 @@ OF_KINDS = {
         *("observed", "horizon", "stride", "split", "validation", "test", "season"),
     ),
 }
-"""Options by the kind of data that has them."""
+"""Options by kind of data."""
 SAID = {"windows": "windows", "motion": "motion", "segments": "segments of motion", "panel": "a table"}
 
 
@@ -181,24 +185,24 @@ def fit(
     source: DataOptions,
     tensorboard: bool = False,
 ) -> None:
-    """Fit a method, or equations of your own, to motion or to a table.
+    """Fit a method, or your own equations, to motion or to a table.
 
     Args:
-        method: what to fit.
-        out: the run directory.
-        training: options of the run; what is not given is the method's own, see `dvae show METHOD`.
-        source: the motion data.
-        tensorboard: write TensorBoard files to the run directory too.
+        method: method to fit.
+        out: run directory.
+        training: options of the run; `dvae show METHOD` prints the defaults of a method.
+        source: data to fit to.
+        tensorboard: also write TensorBoard files to the run directory.
     """
     if out.is_file():
         raise UsageError(f"--out {out} is a file; name a directory for the run")
-    if Run(out).exists and restartable():
-        ERROR.print(f"{out} holds a run, which goes on")
+    if Run(out).exists and is_restartable():
+        ERROR.print(f"{out} contains a run; continuing it")
         return resume(out, tensorboard=tensorboard)
     if Run(out).exists:
         raise ValueError(f"{out} already holds a run; {runs.advice(out)}; or choose another directory")
     with arguments():
-        method.check()  # wrong equations and options are found before the data are read
+        method.check()  # before reading the data, so wrong equations and options fail early
         how = given_options(training)
     opened = source.open(method)
     with _reported():
@@ -215,15 +219,15 @@ def resume(
 ) -> None:
     """Continue a run from its last checkpoint.
 
-    The learning rate falls, and self-feeding rises, over the same shares of the run when it is made longer.
+    In a longer run, the learning rate falls and scheduled sampling rises over the same shares of the run.
 
     Args:
-        run: the run directory.
-        data: where the data lie now, if the path in the run no longer leads there.
-        steps: optimiser steps in all, to make the run longer.
-        learning_rate: step size of the optimiser from here on.
-        accelerator: where it goes on, such as on a processor after a GPU.
-        tensorboard: write TensorBoard files to the run directory too.
+        run: run directory.
+        data: where the data are now, if the path in the run is no longer valid.
+        steps: total number of optimiser steps, to extend the run.
+        learning_rate: step size of the optimiser from this checkpoint on.
+        accelerator: device to continue on, such as a CPU after a GPU.
+        tensorboard: also write TensorBoard files to the run directory.
     """
     given = {"steps": steps, "learning_rate": learning_rate, "accelerator": accelerator}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -245,26 +249,27 @@ def sweep(
     jobs: int = 2,
     scheduler: str | None = None,
 ) -> None:
-    """Fit methods with several seeds and sizes, several runs at a time, each on one thread.
+    """Fit methods with several seeds and sizes, several runs in parallel, each on one thread.
 
-    The same command continues a sweep that was stopped: finished runs are left as they are.
+    The same command continues an interrupted sweep and keeps finished runs.
 
     Args:
-        method: names of methods; none where a grid says what to fit.
-        out: directory of the run directories, such as srnn-seed0, or srnn-z8-seed0 where sizes differ.
+        method: names of methods, unless --grid is given.
+        out: directory for the run directories, such as srnn-seed0, or srnn-z8-seed0 if sizes differ.
         model: options of all methods, in place of their defaults.
-        training: options of the runs; what is not given is each method's own, see `dvae show METHOD`.
-        source: the data.
+        training: options of the runs; `dvae show METHOD` prints the defaults of each method.
+        source: data to fit to.
         grid: TOML file of named equations and methods, each with its options and their values; see docs/sweeps.md.
-        seeds: of initial weights, batches and draws, a run for each; by default the grid's, or 0, 1 and 2.
-        latent: sizes of z; a run for each.
-        jobs: runs at a time.
-        scheduler: address of a dask scheduler, such as tcp://host:8786, whose workers fit the runs in place of --jobs.
+        seeds: seeds of initial weights, batches and draws, one run for each; by default the seeds of the grid, or 0, 1
+            and 2.
+        latent: sizes of z, one run for each.
+        jobs: number of runs in parallel.
+        scheduler: address of a dask scheduler, such as tcp://host:8786, whose workers replace --jobs.
     """
     if bool(method) == bool(grid) or seeds == ():
         raise UsageError("give at least one method and one seed, or no method and --grid")
     if grid is not None and latent:
-        raise UsageError("--latent is of methods that are named; in a grid write each.latent = [8, 16]")
+        raise UsageError("--latent is for methods given by name; in a grid, write each.latent = [8, 16]")
     at_least(1, jobs=jobs)
     if out.is_file():
         raise UsageError(f"--out {out} is a file; name a directory for the runs")
@@ -287,17 +292,17 @@ def sweep(
         results = sweep_methods(chosen, opened, out, seeds or (0, 1, 2), how, jobs)
     if failed := [result for result in results if result.status == "failed"]:
         raise RuntimeError(
-            f"{len(failed)} of {len(results)} runs failed, the same command tries them again\n"
+            f"{len(failed)} of {len(results)} runs failed; the same command retries them\n"
             + "\n".join(map(str, failed))
         )
     then = f"score them with: dvae evaluate {out}/*"
     if fitted[0].fitted_on == "windows":
-        then += f", and bounds, where all have one: dvae compare {out}/*"
+        then += f"; if all have a bound, compare them with: dvae compare {out}/*"
     OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
 
 
 def given_options(training: Any) -> dict[str, Any]:
-    """The options of training that are given, each of which may be."""
+    """Return the training options that are given, after checking each."""
     given = {name: value for name, value in vars(training).items() if value is not None and value is not False}
     Training(**given)
     return given
@@ -305,7 +310,7 @@ def given_options(training: Any) -> dict[str, Any]:
 
 @contextmanager
 def _reported() -> Iterator[None]:
-    """Within it, an interrupted fit says how the command line goes on."""
+    """Add the command that resumes the run to the message of an interrupted fit."""
     try:
         yield
     except Interrupted as stop:
@@ -315,7 +320,7 @@ def _reported() -> Iterator[None]:
 
 @contextmanager
 def _cluster(scheduler: str) -> Iterator[None]:
-    """Within it, joblib runs on the workers of a dask scheduler."""
+    """Run joblib on the workers of a dask scheduler within the block."""
     try:
         from distributed import Client
     except ImportError as error:
@@ -333,8 +338,8 @@ def _report(result: Fit) -> None:
 
 
 def _use(name: str, run: Path) -> str:
-    """What to do with a fitted run."""
-    if name in judges():
+    """Return the next commands for a fitted run, in words."""
+    if name in metric_models():
         what = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"
         return f"score {what} with: dvae evaluate RUN {option} {run}"

@@ -1,7 +1,7 @@
 """Help of one command: its common options with the defaults that apply, or all options.
 
-Help is printed from a copy of the command's signature, which is never called: options marked `Expert` are left out
-unless all are asked for, and an option without a value of its own says where its value comes from.
+Help is printed from a copy of the command's signature, which is never called. `--help` omits the options marked
+`Expert`. An option without a default value shows where its value comes from.
 """
 
 from __future__ import annotations
@@ -20,21 +20,23 @@ from .console import OUT
 T = TypeVar("T")
 EXPERT = "expert"
 Expert = Annotated[T, EXPERT]
-"""An option that `--help` leaves out and `--help-all` shows."""
+"""An option that `--help` omits and `--help-all` shows."""
 
 
-def described(function: Callable[..., None], given: Sequence[str], everything: bool) -> tuple[Callable[..., None], str]:
-    """Return a stand-in for a command, to print its help, and the method that it is about, if any.
+def command_stub(
+    function: Callable[..., None], given: Sequence[str], everything: bool
+) -> tuple[Callable[..., None], str]:
+    """Return a copy of a command's signature, from which its help is printed, and " METHOD" if a method is given.
 
     Args:
-        function: the command.
+        function: function of the command.
         given: arguments, which may name a method to fit.
-        everything: whether to show the options of experts.
+        everything: whether to show expert options.
     """
-    from ..models.registry import judges, methods
+    from ..models.registry import methods, metric_models
 
     hints = get_type_hints(function, include_extras=True)
-    known: dict[str, type[Trainable]] = {**methods(), **judges()} if function.__name__ == "fit" else {}
+    known: dict[str, type[Trainable]] = {**methods(), **metric_models()} if function.__name__ == "fit" else {}
     kind = next((known[word] for word in given if word in known), None)
     if known and kind is None:
         _list_methods(known)
@@ -56,7 +58,7 @@ def described(function: Callable[..., None], given: Sequence[str], everything: b
         kept.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
 
     def shown(**_: Any) -> None:
-        """The help alone is printed."""
+        """Do nothing: only the help of this function is printed."""
 
     shown.__doc__ = function.__doc__
     shown.__signature__ = inspect.Signature(kept)  # type: ignore[attr-defined]
@@ -65,15 +67,29 @@ def described(function: Callable[..., None], given: Sequence[str], everything: b
 
 
 def _hinted(hint: Any, default: Any, said: str | None = None) -> Any:
-    """An option whose help says its default, where that is not a value."""
-    if not (default is None or default is False or default == ()):
+    """Return the type of an option with its default in words, for defaults that are flags, missing or empty."""
+    if not (default is None or isinstance(default, bool) or default in ((), "", {})):
         return hint
-    words = said or ("default: no" if default is False else "optional")
+    words = said or (f"default: {_worded(default)}" if isinstance(default, bool) else "optional")
     return Annotated[hint, tyro.conf.arg(help_behavior_hint=f"({words})")]
 
 
+def _worded(value: Any) -> str:
+    """Return a default in words."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "none" if value is None or value in ((), "", {}) else str(value)
+
+
 def _copied(kind: Any, everything: bool, defaults: Mapping[str, str], expert: Sequence[str] = ()) -> Any:
-    """A subclass of a dataclass of options whose fields are shown as `described` says."""
+    """Return a subclass of a dataclass of options, for its help.
+
+    Args:
+        kind: dataclass of options.
+        everything: whether to show expert options.
+        defaults: {option: its default in words}.
+        expert: further options to treat as expert options.
+    """
     hints = get_type_hints(kind, include_extras=True)
     annotations, values = {}, {}
     for option in fields(kind):
@@ -90,14 +106,15 @@ def _copied(kind: Any, everything: bool, defaults: Mapping[str, str], expert: Se
                 hint = Annotated[hint, tyro.conf.Suppress]
             if default is not MISSING:
                 hint = _hinted(hint, default, defaults.get(option.name))
-                values[option.name] = field(default=default)
+                factory = option.default_factory  # a mutable default needs one
+                values[option.name] = field(default=default) if factory is MISSING else field(default_factory=factory)
         annotations[option.name] = hint
     body = {"__annotations__": annotations, "__doc__": kind.__doc__, "__post_init__": lambda self: None, **values}
     return dataclass(frozen=True)(type(kind.__name__, (kind,), body))
 
 
 def _of_method(kind: type[Trainable], everything: bool) -> Any:
-    """The options of a method; those that it shares with others are for experts."""
+    """Return the options of a method; options shared with other methods are expert options."""
     own = {name for each in kind.__mro__ if each.__module__ == kind.__module__ for name in each.__annotations__}
     shared = [option.name for option in fields(kind) if option.name not in own and option.name != "latent"]
     presets: Mapping[str, Mapping[str, Any]] = getattr(kind, "presets", {})
@@ -110,7 +127,7 @@ def _of_method(kind: type[Trainable], everything: bool) -> Any:
 
 
 def _trainings(kind: type[Trainable]) -> dict[str, str]:
-    """The training defaults of a method, in words."""
+    """Return the training defaults of a method, in words."""
     names = [option.name for option in fields(next(iter(kind.trainings.values())))]
     return {
         name: _by_preset({of or kind.name: getattr(training, name) for of, training in kind.trainings.items()})
@@ -119,8 +136,8 @@ def _trainings(kind: type[Trainable]) -> dict[str, str]:
 
 
 def _by_preset(values: Mapping[str, Any]) -> str:
-    """Values by preset of data; one where all agree."""
-    said = {name: "none" if value is None else str(value) for name, value in values.items()}
+    """Return the values by data preset, in words; a single value if all are equal."""
+    said = {name: _worded(value) for name, value in values.items()}
     if len({*said.values()}) == 1:
         name, value = next(iter(said.items())) if len(said) == 1 else ("", next(iter(said.values())))
         return f"default: {value}" + (f" ({name})" if name else "")

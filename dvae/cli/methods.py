@@ -14,7 +14,7 @@ from ..factorization.inversion import guide
 from ..factorization.notation import Factorization
 from ..inference.evaluation.result import Table
 from ..models import registry
-from ..models.registry import judges, methods
+from ..models.registry import methods, metric_models
 from .console import OUT, UsageError, arguments, at_least, check_figure, save_figure
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def list_methods() -> None:
-    """List the methods: their equations and where they come from."""
+    """List the methods with their equations and sources."""
     table = Table(show_lines=True)
     for column in ("method", "equations", "source"):
         table.add_column(column)
@@ -30,8 +30,8 @@ def list_methods() -> None:
         generative, inference, source = methods().texts(name, "generative", "inference", "source")
         pair = "--generative and --inference" if generative is None else f"{generative}\n{inference}"
         table.add_row(name, pair, source)
-    for name in judges():
-        table.add_row(name, "a judge of what methods make", *judges().texts(name, "source"))
+    for name in metric_models():
+        table.add_row(name, "a metric model of forecasts", *metric_models().texts(name, "source"))
     OUT.print(table, highlight=False)
 
 
@@ -43,14 +43,15 @@ def show(
     summed: tuple[str, ...] = (),
     out: Path | None = None,
 ) -> None:
-    """Show two equations: the joint distributions, the audit of the guide, and the graph; and how a method is fitted.
+    """Show two equations: the joint distributions, the audit of the guide, and the graph; and a method's defaults.
 
     Args:
-        method: name of a method, or of a judge, or give two equations instead.
-        generative: the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)"; alone, with the guides that miss nothing.
-        inference: the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "faithful" for one that misses nothing, "" of a model
-            without latents.
-        steps: time steps in the figure.
+        method: name of a method or of a metric model, unless equations are given.
+        generative: equation of the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)"; without --inference, lists the
+            guides that ignore no dependency of the posterior.
+        inference: equation of the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "faithful" for a guide that ignores no
+            dependency of the posterior, "" for a model without latents.
+        steps: number of time steps in the figure.
         summed: discrete latents of the model, which are summed out and have no factor in the guide.
         out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
     """
@@ -58,11 +59,14 @@ def show(
     check_figure(out, "out")
     if method is not None and (generative or inference or summed):
         raise UsageError("give the name of a method or two equations, not both")
-    if method is not None and method in judges():
+    if method is not None and method in metric_models():
         if out is not None:
-            raise UsageError(f"{method} is a judge of what methods make and has no graph; leave --out out")
-        judge = judges()[method]
-        said = [f"{method} has no equations: a judge of what methods make ({judge.source})", *_fitted(judge.trainings)]
+            raise UsageError(f"{method} is a metric model and has no graph; leave out --out")
+        metric_model = metric_models()[method]
+        said = [
+            f"{method} has no equations: it is a metric model of forecasts ({metric_model.source})",
+            *_fitted(metric_model.trainings),
+        ]
         OUT.print("\n".join(said), highlight=False, soft_wrap=True)
         return
     if method is not None:
@@ -104,14 +108,14 @@ def show(
         OUT.print(found.table())
         OUT.print(found.verdict)
     else:
-        why = "all that is latent is summed out" if summed else "nothing is latent"
+        why = "all latents are summed out" if summed else "nothing is latent"
         OUT.print(f"{why}: there is no guide, and the bound is the log evidence")
     if method is not None:
         OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)
 
 
 def _fitted(trainings: Mapping[str, Training]) -> list[str]:
-    """How a method is fitted where nothing else is said, in words, by the skeleton."""
+    """Return the training defaults of a method by skeleton, in words."""
     lines = []
     for skeleton, told in trainings.items():
         rate = told.rate
@@ -124,5 +128,5 @@ def _fitted(trainings: Mapping[str, Training]) -> list[str]:
 
 
 def _asks_for_equations(kind: Any) -> bool:
-    """Whether the equations of a method are options of it."""
+    """Return whether the equations of a method are given as options."""
     return "generative" in {option.name for option in fields(kind)}

@@ -1,4 +1,4 @@
-"""What commands do with runs on tables: score, criticise, compare, forecast, fill gaps, and propose a schema."""
+"""Commands on tables and on runs fitted on them: windows, forecasts, filling of missing entries, and schemas."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, Literal
 from .. import files
 from ..data.blocks import ColumnSummary, row_blocks
 from ..inference.evaluation.result import Table
-from ..inference.evaluation.scores import reaching
+from ..inference.evaluation.scores import samples_needed
 from ..runs import directory as runs
 from ..tables.dataset import PanelData
 from ..tables.forecasts import BANDS, FORMATS, QUANTILES, column_of, needed
@@ -22,9 +22,9 @@ from .console import ERROR, OUT, UsageError, arguments, check_files, note, save_
 from .help import Expert
 
 OF_MOTION = {".amc", ".bvh", ".c3d", ".npz"}
-"""Ends of names of files that make a folder one of motion, whatever else lies in it."""
+"""Suffixes of motion files: a folder with one of them is a folder of motion."""
 SAMPLES = 100
-"""Draws of a table where nobody says how many: its quantiles from 2.5 to 97.5 % need 39, and are rough then."""
+"""Default number of draws for a table: quantiles from 2.5 to 97.5 % need at least 39, which give rough values."""
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,18 @@ class ColumnOptions:
     """Roles of the columns of a table.
 
     Args:
-        columns: of a table: what is modelled, each as NAME, NAME:FAMILY or NAME:FAMILY:UNIT, such as
-            riders:count:people. Without it, all that is nothing else; a schema beside the file says the same.
-        covariates: of a table: columns that forecasts are given for the future too, such as a calendar.
-        past: of a table: columns that forecasts are given up to the present.
-        attributes: of a table: columns with one value a sequence.
-        id: of a table: columns that tell sequences apart.
-        time: of a table: column of dates or numbers, or columns that are joined, such as a date and a clock.
-        group: of a table: column that is the same within a sequence.
-        zone: of a table: time zone of its dates, such as Europe/Berlin.
-        na_values: of a table: texts or numbers that mark missing values, beside empty cells and NaN.
-        decimal: of a table: decimal sign of its numbers, where they do not show it.
+        columns: for a table: columns to model, each as NAME, NAME:FAMILY or NAME:FAMILY:UNIT, such as
+            riders:count:people; by default all columns without another role. A schema next to the file can give the
+            same.
+        covariates: for a table: columns that are known for the future too, such as a calendar.
+        past: for a table: columns that are known up to the present.
+        attributes: for a table: columns with one value per sequence.
+        id: for a table: columns that identify a sequence.
+        time: for a table: column of dates or numbers, or columns to join, such as a date and a clock time.
+        group: for a table: column of groups of sequences, constant within a sequence.
+        zone: for a table: time zone of its dates, such as Europe/Berlin.
+        na_values: for a table: texts or numbers that mark missing values, in addition to empty cells and NaN.
+        decimal: for a table: decimal sign of its numbers, if it cannot be detected.
     """
 
     columns: tuple[str, ...] = ()
@@ -57,14 +58,14 @@ class ColumnOptions:
     decimal: Expert[Literal[".", ","] | None] = None
 
     def given(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults, under the names that `PanelData.open` gives them."""
+        """Return the options that differ from their defaults, under their names in `PanelData.open`."""
         found = {each.name: getattr(self, each.name) for each in fields(ColumnOptions)}
-        found["static"] = found.pop("attributes")  # a method may have a `static` of its own
+        found["static"] = found.pop("attributes")  # a method may have an option `static`
         return {name: value for name, value in found.items() if value}
 
 
 def is_table(path: str) -> bool:
-    """Whether a path leads to a table rather than to motion."""
+    """Return whether a path is a table rather than motion."""
     if is_domain(path):
         return True
     place = Path(path)
@@ -92,15 +93,21 @@ def is_table(path: str) -> bool:
 
 
 def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: int | None) -> PanelWindows:
-    """Windows to forecast, cut as those of the run but for what is given of `Cut`.
+    """Return windows to forecast, cut as in the run.
+
+    Args:
+        loaded: run.
+        opened: its data, or other data.
+        split: split of the windows.
+        **cut: options of `Cut` that replace the values of the run, if not None.
 
     Raises:
-        UsageError: whole sequences, of which nothing is forecast.
+        UsageError: the run was fitted on whole sequences, for which there are no forecasts.
     """
     if opened.schema.cut.length is None:
         raise UsageError(
             f"{loaded.path} was fitted on whole sequences; fit with --observed and --horizon to forecast, or compare "
-            "their bounds by `dvae compare`"
+            "bounds with `dvae compare`"
         )
     return opened.recut(**{name: steps for name, steps in cut.items() if steps is not None}).windows(split)
 
@@ -116,7 +123,7 @@ def forecast(
     figure: Path | None,
     beyond: bool,
 ) -> None:
-    """Forecast test windows, those of one sequence, or what comes after the end of the table."""
+    """Forecast the test windows, the windows of one sequence, or the steps after the end of the table."""
     check_files(out, figure, *FORMATS)
     opened = opened if sequence is None else opened.only([sequence])
     samples = samples or SAMPLES
@@ -131,28 +138,28 @@ def forecast(
 
 
 def impute(loaded: runs.Loaded, opened: PanelData, out: Path, samples: int | None, particles: int, seed: int) -> None:
-    """Draw the missing entries of a table's sequences, in a table of them."""
+    """Draw the missing entries of a table, and write them."""
     check_files(out, None, *FORMATS)
     samples, held = samples or SAMPLES, opened.whole()
     with arguments():
         found = held.impute(loaded.model, samples, seed, particles)
     found.save(out)
-    ERROR.print(f"wrote {out}: {samples} fillings of {found.lacking.sum()} entries that {held.panel.name} lacks")
+    ERROR.print(f"wrote {out}: {samples} fillings of {found.missing.sum()} missing entries of {held.panel.name}")
     _say_left_out(samples, out)
 
 
 def _say_left_out(samples: int, out: Path, figure: Path | None = None) -> None:
-    """Notes which quantiles and intervals so many draws do not have."""
+    """Note the quantiles and intervals that need more draws."""
     least = {} if out.suffix.lower() == ".npz" else {column_of(level): needed(level) for level in QUANTILES}
-    least |= {} if figure is None else {f"the interval of {100 * level:g} %": reaching(level) for level in BANDS}
+    least |= {} if figure is None else {f"the interval of {100 * level:g} %": samples_needed(level) for level in BANDS}
     if lacking := [f"{name} ({draws})" for name, draws in least.items() if draws > samples]:
-        note(f"left out, as they need more than {samples} draws (--samples): {', '.join(lacking)}")
+        note(f"left out, because they need more than {samples} draws (--samples): {', '.join(lacking)}")
 
 
 def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
     """Print a summary of each table and a schema to correct; columns without a given role are guessed."""
     if out is not None and len(paths) > 1:
-        raise UsageError("--out takes the schema of one table")
+        raise UsageError(f"--out writes the schema of one table, got {len(paths)} tables; name one")
     for path in paths:
         opened = PanelData.open(path, **told.given())
         panel = opened.panel
@@ -171,8 +178,8 @@ def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
         OUT.print(table)
         if panel.columns.id and not told.given().get("id") and schema_beside(path) == (None, None):
             OUT.print(
-                f"note: each value of {', '.join(panel.columns.id)} is taken as a sequence of its own, as its name or "
-                "its repeated times suggest; if all rows are one sequence, make it part of the time",
+                f"note: each value of {', '.join(panel.columns.id)} is read as a separate sequence, as its name or its "
+                "repeated times suggest; if all rows are one sequence, make it part of the time",
                 markup=False,
                 soft_wrap=True,
             )
@@ -182,9 +189,9 @@ def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
         if out is None:
             if schema_beside(path) == (None, None):
                 beside = Path(path).with_suffix(".toml")
-                OUT.print(f"a schema, to be corrected and kept as {beside} (--out {beside} writes it):\n", markup=False)
+                OUT.print(f"schema to correct and keep as {beside} (--out {beside} writes it):\n", markup=False)
             OUT.print(text, markup=False, highlight=False)
         else:
-            with files.written(out) as file:
+            with files.atomic_write(out) as file:
                 file.write(text.encode())
             ERROR.print(f"wrote {out}: correct it, and `dvae fit METHOD --data {path} --out RUN` reads it")

@@ -1,7 +1,8 @@
-"""The program `dvae`: what its command imports, in which Ctrl-C and a missing piece end it in a sentence, and then it.
+"""Entry point of the program `dvae`: it imports the command, then runs it.
 
-Torch takes seconds to import, and dvae itself may be what cannot be imported. So this package is installed under a
-second name, `dvae_command`, beside dvae and not within it.
+Importing torch takes seconds, and importing dvae may fail. Ctrl-C and an ImportError during the imports therefore print
+one line instead of a traceback. This package is installed under a second name, `dvae_command`, outside dvae, so that it
+can be imported without dvae.
 """
 
 import os
@@ -13,13 +14,13 @@ from types import FrameType
 
 def main() -> int:
     """Run the command line and return its exit code."""
-    handled = signal.getsignal(signal.SIGINT) == signal.default_int_handler  # else it is ignored, as by nohup
+    handled = signal.getsignal(signal.SIGINT) == signal.default_int_handler  # otherwise ignored, as under nohup
     if handled:
-        signal.signal(signal.SIGINT, _interrupted)  # a KeyboardInterrupt amid an import can come out as anything
+        signal.signal(signal.SIGINT, _interrupted)  # an import may turn a KeyboardInterrupt into another error
     try:
         from dvae.cli import command, main
 
-        with suppress(ValueError):  # no command, of which main tells
+        with suppress(ValueError):  # an unknown command; `main` reports it
             command(sys.argv[1:])
         from dvae.cli.app import exit_code
     except ImportError as error:
@@ -32,7 +33,7 @@ def main() -> int:
 
 def _interrupted(number: int, _: FrameType | None) -> None:
     os.write(2, b"interrupted\n")
-    os._exit(128 + number)  # nothing has begun, so there is nothing to end
+    os._exit(128 + number)  # no work has started, so no cleanup is needed
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from ..lazy import importing
 if TYPE_CHECKING:
     from .batch import Batch
     from .schema import Schema, SchemaError
-    from .sequences import ArrayWindows, HeldOutWindows, Sequences, gaps, since_observed
+    from .sequences import ArrayWindows, HeldOutWindows, Sequences, time_since_observed, time_since_previous
 
 __all__ = [
     "ArrayWindows",
@@ -16,8 +16,8 @@ __all__ = [
     "Schema",
     "SchemaError",
     "Sequences",
-    "gaps",
-    "since_observed",
+    "time_since_observed",
+    "time_since_previous",
 ]
 
 _PLACES = dict.fromkeys(__all__, "sequences") | {"Batch": "batch", "Schema": "schema", "SchemaError": "schema"}

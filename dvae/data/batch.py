@@ -23,7 +23,7 @@ class Batch(dict[str, Any]):
     ([3, 2], None, torch.Size([1, 3, 1]))
     """
 
-    reserved: ClassVar[tuple[str, ...]] = ("lengths", "mask", "group", "log_det", "beside")
+    reserved: ClassVar[tuple[str, ...]] = ("lengths", "mask", "group", "log_det", "view_inputs")
     reader: Any = None
     """Mark of the model that has read the batch and need not read it again; None after an entry was set."""
 
@@ -48,9 +48,9 @@ class Batch(dict[str, Any]):
         return self.log_det.sum(-1) if self.log_det is not None and self.log_det.dim() == 2 else self.log_det
 
     @property
-    def beside(self) -> Mapping[str, Any]:
+    def view_inputs(self) -> Mapping[str, Any]:
         """Additional inputs of some views, by name; models do not read them."""
-        found: Mapping[str, Any] = self.get("beside", {})
+        found: Mapping[str, Any] = self.get("view_inputs", {})
         return found
 
     @property
@@ -89,8 +89,8 @@ class Batch(dict[str, Any]):
         return found
 
     def past(self, observed: int) -> Batch:
-        """Return the batch as forecasts see it: all context, and the first frames of x, its mask and `beside`."""
-        known = Batch({name: self[name] for name in (WHOLE, "mask", "beside") if name in self})
+        """Return the batch as forecasts see it: all context, and the first frames of x, its mask and `view_inputs`."""
+        known = Batch({name: self[name] for name in (WHOLE, "mask", "view_inputs") if name in self})
         return self | known.map(lambda value: value[:, :observed])
 
     def leaves(self) -> dict[str, Any]:

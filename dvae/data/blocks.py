@@ -45,7 +45,7 @@ def row_blocks(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         yield np.concatenate(held)
 
 
-def cut(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
+def cut_windows(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
     """Return windows (B, T, ...) of arrays (N, ...), copied to a floating type that represents all their values.
 
     Args:

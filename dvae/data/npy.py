@@ -29,7 +29,7 @@ NOTHING = 2**20
 """Maximum bytes of an empty array if dimensions of size 0 count as 1."""
 
 
-class Refused(ValueError):
+class NpyError(ValueError):
     """A file is damaged, or its content is not data."""
 
 
@@ -44,15 +44,15 @@ def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any
     """
     magic = read(8)
     if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\x00", b"\x02\x00"):
-        raise Refused(f"no npy file of version 1 or 2 (it begins with {magic!r}); write it with numpy")
+        raise NpyError(f"no npy file of version 1 or 2 (it begins with {magic!r}); write it with numpy")
     size = int.from_bytes(read(2 if magic[6] == 1 else 4), "little")
     text = read(size).decode("latin1") if size <= LONGEST else ""
     found = HEADER.fullmatch(text)
     if not found or None in found.groups():
-        raise Refused(f"damaged, or no plain array: the header of its npy file is {text[:100]!r}")
+        raise NpyError(f"damaged, or no plain array: the header of its npy file is {text[:100]!r}")
     lengths = [length.strip().removesuffix("L") for length in found["shape"].split(",") if length.strip()]
     if not all(re.fullmatch(r"\d{1,18}", length) for length in lengths):
-        raise Refused(f"damaged: its shape is ({found['shape'][:100]})")
+        raise NpyError(f"damaged: its shape is ({found['shape'][:100]})")
     return dtype_of(found["descr"]), tuple(map(int, lengths)), "F" if found["order"] == "True" else "C"
 
 
@@ -63,7 +63,7 @@ def dtype_of(code: str) -> np.dtype:
     except (TypeError, ValueError, OverflowError):
         dtype = None
     if dtype is None or dtype.kind not in "biufOSU" or not dtype.itemsize:
-        raise Refused(f"refused an array of {str(dtype or code)[:40]}: expected numbers")
+        raise NpyError(f"refused an array of {str(dtype or code)[:40]}: expected numbers")
     return dtype
 
 
@@ -72,14 +72,14 @@ def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = 
     needed, places = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
     if len(shape) > 32 or needed != size or places > max(size, NOTHING):
         short = f", needs {needed:,}; it was cut short, copy or write it again" if needed > size else ""
-        raise Refused(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes{short}")
+        raise NpyError(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes{short}")
 
 
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
     """Return the numbers of an npy file as a read-only memory map; data are read on use.
 
-    If another process truncates the file, the program crashes. If the file is replaced, as `files.written` does, the
-    map keeps the old content.
+    If another process truncates the file, the program crashes. If the file is replaced, as `files.atomic_write` does,
+    the map keeps the old content.
 
     Args:
         path: the file.
@@ -102,19 +102,19 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
             dtype, shape, order = header(file.read)
             size = os.fstat(file.fileno()).st_size - file.tell()
             if dtype.kind not in "fiu":
-                raise Refused(f"holds {dtype}, expected real numbers; write it with numpy.asarray(values, float)")
+                raise NpyError(f"holds {dtype}, expected real numbers; write it with numpy.asarray(values, float)")
             check_bytes(dtype, shape, size)
             if not size:
-                raise Refused(f"has shape {shape}, in which there is no number")
+                raise NpyError(f"has shape {shape}, in which there is no number")
             if order == "F" and len(shape) > 1:
-                raise Refused(
+                raise NpyError(
                     "is in Fortran order, in which the numbers of a frame lie far apart; write it with "
                     "numpy.ascontiguousarray"
                 )
             found = np.memmap(file, dtype, "r", file.tell(), shape)
             found.filename = os.path.abspath(path)  # for joblib, whose processes map it too
             return found.view(np.ndarray)
-    except Refused as error:
+    except NpyError as error:
         raise ValueError(f"{os.fspath(path)} {error}") from error
     except OSError as error:
         if error.errno != errno.EMFILE:

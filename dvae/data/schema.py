@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from torch import Tensor
 
-from ..distributions.base import LawSpec
+from ..distributions.base import DistributionSpec
 from ..options import Frames, Size, check
 from .sequences import ArrayWindows, Sequences, refuse_table, sequences
 from .units import Coordinate
@@ -55,7 +55,7 @@ class Schema:
         return View()
 
     @property
-    def emission(self) -> LawSpec | None:
+    def emission(self) -> DistributionSpec | None:
         """Suitable distribution of x, if the data determine one."""
         return None
 

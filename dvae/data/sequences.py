@@ -2,13 +2,13 @@
 
 A batch is a `Batch`, or a dictionary that can become one. Local variables have the shape (B, T, D), static ones (B, D).
 "lengths" (B,) counts the valid frames of right-padded sequences. "mask" (B, T, D) is True where an entry of the
-observed variable was observed; for several variables it maps names to masks. "beside" maps names to additional inputs
-of some views, such as the rotations of joints in addition to their positions.
+observed variable was observed; for several variables it maps names to masks. "view_inputs" maps names to additional
+inputs of some views, such as the rotations of joints in addition to their positions.
 
 | used by | protocol |
 |---|---|
 | training | `Source`: draws batches |
-| validation | `InBatches`: iterates over batches of sequences; or the same as comparison |
+| validation | `Batched`: iterates over batches of sequences; or the same as comparison |
 | comparison | `Listed`: returns all sequences at once; or arrays, or a batch |
 | evaluation and criticism | `HeldOutWindows`: listed windows with a past, names and a fingerprint |
 
@@ -59,7 +59,7 @@ class Listed(Protocol):
 
 
 @runtime_checkable
-class InBatches(Protocol):
+class Batched(Protocol):
     """Data that can be iterated without loading them completely."""
 
     def __len__(self) -> int:
@@ -100,7 +100,7 @@ def clusters(windows: Any) -> list[tuple[str, str, int]]:
     return list(getattr(windows, "clusters", None) or windows.keys)
 
 
-def called(said: Mapping[str, Any]) -> tuple[str, str]:
+def axis_names(said: Mapping[str, Any]) -> tuple[str, str]:
     """Return the words for a clip and a frame in a description of windows."""
     clip, frame = said.get("called", ("clip", "frame"))
     return clip, frame
@@ -182,7 +182,7 @@ class Sequences:
 
 
 @dataclass(frozen=True, eq=False)
-class Hiding:
+class RandomMasking:
     """A source that hides further entries of x at random, anew in each batch.
 
     The bound remains valid for the visible entries. The guide thereby learns from incomplete sequences if training
@@ -222,7 +222,7 @@ def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
     return values.nanmean(dims) if found.isnan().any() else found
 
 
-def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
+def interpolate_missing(x: Tensor, mask: Tensor | None) -> Tensor:
     """Return sequences with missing entries interpolated linearly in time between observed ones.
 
     Before the first and after the last observed entry of a coordinate, its value is repeated. A coordinate that is
@@ -249,7 +249,7 @@ def bridged(x: Tensor, mask: Tensor | None) -> Tensor:
     return torch.where(mask, x, torch.where(mask.any(-2, keepdim=True), line, 0.0))
 
 
-def gaps(times: Tensor | np.ndarray, lengths: Tensor | None = None) -> Tensor:
+def time_since_previous(times: Tensor | np.ndarray, lengths: Tensor | None = None) -> Tensor:
     """Return the time (B, T, 1) since the previous step, a covariate for irregular steps.
 
     It is 0 at the first step and at padding.
@@ -285,7 +285,7 @@ def gaps(times: Tensor | np.ndarray, lengths: Tensor | None = None) -> Tensor:
     return rise[..., None] if rise.is_floating_point() else rise[..., None].to(torch.get_default_dtype())
 
 
-def since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
+def time_since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
     """Return the time (B, T, D) since each entry was last observed before this step, a covariate for missing values.
 
     For an entry that was never observed, it is the time since the first step; at the first step it is 0. Source: Che et
@@ -293,7 +293,7 @@ def since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
 
     Args:
         mask: (B, T, D), True where an entry was observed.
-        gaps: (B, T, 1), as returned by `gaps`; by default 1 at every step.
+        gaps: (B, T, 1), as returned by `time_since_previous`; by default 1 at every step.
 
     Example:
         >>> mask = torch.tensor([[[True], [False], [False], [True], [True]]])
@@ -313,12 +313,12 @@ def refuse_table(data: Any) -> None:
         if (library := kind.__module__.partition(".")[0]) in ("pandas", "polars", "xarray"):
             raise TypeError(
                 f"got {library}.{kind.__name__}, expected numbers (N, T, D) or windows; give "
-                "`dvae.tables.PanelData.of(frame, dvae.tables.Told(id=('unit',), time='date'))`, where `id` names the "
-                "columns that identify a sequence, and `time` the column that orders its steps"
+                "`dvae.tables.PanelData.of(frame, dvae.tables.ColumnHints(id=('unit',), time='date'))`, where `id` "
+                "names the columns that identify a sequence, and `time` the column that orders its steps"
             )
 
 
-def is_divided(data: Any) -> bool:
+def has_splits(data: Any) -> bool:
     """Return whether data have splits for training, validation and test, such as `dvae.tables.PanelData`."""
     return callable(getattr(type(data), "windows", None))  # of the type, since some windows have such an attribute
 
@@ -330,7 +330,7 @@ def take_split(data: Any, split: str) -> Any:
         TypeError: if the data are a table.
     """
     refuse_table(data)
-    return data.windows(split) if is_divided(data) else data
+    return data.windows(split) if has_splits(data) else data
 
 
 def held_out_windows(data: Any) -> HeldOutWindows:
@@ -387,10 +387,10 @@ def as_source(data: Any) -> Source:
     return data if isinstance(data, Source) else sequences(data)
 
 
-def in_batches(data: Any) -> InBatches:
+def as_batches(data: Any) -> Batched:
     """Return validation data that can be iterated: unchanged if they can, else as `sequences`."""
     data = take_split(data, "validation")
-    return data if isinstance(data, InBatches) else sequences(data)
+    return data if isinstance(data, Batched) else sequences(data)
 
 
 def unmasked(values: Any) -> tuple[Any, np.ndarray | None]:

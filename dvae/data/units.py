@@ -7,8 +7,9 @@ A variable of the data or the context may lie far from 0 relative to its spread,
 stays in float64, its values are read in float64, and only the difference becomes the model's float32.
 
 Units are different from views of the data (`dvae.data.views`). Latents and context also have units, and outputs keep
-the original unit. A distribution is transformed to the data's unit where it is built (`Law.in_units`, the
-push-forward), so given scales and all densities are in this unit. Positive data that span orders of magnitude are read
+the original unit. A distribution is transformed to the data's unit where it is built
+(`ConditionalDistribution.rescale`, the push-forward), so given scales and all densities are in this unit. Positive data
+that span orders of magnitude are read
 as logarithms: of the raw powers of a spectrum, a network sees only the peaks. They are still produced as a multiple of
 their mean.
 """
@@ -40,19 +41,19 @@ LEVELS = "subtract from each sequence its own mean, or fit in float64"
 """Advice for sequences at levels so far apart that float32 resolves no variation around one mean."""
 
 
-def is_lost(known: ColumnSummary, center: Any) -> np.ndarray:
+def is_imprecise(known: ColumnSummary, center: Any) -> np.ndarray:
     """Return whether columns vary, but by less than float32 resolves at their distance from a center."""
     spread = np.sqrt(known.variance)
     return (spread > ROUNDING * abs(known.mean)) & (spread < RESOLVED * abs(known.mean - center))  # type: ignore[no-any-return]
 
 
-def lost_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
-    """Return `is_lost` (N, D) for the coordinates of each sequence (N, T, D), read in blocks."""
+def imprecise_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
+    """Return `is_imprecise` (N, D) for the coordinates of each sequence (N, T, D), read in blocks."""
     found = []
     for block in blocks(values):
         count, _, size = block.shape
         columns = block.swapaxes(0, 1).reshape(-1, count * size)
-        found.append(is_lost(ColumnSummary.of([columns]), np.tile(center, count)).reshape(count, size))
+        found.append(is_imprecise(ColumnSummary.of([columns]), np.tile(center, count)).reshape(count, size))
     return np.concatenate(found)
 
 
@@ -136,7 +137,7 @@ class Units(nn.Module):
         self.mean = mean if self.exact and exceeds_float32(values.dtype) else mean.to(self.scale.dtype)
         self.scale.fill_(scale)
         if values.ndim == 3 and exceeds_float32(values.dtype) and self.scale.dtype is torch.float32:
-            lost = lost_sequences(values, known.mean)
+            lost = imprecise_sequences(values, known.mean)
             if lost.any():
                 warnings.warn(
                     f"in {lost.any(1).sum()} of {len(lost)} sequences, such as {lost.any(1).argmax()}, coordinate "

@@ -1,7 +1,7 @@
 """Views: bijections between the data and their representation in a model.
 
-A model has one view. `DynamicalVAE.read` applies it to a batch, and `DynamicalVAE.shown` applies its inverse to the
-model's data. In between, all values are in the representation of the model. Views for one kind of data are in the
+A model has one view. `DynamicalVAE.read` applies it to a batch, and `DynamicalVAE.to_data_space` applies its inverse to
+the model's data. In between, all values are in the representation of the model. Views for one kind of data are in the
 package of these data.
 
 Densities and bounds refer to the data as given: for a view that changes volume, the log-determinant is added to the log
@@ -54,12 +54,12 @@ class View:
             ValueError: if it is not, with the reason.
         """
 
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         """Return the data in the model's representation.
 
         Args:
             data: values (B, ...) by name.
-            beside: a transformed batch, if `data` continue its sequences.
+            view_inputs: a transformed batch, if `data` continue its sequences.
 
         Raises:
             ValueError: if the data cannot be transformed.
@@ -108,7 +108,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Offered(View):
+class ContextView(View):
     """The identity, with context that a model may ignore.
 
     Args:
@@ -152,9 +152,9 @@ class Views(View):
             view.check(sizes, context, generative)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         for view in self.views:
-            data = Batch(view(data, beside))
+            data = Batch(view(data, view_inputs))
         return data
 
     @override
@@ -210,7 +210,7 @@ class Parts(View):
             raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         if WHOLE not in data:
             return data
         seen, masks = Batch(data), data.masks()
@@ -263,8 +263,8 @@ class History(View):
                 )
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
-        if self.of not in data or self.history in data or beside is not None:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
+        if self.of not in data or self.history in data or view_inputs is not None:
             return data
         masks = data.masks()
         seen = data | {self.history: data[self.of]}
@@ -298,8 +298,8 @@ class Past(View):
         return self.frames
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
-        if WHOLE not in data or self.name in data or beside is not None:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
+        if WHOLE not in data or self.name in data or view_inputs is not None:
             return data
         if data.lengths is not None:
             raise ValueError("a view with `Past` requires windows of one length; remove 'lengths' from the batch")

@@ -1,10 +1,10 @@
 """Conditional distributions of a variable given features, and the parts they are built from.
 
->>> laws = {"p(x)": dvae.distributions.StudentT(df=4), "p(w)": dvae.distributions.Mixture(components=3)}
->>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, laws=laws)
+>>> distributions = {"p(x)": dvae.distributions.StudentT(df=4), "p(w)": dvae.distributions.Mixture(components=3)}
+>>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, distributions=distributions)
 """
 
-from .base import Law, LawSpec, Shape
+from .base import ConditionalDistribution, DistributionSpec, Shape
 from .conditional_flow import ConditionalFlow
 from .families import Delta, Directions, FixedNormal, KnownNoise, Normal, StandardNormal, StudentT
 from .family import FAMILIES, Family, LowRankNormal, NormalMixture
@@ -16,16 +16,16 @@ from .triangular import Triangular
 
 __all__ = [
     "FAMILIES",
+    "ConditionalDistribution",
     "ConditionalFlow",
     "Delta",
     "Directions",
+    "DistributionSpec",
     "Family",
     "FixedNormal",
     "Flow",
     "FlowDistribution",
     "KnownNoise",
-    "Law",
-    "LawSpec",
     "LowRankNormal",
     "Mixture",
     "Normal",

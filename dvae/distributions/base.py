@@ -1,6 +1,7 @@
 """The interface of conditional distributions: a specification, built for a shape, maps features to a distribution.
 
-    LawSpec.build(Shape) -> Law        Law(features) -> parameters        Law.distribution(parameters) -> Pyro's
+    DistributionSpec.build(Shape) -> Distribution        Distribution(features) -> parameters
+    Distribution.distribution(parameters) -> Pyro's
 
 The parameters are plain tensors, so a loop over time creates no distribution objects. For a variable without parents,
 the module has no features and learns the parameters itself; priors therefore use the same interface.
@@ -42,7 +43,7 @@ class Shape:
     guide: Any = None
 
 
-class Law(nn.Module):
+class ConditionalDistribution(nn.Module):
     """A module that maps features to the conditional distribution of one variable.
 
     Subclasses implement `forward` and `distribution`. They declare `support`, `event_dim`, `discrete` and
@@ -70,12 +71,12 @@ class Law(nn.Module):
     error_weight: bool = False
     """Whether the scale is the weight of a squared error, not the spread of the data; forecasts then show the mean."""
     location_scale: bool = False
-    """Whether `in_units` can convert the parameters to another unit.
+    """Whether `rescale` can convert the parameters to another unit.
 
     This requires a location and a scale, or a scale alone such as a rate; probabilities cannot be converted.
     """
     centred: bool | Sequence[bool] = False
-    """Whether `in_units` adds the mean, so that the network can work with values minus their mean; or a flag for each
+    """Whether `rescale` adds the mean, so that the network can work with values minus their mean; or a flag for each
     coordinate.
     """
     events: Sequence[Sequence[int]] = ()
@@ -88,11 +89,11 @@ class Law(nn.Module):
         self.residual = float(residual)
 
     @property
-    def called(self) -> str:
+    def label(self) -> str:
         """Name of the distribution in messages."""
-        return type(self).__name__.removesuffix("Law")
+        return type(self).__name__.removesuffix("Distribution")
 
-    def inside(self, size: int) -> Tensor | None:
+    def interior_point(self, size: int) -> Tensor | None:
         """Return a value (D,) with positive density to fill unobserved entries; None if 0 has positive density."""
         if self.support is None or is_real(self.support):
             return None
@@ -115,7 +116,7 @@ class Law(nn.Module):
                 layer.bias[:locations] *= 0.01
         return layer
 
-    def moved(self, loc: Tensor, previous: Tensor | None) -> Tensor:
+    def add_residual(self, loc: Tensor, previous: Tensor | None) -> Tensor:
         """Return the location: the output of the features plus `residual` times the previous value."""
         return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
 
@@ -146,10 +147,10 @@ class Law(nn.Module):
 
     def joint(self, parameters: Parameters) -> TorchDistribution:
         """Return the distribution with all coordinates as one event: batch (...), event (D,)."""
-        law = self.distribution(parameters)
-        return law.to_event(1 - len(law.event_shape))
+        distribution = self.distribution(parameters)
+        return distribution.to_event(1 - len(distribution.event_shape))
 
-    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+    def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         """Convert parameters of a variable to parameters of mean + scale * variable, for a location-scale family."""
         loc, *rest = parameters
         return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
@@ -160,8 +161,8 @@ class Law(nn.Module):
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Return values (..., D), reparameterised if possible; `noise` is ignored if the distribution draws its own."""
-        law = self.distribution(parameters)
-        return law.rsample() if law.has_rsample else law.sample()
+        distribution = self.distribution(parameters)
+        return distribution.rsample() if distribution.has_rsample else distribution.sample()
 
 
 def is_real(support: Any) -> bool:
@@ -172,10 +173,10 @@ def is_real(support: Any) -> bool:
     return all(is_real(own) for _, own in parts) if parts else support is constraints.real
 
 
-class LawSpec(Protocol):
+class DistributionSpec(Protocol):
     """Specification of a conditional distribution: a frozen dataclass with a `build` method."""
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable; raise ValueError if the distribution does not support its shape."""
         ...
 

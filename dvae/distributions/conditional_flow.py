@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 from typing_extensions import override
 
-from .base import Law, Parameters, Shape
+from .base import ConditionalDistribution, Parameters, Shape
 from .flow import FlowDistribution
 
 
@@ -31,7 +31,7 @@ class ConditionalFlow:
         hidden: widths of the perceptron in each step.
         bound: bound on the log scale of a step; smaller values keep free-running forecasts from diverging.
         min_scale: lower bound of s.
-        residual: share of the previous value, as in `Law`.
+        residual: share of the previous value, as in `ConditionalDistribution`.
     """
 
     steps: int = 8
@@ -40,7 +40,7 @@ class ConditionalFlow:
     min_scale: float = 1e-3
     residual: float = False
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
         Raises:
@@ -51,10 +51,10 @@ class ConditionalFlow:
             raise ValueError(
                 f"a ConditionalFlow has at least one step and a positive bound, got {self.steps} and {self.bound}"
             )
-        return ConditionalFlowLaw(self, shape)
+        return ConditionalFlowModule(self, shape)
 
 
-class ConditionalFlowLaw(Law):
+class ConditionalFlowModule(ConditionalDistribution):
     """Distribution module of `ConditionalFlow`; its parameters are m, s and h: (..., D), (..., D) and (..., H)."""
 
     event_dim = 1
@@ -77,12 +77,12 @@ class ConditionalFlowLaw(Law):
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         loc, raw = self.out(features).chunk(2, dim=-1)
         scale = functional.softplus(raw.contiguous()) + self.min_scale
-        return self.moved(loc, previous), scale, features
+        return self.add_residual(loc, previous), scale, features
 
     @override
     def distribution(self, parameters: Parameters) -> FlowDistribution:
         loc = parameters[0]
-        return FlowDistribution(Conditioned(self.flow, parameters), loc, loc.shape[:-1])
+        return FlowDistribution(ConditionedBijection(self.flow, parameters), loc, loc.shape[:-1])
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:
@@ -90,7 +90,7 @@ class ConditionalFlowLaw(Law):
 
     @override
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        return Conditioned(self.flow, parameters).from_noise(noise)
+        return ConditionedBijection(self.flow, parameters).from_noise(noise)
 
     def start_at(self, parameters: Parameters, values: Tensor) -> None:
         """Initialise the flow so that values enter every coupling with mean 0 and variance 1, as in Glow.
@@ -105,7 +105,7 @@ class ConditionalFlowLaw(Law):
         self.flow.start_at((values - loc) / scale, _read(features))
 
 
-class Conditioned:
+class ConditionedBijection:
     """The bijection of a flow for given parameters, in the precision of the flow."""
 
     def __init__(self, flow: Any, parameters: Parameters):

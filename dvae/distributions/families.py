@@ -15,12 +15,12 @@ from torch.distributions import register_kl
 from torch.nn import functional
 from typing_extensions import override
 
-from .base import Law, Parameters, Shape
+from .base import ConditionalDistribution, Parameters, Shape
 
 HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
 
 
-class Normals(dist.Normal):
+class NormalDistribution(dist.Normal):
     """Normals with locations and scales (..., D) and a faster log density and KL divergence than torch's.
 
     They compute each quotient once and reuse it, in place of squared scales. This saves 1 to 5 % of a training step of
@@ -33,13 +33,13 @@ class Normals(dist.Normal):
         return torch.addcmul(-HALF_LOG_2_PI - self.scale.log(), distance, distance, value=-0.5)
 
 
-@register_kl(Normals, Normals)
-def _divergence(q: Normals, p: Normals) -> Tensor:
+@register_kl(NormalDistribution, NormalDistribution)
+def _divergence(q: NormalDistribution, p: NormalDistribution) -> Tensor:
     ratio, distance = q.scale / p.scale, (q.loc - p.loc) / p.scale
     return torch.addcmul(torch.addcmul(-0.5 - ratio.log(), ratio, ratio, value=0.5), distance, distance, value=0.5)
 
 
-class Gaussian(Law):
+class Gaussian(ConditionalDistribution):
     """Base of distribution modules for independent normals; the parameters are locations and scales, (..., D) each."""
 
     location_scale = True
@@ -48,7 +48,7 @@ class Gaussian(Law):
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         """Return the normals."""
         loc, scale = parameters
-        return Normals(loc, scale, validate_args=False)
+        return NormalDistribution(loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Return reparameterised values (..., D)."""
@@ -62,18 +62,18 @@ class Normal:
 
     Args:
         min_scale: lower bound of the scale; without one, the likelihood may be unbounded.
-        residual: share of the previous value, as in `Law`.
+        residual: share of the previous value, as in `ConditionalDistribution`.
     """
 
     min_scale: float = 1e-3
     residual: float = False
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
-        return NormalLaw(self, shape)
+        return NormalModule(self, shape)
 
 
-class NormalLaw(Gaussian):
+class NormalModule(Gaussian):
     """Distribution module of `Normal`."""
 
     def __init__(self, spec: Normal, shape: Shape):
@@ -86,7 +86,7 @@ class NormalLaw(Gaussian):
         loc, raw = self.out(features).chunk(2, dim=-1)
         # contiguous, because softplus of a slice is not vectorised and takes nine times as long
         scale = functional.softplus(raw.contiguous()) + self.min_scale
-        return loc if previous is None else self.moved(loc, previous), scale
+        return loc if previous is None else self.add_residual(loc, previous), scale
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class FixedNormal:
         learned: whether to learn one scale per dimension.
         project: whether a linear layer maps features to the location; if False, the features are the location.
         steps: with `learned`, the maximum number of time steps, with one scale per step; for a local variable only.
-        residual: share of the previous value, as in `Law`.
+        residual: share of the previous value, as in `ConditionalDistribution`.
         fitted: what receives the gradient of the density: "both", or "scale" if the location learns from energies only.
         error_weight: whether the scale is the weight of a squared error, not the spread of the data; forecasts then
             show the location.
@@ -112,23 +112,23 @@ class FixedNormal:
     fitted: Literal["both", "scale"] = "both"
     error_weight: bool = False
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if self.scale <= 0:
             raise ValueError(f"FixedNormal's scale is positive, got {self.scale}")
         if self.steps and not shape.local:
             raise ValueError(
                 f"FixedNormal(steps={self.steps}) has one scale per time step, but its variable is static, with one "
-                "value per sequence; give static variables a law of their own, with steps=0"
+                "value per sequence; give static variables a distribution of their own, with steps=0"
             )
         if not self.project and shape.features != shape.size:
             raise ValueError(
                 f"a FixedNormal without projection takes {shape.size} features, but the network gives {shape.features}"
             )
-        return FixedNormalLaw(self, shape)
+        return FixedNormalModule(self, shape)
 
 
-class FixedNormalLaw(Gaussian):
+class FixedNormalModule(Gaussian):
     """Distribution module of `FixedNormal`."""
 
     def __init__(self, spec: FixedNormal, shape: Shape):
@@ -144,9 +144,9 @@ class FixedNormalLaw(Gaussian):
         self.fitted, self.learned, self.error_weight = spec.fitted, spec.learned, spec.error_weight
 
     @override
-    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+    def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         """Convert the parameters; a scale that is not learned already has the unit of the variable."""
-        loc, own = super().in_units(parameters, mean, scale)
+        loc, own = super().rescale(parameters, mean, scale)
         return loc, own if self.learned else parameters[1]
 
     @override
@@ -163,7 +163,7 @@ class FixedNormalLaw(Gaussian):
             if end > self.steps:
                 raise ValueError(f"FixedNormal(steps={self.steps}) was given {end} steps; build it with so many")
             scale = scale[first:end] if loc.dim() == 3 else scale[first]
-        return loc if previous is None else self.moved(loc, previous), scale.expand_as(loc)
+        return loc if previous is None else self.add_residual(loc, previous), scale.expand_as(loc)
 
 
 @dataclass(frozen=True)
@@ -171,19 +171,19 @@ class KnownNoise:
     """A normal with a given scale: the last D features, after the features of the network in `networks.WithNoise`.
 
     Args:
-        residual: share of the previous value, as in `Law`.
+        residual: share of the previous value, as in `ConditionalDistribution`.
     """
 
     residual: float = False
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if shape.features <= shape.size:
             raise ValueError(f"KnownNoise has its scale from networks.WithNoise, as a network of p({shape.name} | ...)")
-        return KnownNoiseLaw(self, shape)
+        return KnownNoiseModule(self, shape)
 
 
-class KnownNoiseLaw(Gaussian):
+class KnownNoiseModule(Gaussian):
     """Distribution module of `KnownNoise`."""
 
     def __init__(self, spec: KnownNoise, shape: Shape):
@@ -192,14 +192,14 @@ class KnownNoiseLaw(Gaussian):
         self.out = self.projection(shape.features - shape.size, shape.size, shape.size)
 
     @override
-    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+    def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         """Convert the location; the scale already has the unit of the variable."""
         return torch.addcmul(mean, parameters[0], scale), parameters[1]
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         features, scale = features[..., : -self.size], features[..., -self.size :]
-        return self.moved(self.out(features), previous), scale
+        return self.add_residual(self.out(features), previous), scale
 
 
 @dataclass(frozen=True)
@@ -209,21 +209,21 @@ class StudentT:
     Args:
         df: initial degrees of freedom; one per dimension is learned and stays above 2.
         min_scale: lower bound of the scale.
-        residual: share of the previous value, as in `Law`.
+        residual: share of the previous value, as in `ConditionalDistribution`.
     """
 
     df: float = 5.0
     min_scale: float = 1e-3
     residual: float = False
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if self.df <= 2:
             raise ValueError(f"StudentT needs df > 2, where the variance is finite; got {self.df}")
-        return StudentTLaw(self, shape)
+        return StudentTModule(self, shape)
 
 
-class StudentTs(dist.StudentT):  # type: ignore[misc]
+class StudentTDistribution(dist.StudentT):  # type: ignore[misc]
     """Student t distributions with degrees of freedom, locations and scales (..., D)."""
 
     @override
@@ -236,7 +236,7 @@ class StudentTs(dist.StudentT):  # type: ignore[misc]
         return (normaliser - (half + 0.5) * (distance.square() / df).log1p()).to(value.dtype) - self.scale.log()
 
 
-class StudentTLaw(Law):
+class StudentTModule(ConditionalDistribution):
     """Distribution module of `StudentT`."""
 
     location_scale = True
@@ -251,14 +251,14 @@ class StudentTLaw(Law):
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         loc, raw = self.out(features).chunk(2, dim=-1)
-        loc = self.moved(loc, previous)
+        loc = self.add_residual(loc, previous)
         df = functional.softplus(self.raw_df) + 2
         return loc, functional.softplus(raw.contiguous()) + self.min_scale, df.expand_as(loc)
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         loc, scale, df = parameters
-        return StudentTs(df, loc, scale, validate_args=False)
+        return StudentTDistribution(df, loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Return reparameterised values (..., D): normal noise divided by the square root of a gamma draw."""
@@ -274,14 +274,14 @@ class Delta:
     It has no density, so there is no likelihood and no bound. Data enter such a model as history and through energies.
     """
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if shape.features != shape.size:
             raise ValueError(f"a Delta takes {shape.size} features, its size, but the network gives {shape.features}")
-        return DeltaLaw()
+        return DeltaModule()
 
 
-class DeltaLaw(Law):
+class DeltaModule(ConditionalDistribution):
     """Distribution module of `Delta`."""
 
     deterministic = True
@@ -315,23 +315,23 @@ class Directions:
     Args:
         project: whether a linear layer maps features to vectors before normalisation; if False, the features are the
             vectors.
-        residual: share of the previous value, as in `Law`; it is added before normalisation.
+        residual: share of the previous value, as in `ConditionalDistribution`; it is added before normalisation.
     """
 
     project: bool = True
     residual: float = False
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if shape.size % 3 or not (self.project or shape.features == shape.size):
             raise ValueError(
                 f"Directions are of three coordinates each, and without projection the features themselves; "
                 f"{shape.name} has {shape.size} coordinates and the network gives {shape.features} features"
             )
-        return DirectionsLaw(self, shape)
+        return DirectionsModule(self, shape)
 
 
-class DirectionsLaw(DeltaLaw):
+class DirectionsModule(DeltaModule):
     """Distribution module of `Directions`."""
 
     location_scale = False
@@ -343,7 +343,7 @@ class DirectionsLaw(DeltaLaw):
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        vectors = self.moved(self.out(features), previous).unflatten(-1, (-1, 3))
+        vectors = self.add_residual(self.out(features), previous).unflatten(-1, (-1, 3))
         return ((vectors * vectors.square().sum(-1, keepdim=True).clamp_min(1e-12).rsqrt()).flatten(-2),)
 
 
@@ -351,12 +351,12 @@ class DirectionsLaw(DeltaLaw):
 class StandardNormal:
     """N(0, I) for any features: the default distribution of a model variable without parents."""
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
-        return StandardNormalLaw(shape.size)
+        return StandardNormalModule(shape.size)
 
 
-class StandardNormalLaw(Gaussian):
+class StandardNormalModule(Gaussian):
     """Distribution module of `StandardNormal`."""
 
     zero: Tensor

@@ -43,9 +43,9 @@ from typing_extensions import override
 
 from ..constants import constant
 from ..options import nearest
-from .base import Law, LawSpec, Parameters, Shape
+from .base import ConditionalDistribution, DistributionSpec, Parameters, Shape
 from .families import FixedNormal, Normal, StudentT
-from .precise import Bounded, InDouble
+from .precise import BoundedDistribution, DoublePrecision
 
 ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
 """Equivalent parameters; the network provides the first of each group."""
@@ -99,7 +99,7 @@ location ignore the mean.
 """
 
 
-class Inside(constraints.Constraint):
+class Interior(constraints.Constraint):
     """The interior of the unit interval or of the simplex.
 
     Args:
@@ -118,7 +118,7 @@ class Inside(constraints.Constraint):
         return f"Inside({self.closed})"
 
 
-transform_to.register(Inside, lambda constraint: transform_to(constraint.closed))
+transform_to.register(Interior, lambda constraint: transform_to(constraint.closed))
 
 
 class VonMises(dist.VonMises):  # type: ignore[misc]
@@ -139,8 +139,8 @@ class VonMises(dist.VonMises):  # type: ignore[misc]
 
 OPEN: Mapping[type[Distribution], Any] = {
     plain.Gamma: constraints.positive,
-    **dict.fromkeys((plain.Beta, plain.Kumaraswamy, plain.RelaxedBernoulli), Inside(constraints.unit_interval)),
-    **dict.fromkeys((plain.Dirichlet, plain.RelaxedOneHotCategorical), Inside(constraints.simplex)),
+    **dict.fromkeys((plain.Beta, plain.Kumaraswamy, plain.RelaxedBernoulli), Interior(constraints.unit_interval)),
+    **dict.fromkeys((plain.Dirichlet, plain.RelaxedOneHotCategorical), Interior(constraints.simplex)),
 }
 """Open supports of distributions that torch declares closed although their density at the boundary is 0 or infinite."""
 
@@ -163,14 +163,14 @@ class Family:
         shapes: shapes of the parameters of a vector distribution if they are not D or (D, D), with -1 for D, such as
             {"cov_factor": (-1, 2)}.
         min_scale: lower bound of scales and of square roots of diagonals; without one, the likelihood may be unbounded.
-        residual: share of the previous value, as in `Law`; requires a location.
+        residual: share of the previous value, as in `ConditionalDistribution`; requires a location.
         project: whether a linear layer maps features to parameters; if False, the features are the parameters in their
             order, with the location first.
-        error_weight: whether the scale is the weight of a squared error, as in `Law`.
+        error_weight: whether the scale is the weight of a squared error, as in `ConditionalDistribution`.
 
     Example:
         >>> pair, sizes = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"z": 2, "x": 3}
-        >>> model = dvae.DynamicalVAE(*pair, sizes, laws={"p(x)": dvae.distributions.Family("Poisson")})
+        >>> model = dvae.DynamicalVAE(*pair, sizes, distributions={"p(x)": dvae.distributions.Family("Poisson")})
         >>> model.sample(1, length=4)["x"].frac().any()
         tensor(False)
     """
@@ -199,12 +199,12 @@ class Family:
         known = [name for name, value in vars(dist).items() if isinstance(value, type)]
         raise ValueError(f"Pyro has no distribution {self.distribution!r}{nearest(self.distribution, known)}")
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
-        return FamilyLaw(self, shape)
+        return FamilyModule(self, shape)
 
 
-class FamilyLaw(Law):
+class FamilyModule(ConditionalDistribution):
     """Distribution module of `Family`; its parameters are the distribution's, each flattened to (..., P)."""
 
     def __init__(self, spec: Family, shape: Shape):
@@ -246,7 +246,7 @@ class FamilyLaw(Law):
 
     @property
     @override
-    def called(self) -> str:
+    def label(self) -> str:
         return str(self.kind.__name__)
 
     @override
@@ -258,18 +258,18 @@ class FamilyLaw(Law):
         for name, (free, to, shape) in self.forms.items():
             value = to(raw[name].unflatten(-1, free)).flatten(-len(shape)) if shape else to(raw[name])  # (..., P)
             value = value + self.floors.get(name, 0)
-            found.append(self.moved(value, previous) if name == "loc" else value)
+            found.append(self.add_residual(value, previous) if name == "loc" else value)
         return tuple(found)
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         if not parameters or parameters[0].dtype is torch.float64 or self.kind.__name__ in PLAIN:
             return self._bounded(parameters)
-        return InDouble(self._made(parameters), lambda: self._bounded(tuple(p.double() for p in parameters)))
+        return DoublePrecision(self._made(parameters), lambda: self._bounded(tuple(p.double() for p in parameters)))
 
     def _bounded(self, parameters: Parameters) -> TorchDistribution:
         made = self._made(parameters)
-        return Bounded(made) if constraints.is_dependent(self.kind.support) else made
+        return BoundedDistribution(made) if constraints.is_dependent(self.kind.support) else made
 
     def _made(self, parameters: Parameters) -> TorchDistribution:
         shaped = {
@@ -293,7 +293,7 @@ class FamilyLaw(Law):
         return getattr(self.distribution(parameters), self.centre)  # type: ignore[no-any-return]
 
     @override
-    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+    def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         named = zip(self.forms, parameters, strict=True)
         return tuple(self.moves[name](value, mean, scale) if name in self.moves else value for name, value in named)
 
@@ -318,7 +318,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
     kind, name = spec.kind, spec.kind.__name__
     constraints = kind.arg_constraints
     if not isinstance(constraints, Mapping):
-        raise ValueError(f"{name} does not say what its parameters may be; write a law of your own")
+        raise ValueError(f"{name} does not say what its parameters may be; write a distribution of your own")
     taken = inspect.signature(kind.__init__).parameters
     if unknown := [own for own in (*spec.given, *spec.learned, *spec.shapes) if own not in taken]:
         raise ValueError(
@@ -355,7 +355,7 @@ def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
     except errors as error:
         raise ValueError(
             f"{spec.kind.__name__} with given={dict(spec.given)} cannot be made of numbers that a network reads "
-            f"({error}); give what it needs, or write a law of your own"
+            f"({error}); give what it needs, or write a distribution of your own"
         ) from error
 
 
@@ -366,11 +366,11 @@ def _to(constraint: Any) -> Any:
         return transform_to(constraint)
 
 
-def _centre(law: Any) -> str:
+def _centre(distribution: Any) -> str:
     """Return "mean", or "mode" if the mean is not finite (Cauchy), or "" if neither exists."""
     for name in ("mean", "mode"):
         with suppress(NotImplementedError, AttributeError):
-            if torch.isfinite(getattr(law, name)).all():
+            if torch.isfinite(getattr(distribution, name)).all():
                 return name
     return ""
 
@@ -387,14 +387,14 @@ class NormalMixture:
     components: int = 5
     min_scale: float = 1e-3
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if self.components < 1:
             raise ValueError(f"a mixture has at least one component, got {self.components}")
-        return NormalMixtureLaw(self, shape)
+        return NormalMixtureModule(self, shape)
 
 
-class NormalMixtureLaw(Law):
+class NormalMixtureModule(ConditionalDistribution):
     """Distribution module of `NormalMixture`; its parameters are logits, locations and scales, (..., D K) each."""
 
     reparameterised = False
@@ -425,7 +425,7 @@ class NormalMixtureLaw(Law):
         return self.distribution(parameters).mean
 
     @override
-    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+    def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         logits, loc, own = (value.unflatten(-1, (-1, self.components)) for value in parameters)
         mean, scale = mean[:, None], scale.expand_as(mean)[:, None]
         return logits.flatten(-2), torch.addcmul(mean, loc, scale).flatten(-2), (own * scale).flatten(-2)
@@ -438,14 +438,14 @@ class LowRankNormal:
     Args:
         rank: number of factors of the covariance.
         min_scale: lower bound of the square roots of the diagonal.
-        residual: share of the previous value, as in `Law`.
+        residual: share of the previous value, as in `ConditionalDistribution`.
     """
 
     rank: int = 2
     min_scale: float = 1e-3
     residual: float = False
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         family = Family(
             "LowRankMultivariateNormal", {}, (), {"cov_factor": (-1, self.rank)}, self.min_scale, self.residual
@@ -453,7 +453,7 @@ class LowRankNormal:
         return family.build(shape)
 
 
-FAMILIES: Mapping[str, LawSpec] = {
+FAMILIES: Mapping[str, DistributionSpec] = {
     "real": Normal(),
     "fixed": FixedNormal(scale=0.1, learned=True),
     "robust": StudentT(),

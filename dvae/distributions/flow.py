@@ -42,16 +42,16 @@ class QRFlow:
 
     layers: int = 3
 
-    def build(self, shape: Shape) -> QRFlowLaw:
+    def build(self, shape: Shape) -> QRFlowModule:
         """Return the module for a static latent without parents.
 
         Raises:
             ValueError: the size or the number of layers is less than 1.
         """
-        return QRFlowLaw(self, shape)
+        return QRFlowModule(self, shape)
 
 
-class QRFlowLaw(Prior):
+class QRFlowModule(Prior):
     """Distribution module of `QRFlow`."""
 
     def __init__(self, spec: QRFlow, shape: Shape):

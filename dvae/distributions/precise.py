@@ -1,8 +1,10 @@
 """Distributions whose values or densities need more precision than the float32 of the networks.
 
-`Offset` subtracts the mean in float64, because float32 cannot represent the noise in 1e9 + N(0, 1). `InDouble`
+`OffsetDistribution` subtracts the mean in float64, because float32 cannot represent the noise in 1e9 + N(0, 1).
+`DoublePrecision`
 evaluates a density in float64 if its terms cancel: a Poisson log density at mean 1e7 is a difference of terms near 1e8.
-`Bounded` sets the density to 0 outside the support, such as below the scale of a Pareto, where torch extrapolates.
+`BoundedDistribution` sets the density to 0 outside the support, such as below the scale of a Pareto, where torch
+extrapolates.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ class _Wrapped(TorchDistribution):
         return self.base.support
 
 
-class Offset(_Wrapped):
+class OffsetDistribution(_Wrapped):
     """The distribution of offset + value, in float64.
 
     Args:
@@ -81,12 +83,12 @@ class Offset(_Wrapped):
     def mean(self) -> Tensor:
         return super().mean + self.offset
 
-    def expand(self, batch_shape: Any, _instance: object = None) -> Offset:
+    def expand(self, batch_shape: Any, _instance: object = None) -> OffsetDistribution:
         """Return the distribution with another batch shape."""
-        return Offset(self.base.expand(batch_shape), self.offset, self.dtype)
+        return OffsetDistribution(self.base.expand(batch_shape), self.offset, self.dtype)
 
 
-class Bounded(_Wrapped):
+class BoundedDistribution(_Wrapped):
     """A distribution with density 0 outside a parameter-dependent support, which torch may not enforce.
 
     Args:
@@ -98,12 +100,12 @@ class Bounded(_Wrapped):
         inside = self.support.check(value)  # type: ignore[no-untyped-call]
         return torch.where(inside, self.base.log_prob(value), -torch.inf)
 
-    def expand(self, batch_shape: Any, _instance: object = None) -> Bounded:
+    def expand(self, batch_shape: Any, _instance: object = None) -> BoundedDistribution:
         """Return the distribution with another batch shape."""
-        return Bounded(self.base.expand(batch_shape))
+        return BoundedDistribution(self.base.expand(batch_shape))
 
 
-class InDouble(_Wrapped):
+class DoublePrecision(_Wrapped):
     """A distribution whose log density is evaluated in float64 and returned in the precision of the value.
 
     Args:
@@ -119,6 +121,6 @@ class InDouble(_Wrapped):
         """Return the log density or log probability."""
         return self.double().log_prob(value.double()).to(value.dtype)  # type: ignore[no-any-return]
 
-    def expand(self, batch_shape: Any, _instance: object = None) -> InDouble:
+    def expand(self, batch_shape: Any, _instance: object = None) -> DoublePrecision:
         """Return the distribution with another batch shape."""
-        return InDouble(self.base.expand(batch_shape), lambda: self.double().expand(batch_shape))
+        return DoublePrecision(self.base.expand(batch_shape), lambda: self.double().expand(batch_shape))

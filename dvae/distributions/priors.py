@@ -15,10 +15,10 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from typing_extensions import override
 
-from .base import Law, Parameters, Shape
+from .base import ConditionalDistribution, Parameters, Shape
 
 
-class Prior(Law):
+class Prior(ConditionalDistribution):
     """A distribution of (D,) without features, the same for every sequence; subclasses implement `prior`.
 
     All coordinates are one event.
@@ -39,7 +39,7 @@ class Prior(Law):
         wrong += ["is data"] * (shape.name in shape.data)
         if wrong:
             raise ValueError(
-                f"{spec} is a law of static latents without parents, such as w in p(w), but {shape.name} "
+                f"{spec} is a distribution of static latents without parents, such as w in p(w), but {shape.name} "
                 + " and ".join(wrong)
             )
 
@@ -66,12 +66,12 @@ class Mixture:
 
     components: int = 8
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a static latent without parents."""
-        return MixtureLaw(self, shape)
+        return MixtureModule(self, shape)
 
 
-class MixtureLaw(Prior):
+class MixtureModule(Prior):
     """Distribution module of `Mixture`."""
 
     reparameterised = False
@@ -103,12 +103,12 @@ class Vamp:
     components: int = 16
     steps: int = 16
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a static latent without parents whose guide reads data over time."""
-        return VampLaw(self, shape)
+        return VampModule(self, shape)
 
 
-class VampLaw(Prior):
+class VampModule(Prior):
     """Distribution module of `Vamp`."""
 
     reparameterised = False
@@ -153,7 +153,7 @@ class VampLaw(Prior):
     def prior(self) -> Any:
         units = self.guide.units
         data = {name: units[name].absolute(p) if name in units else p for name, p in self.pseudo.items()}
-        posteriors = self.guide.law.joint(self.guide(data, self.components, self.steps))
+        posteriors = self.guide.head.joint(self.guide(data, self.components, self.steps))
         same = next(self.pseudo.parameters()).new_zeros(self.components)
         weights = dist.Categorical(logits=same, validate_args=False)
         return dist.MixtureSameFamily(weights, posteriors, validate_args=False)
@@ -176,12 +176,12 @@ class Flow:
     layers: int = 4
     bins: int = 8
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a static latent without parents."""
-        return FlowLaw(self, shape)
+        return FlowModule(self, shape)
 
 
-class FlowLaw(Prior):
+class FlowModule(Prior):
     """Distribution module of `Flow`."""
 
     def __init__(self, spec: Flow, shape: Shape):

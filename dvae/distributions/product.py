@@ -15,27 +15,29 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..constants import indices
-from .base import Law, LawSpec, Parameters, Shape, is_real
+from .base import ConditionalDistribution, DistributionSpec, Parameters, Shape, is_real
 
 
 @dataclass(frozen=True)
 class Product:
     """Distributions of parts of a variable, independent given the parents: pairs of coordinates and a specification.
 
-    The density is reported per coordinate. The density of a multivariate event (see `Law.distribution`) is assigned to
-    its first coordinate. Single entries may be missing, but an event can only be missing completely.
+    The density is reported per coordinate. The density of a multivariate event (see
+    `ConditionalDistribution.distribution`) is assigned to its first coordinate. Single entries may be missing, but an
+    event can only be missing completely.
 
     Example:
-        >>> law = Product((((0, 2), dvae.distributions.Normal()), ((1,), dvae.distributions.Family("Poisson"))))
+        >>> count = dvae.distributions.Family("Poisson")
+        >>> distribution = Product((((0, 2), dvae.distributions.Normal()), ((1,), count)))
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
-        >>> model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, laws={"p(x)": law})
+        >>> model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, distributions={"p(x)": distribution})
         >>> model.sample(1, length=4)["x"][..., 1].frac().any()
         tensor(False)
     """
 
-    parts: Sequence[tuple[Sequence[int], LawSpec]]
+    parts: Sequence[tuple[Sequence[int], DistributionSpec]]
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
         Raises:
@@ -47,16 +49,18 @@ class Product:
                 f"the parts of a Product share the coordinates 0 to {shape.size - 1} of {shape.name} among them, once "
                 f"each; got {given}"
             )
-        return ProductLaw(self, shape)
+        return ProductModule(self, shape)
 
 
-class ProductLaw(Law):
+class ProductModule(ConditionalDistribution):
     """Distribution module of `Product`; its parameters are the concatenated parameters of the parts."""
 
     order: Tensor
 
     def __init__(self, spec: Product, shape: Shape):
-        parts = [law.build(Shape(len(places), shape.features, *_rest(shape))) for places, law in spec.parts]
+        parts = [
+            distribution.build(Shape(len(places), shape.features, *_rest(shape))) for places, distribution in spec.parts
+        ]
         super().__init__(max(part.residual for part in parts))
         self.parts = nn.ModuleList(parts)
         self.places = [list(places) for places, _ in spec.parts]
@@ -79,23 +83,27 @@ class ProductLaw(Law):
             self.support = ProductSupport(list(zip(self.places, supports, strict=True)))
         self.events = [
             *(places for part, places in zip(parts, self.places, strict=True) if part.event_dim),
-            *([part[n] for n in event] for law, part in zip(parts, self.places, strict=True) for event in law.events),
+            *(
+                [part[n] for n in event]
+                for distribution, part in zip(parts, self.places, strict=True)
+                for event in distribution.events
+            ),
         ]
 
     @override
-    def inside(self, size: int) -> Tensor | None:
-        found = [part.inside(len(places)) for part, places in zip(self.parts, self.places, strict=True)]  # type: ignore[operator]
+    def interior_point(self, size: int) -> Tensor | None:
+        found = [part.interior_point(len(places)) for part, places in zip(self.parts, self.places, strict=True)]  # type: ignore[operator]
         if all(each is None for each in found):
             return None
         sizes = map(len, self.places)
         return self._whole([torch.zeros(n) if own is None else own for own, n in zip(found, sizes, strict=True)])
 
     def _part(self, n: int, features: Tensor, previous: Tensor | None, t: int | None) -> Parameters:
-        law: Any = self.parts[n]
+        distribution: Any = self.parts[n]
         own = None
-        if law.residual and previous is not None:
+        if distribution.residual and previous is not None:
             own = previous.index_select(-1, indices(self.places[n], previous))
-        return law(features, own, t)  # type: ignore[no-any-return]
+        return distribution(features, own, t)  # type: ignore[no-any-return]
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
@@ -114,22 +122,26 @@ class ProductLaw(Law):
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        return ProductDistribution([(places, law.distribution(own)) for law, places, own in self.each(parameters)])
+        return ProductDistribution(
+            [(places, distribution.distribution(own)) for distribution, places, own in self.each(parameters)]
+        )
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:
-        return self._whole([law.mean(own) for law, _, own in self.each(parameters)])
+        return self._whole([distribution.mean(own) for distribution, _, own in self.each(parameters)])
 
     @override
-    def in_units(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
+    def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         scale, found = scale.expand_as(mean), ()
-        for law, places, own in self.each(parameters):
-            found += law.in_units(own, mean[places], scale[places]) if law.location_scale else own
+        for distribution, places, own in self.each(parameters):
+            found += distribution.rescale(own, mean[places], scale[places]) if distribution.location_scale else own
         return found
 
     @override
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        return self._whole([law.draw(own, noise[..., places]) for law, places, own in self.each(parameters)])
+        return self._whole(
+            [distribution.draw(own, noise[..., places]) for distribution, places, own in self.each(parameters)]
+        )
 
 
 def _order(parts: Iterable[Sequence[int]]) -> Tensor:
@@ -155,7 +167,7 @@ class ProductDistribution(TorchDistribution):
         self.order = _order(places for places, _ in parts).tolist()
         first = parts[0][1]
         batch = first.batch_shape if first.event_shape else first.batch_shape[:-1]
-        self.has_rsample = all(law.has_rsample for _, law in parts)
+        self.has_rsample = all(distribution.has_rsample for _, distribution in parts)
         super().__init__(torch.Size([*batch, len(self.order)]), torch.Size(), validate_args=False)
 
     def _whole(self, parts: list[Tensor]) -> Tensor:
@@ -164,33 +176,33 @@ class ProductDistribution(TorchDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Return (..., D), with the density of an event at its first coordinate and 0 at its others."""
         found = []
-        for places, law in self.parts:
-            own = law.log_prob(value.index_select(-1, indices(places, value)))
-            found.append(functional.pad(own[..., None], (0, len(places) - 1)) if law.event_shape else own)
+        for places, distribution in self.parts:
+            own = distribution.log_prob(value.index_select(-1, indices(places, value)))
+            found.append(functional.pad(own[..., None], (0, len(places) - 1)) if distribution.event_shape else own)
         return self._whole(found)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Return a reparameterised draw (..., D)."""
-        return self._whole([law.rsample(torch.Size(sample_shape)) for _, law in self.parts])
+        return self._whole([distribution.rsample(torch.Size(sample_shape)) for _, distribution in self.parts])
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         """Return a draw (..., D)."""
-        return self._whole([law.sample(torch.Size(sample_shape)) for _, law in self.parts])
+        return self._whole([distribution.sample(torch.Size(sample_shape)) for _, distribution in self.parts])
 
     @property
     def mean(self) -> Tensor:
         """Means (..., D) of the parts."""
-        return self._whole([law.mean for _, law in self.parts])
+        return self._whole([distribution.mean for _, distribution in self.parts])
 
     @property
     def variance(self) -> Tensor:
         """Variances (..., D) of the parts."""
-        return self._whole([law.variance for _, law in self.parts])
+        return self._whole([distribution.variance for _, distribution in self.parts])
 
     @property
     def support(self) -> constraints.Constraint:  # type: ignore[override]
         """Support of the parts."""
-        return ProductSupport([(places, law.support) for places, law in self.parts])
+        return ProductSupport([(places, distribution.support) for places, distribution in self.parts])
 
 
 class ProductSupport(constraints.Constraint):

@@ -30,7 +30,7 @@ WIDE = 32
 """Maximum rows per step (sequences times N). With more, a step keeps a core busy and blocks double the work."""
 
 
-def in_blocks(matrix: Tensor) -> bool:
+def use_blocks(matrix: Tensor) -> bool:
     """Return whether blocks are faster than sequential steps for matrices (T, B, N, N)."""
     steps, batch, size, _ = matrix.shape
     return steps >= 4 * BLOCK and batch * size <= min(WIDE, steps // 6)
@@ -51,7 +51,7 @@ class Recursion:
 
     def states(self, offset: Tensor, start: Tensor) -> Tensor:
         """Return all x (T + 1, B, N, M) for c (T, B, N, M) and x_1 (B, N, M)."""
-        if in_blocks(self.matrix):
+        if use_blocks(self.matrix):
             within, passed, between = self._blocks
             own = within.states(offset := _apart(offset), torch.zeros_like(offset[0]))[1:]
             starts = between.states(_last(own, self.matrix), start)[:-1].flatten(0, 1)
@@ -63,7 +63,7 @@ class Recursion:
 
     def covariances(self, offset: Tensor, start: Tensor) -> Tensor:
         """Return all X (T + 1, B, N, N) for C (T, B, N, N) and X_1 (B, N, N)."""
-        if in_blocks(self.matrix):
+        if use_blocks(self.matrix):
             within, passed, between = self._blocks
             own = within.covariances(offset := _apart(offset), torch.zeros_like(offset[0]))[1:]
             starts = between.covariances(_last(own, self.matrix), start)[:-1].flatten(0, 1)
@@ -78,7 +78,7 @@ class Recursion:
 
 def riccati(transition: Tensor, noise: Tensor, information: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return all P (T + 1, B, N, N), W and F (T, B, N, N) for A, Q and G (T, B, N, N) and P_1 (B, N, N)."""
-    if in_blocks(transition):
+    if use_blocks(transition):
         a, q, g = (_apart(values) for values in (transition, noise, information))
         own, shrink, carry = riccati(a, q, g, torch.zeros_like(a[0]))
         passed, told = products(carry), g @ shrink

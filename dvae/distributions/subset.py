@@ -41,7 +41,7 @@ class Subset:
         """Return the number of chosen indices out of `size`."""
         return ceil(self.share * size - 1e-9)  # rounding error must not turn 0.3 * 10 into 4
 
-    def distribution(self, size: int, curriculum: float = 1.0) -> Subsets:
+    def distribution(self, size: int, curriculum: float = 1.0) -> SubsetDistribution:
         """Return the distribution of vectors (L,) that are 1 at chosen indices and 0 elsewhere.
 
         Args:
@@ -51,10 +51,10 @@ class Subset:
         chosen = self.chosen(size)
         most = round(chosen * (size - chosen) / size)
         swapped = int(curriculum * most)
-        return Subsets(size, chosen, None if curriculum >= 1 else swapped)
+        return SubsetDistribution(size, chosen, None if curriculum >= 1 else swapped)
 
 
-class Subsets(TorchDistribution):
+class SubsetDistribution(TorchDistribution):
     """Uniform distribution over vectors (L,) of zeros and ones with a fixed number of ones.
 
     Args:

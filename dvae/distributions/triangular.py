@@ -14,22 +14,24 @@ from torch.distributions import Normal, constraints
 from torch.distributions.kl import register_kl
 from typing_extensions import override
 
-from .base import Law, Parameters, Shape
+from .base import ConditionalDistribution, Parameters, Shape
 
 
 @dataclass(frozen=True)
 class Triangular:
     """A normal with full covariance; the features are its location and whitening matrix."""
 
-    def build(self, shape: Shape) -> Law:
+    def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         needed = shape.size + shape.size**2
         if shape.features != needed:
-            raise ValueError(f"a Triangular law takes {needed} features, but the network gives {shape.features}")
-        return TriangularLaw(shape.size)
+            raise ValueError(
+                f"a Triangular distribution takes {needed} features, but the network gives {shape.features}"
+            )
+        return TriangularModule(shape.size)
 
 
-class TriangularLaw(Law):
+class TriangularModule(ConditionalDistribution):
     """Distribution module of `Triangular`; its parameters have shapes (..., D) and (..., D * D)."""
 
     event_dim = 1

@@ -52,15 +52,15 @@ def draw_dag(
         node: _circled(ax, xy, symbol(*node), dag.nodes[node].get("kind", "latent")) for node, xy in place.items()
     }
     dotted = set(redundant)
-    arrows = [(edge, REDUNDANT if edge in dotted else EDGE) for edge in dag.edges]
-    for (source, target), style in arrows + [(edge, MISSING) for edge in missing]:
-        _arrow(ax, (source, target), place, patches, style)
+    edges = [(edge, REDUNDANT if edge in dotted else EDGE) for edge in dag.edges]
+    for (source, target), style in edges + [(edge, MISSING) for edge in missing]:
+        _edge(ax, (source, target), place, patches, style)
     return _finished(ax)
 
 
 def draw_slice(
     graph: nx.DiGraph,
-    prices: Mapping[tuple[Any, Any], float],
+    costs: Mapping[tuple[Any, Any], float],
     ax: Axes,
     top: float = 0.0,
     unsure: Collection[tuple[Any, Any]] = (),
@@ -69,24 +69,24 @@ def draw_slice(
 
     Args:
         graph: graph of `Factorization.slice`.
-        prices: KL gap of each edge, printed at the edge. A gap of about 0 or less is dotted; an edge without one is
+        costs: KL gap of each edge, printed at the edge. A gap of about 0 or less is dotted; an edge without one is
             thin.
         ax: matplotlib axes.
-        top: KL gap of the widest edge; at least the highest of `prices`.
+        top: KL gap of the widest edge; at least the highest of `costs`.
         unsure: edges to draw in a lighter colour.
     """
     place = _slice_layout(graph)
     patches = {
         node: _circled(ax, xy, graph.nodes[node]["label"], graph.nodes[node]["kind"]) for node, xy in place.items()
     }
-    top = max([top, *prices.values()])
+    top = max([top, *costs.values()])
     for edge in graph.edges:
-        cost = prices.get(edge)
+        cost = costs.get(edge)
         style = {**EDGE, "color": "0.7"} if edge in unsure else EDGE
         if cost is not None:
             thick = {"linewidth": 0.9 + 5 * cost / top, "mutation_scale": 9 + 8 * cost / top} if cost > 0 else {}
             style = REDUNDANT if cost <= LEAST * top else {**style, **thick}
-        bend = _arrow(ax, edge, place, patches, style)
+        bend = _edge(ax, edge, place, patches, style)
         if cost is not None:
             (x, y), (to_x, to_y) = (place[node] for node in edge)
             middle = (x + to_x + bend * (to_y - y)) / 2, (y + to_y - bend * (to_x - x)) / 2
@@ -107,7 +107,7 @@ def _circled(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch
     return ax.add_patch(shape)
 
 
-def _arrow(
+def _edge(
     ax: Axes, edge: tuple[Any, Any], place: Mapping[Any, Any], patches: Mapping[Any, Patch], style: dict[str, Any]
 ) -> float:
     """Draw an edge between two nodes and return its curvature."""

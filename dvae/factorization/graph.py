@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import networkx as nx
 
 from .drawing import Edge, Node, draw_dag
-from .inversion import MarkovBoundaries, Order, Unrolled, faithful, guide, orders, spelled
+from .inversion import MarkovBoundaries, Order, Unrolled, describe_order, faithful_inverse, guide, orders
 from .notation import Factor, Factorization, Parent, check_pair
 from .relations import Relation
 
@@ -74,7 +74,7 @@ def _relations(*factorizations: Factorization) -> list[Relation]:
 # ------------------------------------------------------------------------------------------------------ audit
 
 
-class _Tabled:
+class _TextTable:
     """A result that prints as lines of text and, in a notebook, as an HTML table with a caption."""
 
     header: ClassVar[tuple[str, ...]]
@@ -94,7 +94,7 @@ class _Tabled:
 
 
 @dataclass(frozen=True)
-class Audit(_Tabled):
+class Audit(_TextTable):
     """Comparison of what a guide reads with what the exact posterior depends on.
 
     Args:
@@ -179,12 +179,13 @@ class Audit(_Tabled):
 
     @property
     def repaired(self) -> Factorization:
-        """The guide with the missing and without the redundant parents, in the same drawing order; see `faithful`.
+        """The guide with the missing and without the redundant parents, in the same drawing order; see
+        `faithful_inverse`.
 
         Raises:
             ValueError: the model contains a custom mask.
         """
-        return faithful(self.generative, self.observed, self.inference.blocks, self.summed)
+        return faithful_inverse(self.generative, self.observed, self.inference.blocks, self.summed)
 
     def draw(self, T: int = 3, ax: Axes | None = None) -> Axes:
         """Draw the guide over T steps: missing edges dashed red, redundant edges dotted grey."""
@@ -285,25 +286,25 @@ def audit(
 
 @dataclass(frozen=True)
 class Derived:
-    """A guide that misses nothing, derived by `faithful`.
+    """A guide that misses nothing, derived by `faithful_inverse`.
 
     Args:
         order: drawing order of the latents.
         inference: the guide.
-        arrows: number of edges of its unrolled graph.
+        edges: number of edges of its unrolled graph.
         looped: latents that are drawn step by step; the others are drawn at all steps at once.
         sampled: latents whose KL has no closed form under this guide, so that the bound contains sampling noise.
     """
 
     order: Order
     inference: Factorization
-    arrows: int
+    edges: int
     looped: tuple[str, ...]
     sampled: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Alternatives(_Tabled):
+class Alternatives(_TextTable):
     """The guides of a model that miss nothing. Guides without a loop are first, then those with the fewest edges.
 
     Attributes:
@@ -317,7 +318,7 @@ class Alternatives(_Tabled):
         (4, 'q(w | x_{1:T}) q(z_t | z_{t-1}, x_{>=t}, w)')
     """
 
-    header = ("guide", "drawn", "arrows", "looped", "KL by draws")
+    header = ("guide", "drawn", "edges", "looped", "KL by draws")
 
     generative: Factorization
     guides: tuple[Derived, ...]
@@ -329,8 +330,8 @@ class Alternatives(_Tabled):
         return [
             (
                 each.inference.text,
-                spelled(each.order),
-                str(each.arrows),
+                describe_order(each.order),
+                str(each.edges),
                 ", ".join(each.looped) or "-",
                 ", ".join(each.sampled) or "-",
             )
@@ -340,7 +341,8 @@ class Alternatives(_Tabled):
     @property
     def verdict(self) -> str:
         """A caption for the table."""
-        return f"each reads what the posterior depends on in its order (see `faithful`); arrows of {self.steps} steps"
+        guides = "each reads what the posterior depends on in its order (see `faithful_inverse`)"
+        return f"{guides}; edges of {self.steps} steps"
 
     def table(self) -> Table:
         """Return a rich table with one row per guide."""
@@ -349,7 +351,7 @@ class Alternatives(_Tabled):
 
         table = Table(title="guides that miss nothing", title_justify="left", caption=self.verdict)
         for name in self.header:
-            table.add_column(name, justify="right" if name == "arrows" else "left")
+            table.add_column(name, justify="right" if name == "edges" else "left")
         for row in self.rows:
             table.add_row(*map(Text, row))
         return table
@@ -364,30 +366,30 @@ class Alternatives(_Tabled):
 def alternatives(
     generative: Factorization | str, observed: Iterable[str] = ("x",), steps: int = 10, summed: Iterable[str] = ()
 ) -> Alternatives:
-    """Return all guides that `faithful` derives, one for each drawing order, without duplicates.
+    """Return all guides that `faithful_inverse` derives, one for each drawing order, without duplicates.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
         steps: T at which edges are counted.
-        summed: names of latents that are summed out, as in `faithful`.
+        summed: names of latents that are summed out, as in `faithful_inverse`.
 
     Raises:
-        ValueError: `steps` is less than 1, the model has no latents, or `faithful` raises it.
+        ValueError: `steps` is less than 1, the model has no latents, or `faithful_inverse` raises it.
 
     Example:
         >>> print(dvae.alternatives("p(z_t | z_{t-1}) p(x_t | z_t)"))
-        guide                      drawn       arrows  looped  KL by draws
-        q(z_t | z_{t-1}, x_{>=t})  z forward   64      z       -
-        q(z_t | z_{t+1}, x_{<=t})  z backward  64      z       z
-        each reads what the posterior depends on in its order (see `faithful`); arrows of 10 steps
+        guide                      drawn       edges  looped  KL by draws
+        q(z_t | z_{t-1}, x_{>=t})  z forward   64     z       -
+        q(z_t | z_{t+1}, x_{<=t})  z backward  64     z       z
+        each reads what the posterior depends on in its order (see `faithful_inverse`); edges of 10 steps
     """
     generative, observed, summed = Factorization.parse(generative), tuple(observed), tuple(summed)
     if steps < 1:
-        raise ValueError(f"arrows are counted in at least 1 step, not {steps}")
+        raise ValueError(f"edges are counted in at least 1 step, not {steps}")
     found: dict[frozenset[Factor], Derived] = {}
     for order in orders(generative, observed, summed):
-        inference = faithful(generative, observed, order, summed)
+        inference = faithful_inverse(generative, observed, order, summed)
         if not inference.factors:
             raise ValueError(f"nothing is latent in {generative.text!r}: there is no guide to derive")
         looped = tuple(name for block in inference.blocks if block.direction for name in block.names)
@@ -401,5 +403,5 @@ def alternatives(
             tuple(name for name, exact in closed.items() if not exact),
         )
         found.setdefault(frozenset(inference.factors), derived)
-    guides = sorted(found.values(), key=lambda each: (bool(each.looped), each.arrows, len(each.sampled)))
+    guides = sorted(found.values(), key=lambda each: (bool(each.looped), each.edges, len(each.sampled)))
     return Alternatives(generative, tuple(guides), steps)

@@ -26,7 +26,7 @@ from .notation import Block, Factor, Factorization, Parent, unrolled
 from .relations import ALL, MaskFunction, Relation
 
 FAITHFUL = "faithful"
-"""Value in place of a guide's equations that selects the guide derived by `faithful`."""
+"""Value in place of a guide's equations that selects the guide derived by `faithful_inverse`."""
 Order = tuple[Block, ...]
 """Blocks of latents in drawing order; each block is drawn at all of its steps before the next one."""
 
@@ -127,10 +127,10 @@ class Unrolled:
         If one of the two is static, the result has shape (1,): whether there is any edge.
         """
         rows, columns = map(self.inner, (child, parent))
-        arrows = np.array([[column in edges[row] for column in columns] for row in rows])
+        reads = np.array([[column in edges[row] for column in columns] for row in rows])
         if not self.in_time(child, parent):
-            return np.array([arrows.any()])
-        return np.array([arrows.diagonal(offset).any() for offset in range(1 - self.width, self.width)])
+            return np.array([reads.any()])
+        return np.array([reads.diagonal(offset).any() for offset in range(1 - self.width, self.width)])
 
     def parent(self, child: str, name: str, offsets: np.ndarray) -> Parent:
         """Return a parent with these offsets; a relation that includes the last offset in view is unbounded."""
@@ -146,7 +146,7 @@ class Unrolled:
         return self.local[child] and self.local[parent]
 
 
-def faithful(
+def faithful_inverse(
     generative: Factorization | str,
     observed: Iterable[str] = ("x",),
     order: Sequence[Block] | None = None,
@@ -170,7 +170,7 @@ def faithful(
             static and local latents in a block; the model has a custom mask, which is known only at a given length.
         TypeError: the order contains something else than blocks.
 
-    >>> print(dvae.faithful("p(z_t | z_{t-1}) p(x_t | z_t)").text)
+    >>> print(dvae.faithful_inverse("p(z_t | z_{t-1}) p(x_t | z_t)").text)
     q(z_t | z_{t-1}, x_{>=t})
     """
     generative = Factorization.parse(generative)
@@ -180,9 +180,13 @@ def faithful(
     if not all(isinstance(block, Block) for block in order):
         raise TypeError(f"an order is of blocks, such as those of dvae.factorization.inversion.orders, not {order!r}")
     if mixed := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
-        raise ValueError(f"{spelled(mixed)} mixes static and local latents; give static ones a block of their own")
+        raise ValueError(
+            f"{describe_order(mixed)} mixes static and local latents; give static ones a block of their own"
+        )
     if sorted(name for block in order for name in block.names) != sorted(latents):
-        raise ValueError(f"the order '{spelled(order)}' is not one of the latents {', '.join(latents)}, each once")
+        raise ValueError(
+            f"the order '{describe_order(order)}' is not one of the latents {', '.join(latents)}, each once"
+        )
     relations = [p.relation for f in generative.factors for p in f.parents if p.relation is not None]
     if own := [relation for relation in relations if relation.intervals is None]:
         raise ValueError(
@@ -230,9 +234,9 @@ def orders(
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
-        summed: names of latents that are summed out, as in `faithful`.
+        summed: names of latents that are summed out, as in `faithful_inverse`.
 
-    >>> [spelled(order) for order in orders("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")]
+    >>> [describe_order(order) for order in orders("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")]
     ['w, z forward', 'w, z backward', 'z forward, w', 'z backward, w']
     """
     generative = Factorization.parse(generative)
@@ -248,7 +252,7 @@ def orders(
                     yield (*locals_, *statics) if last else (*statics, *locals_)
 
 
-def spelled(order: Sequence[Block]) -> str:
+def describe_order(order: Sequence[Block]) -> str:
     """Return an order in words."""
     ways = {1: " forward", -1: " backward", 0: ""}
     return ", ".join(" with ".join(block.names) + ways[block.direction] for block in order)
@@ -272,19 +276,19 @@ def guide(
 
     Args:
         generative: the model.
-        inference: a factorization or its text; "faithful" for the guide that `faithful` derives, None for the prior, ""
-            without latents.
+        inference: a factorization or its text; "faithful" for the guide that `faithful_inverse` derives, None for the
+            prior, "" without latents.
         observed: names of the observed variables.
         masks: custom relations, as in `Factorization.parse`.
-        summed: names of latents that are summed out, as in `faithful`.
+        summed: names of latents that are summed out, as in `faithful_inverse`.
 
     Raises:
-        NotationError, ValueError, TypeError: as in `Factorization.parse` and `faithful`.
+        NotationError, ValueError, TypeError: as in `Factorization.parse` and `faithful_inverse`.
     """
     if inference is None:
         return generative.prior_guide((*observed, *summed))
     if isinstance(inference, str) and not inference.strip():
         return Factorization("q", ())
     if isinstance(inference, str) and inference.strip() == FAITHFUL:
-        return faithful(generative, observed, summed=summed)
+        return faithful_inverse(generative, observed, summed=summed)
     return Factorization.parse(inference, masks)

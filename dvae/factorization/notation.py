@@ -283,7 +283,7 @@ class Factorization:
         return factor.mask(parent, T)
 
     @property
-    def arrows(self) -> tuple[tuple[str, Parent], ...]:
+    def edges(self) -> tuple[tuple[str, Parent], ...]:
         """The dependencies (child, parent), with the past, the same step and the future as separate edges.
 
         For q(z_t | x_{1:T}, w) the parents are x_{<t}, x_t, x_{>t} and w. A parent of a static variable is a single
@@ -302,19 +302,19 @@ class Factorization:
             for relation in sides(factor, parent.relation)
         )
 
-    def arrow(self, child: str, parent: Parent) -> str:
-        """Return one of the `arrows` in words, such as "x_{<t} to z_t"."""
+    def describe_edge(self, child: str, parent: Parent) -> str:
+        """Return one of the `edges` in words, such as "x_{<t} to z_t"."""
         return f"{parent} to {_plain(child, 't' if self.local(child) else None)}"
 
     def without(self, child: str, parent: Parent) -> Factorization:
-        """Return the factorization without one of its `arrows`.
+        """Return the factorization without one of its `edges`.
 
         Raises:
             ValueError: the factorization does not contain this edge.
         """
         factor = self.factor(child)
-        if (child, parent) not in self.arrows:
-            raise ValueError(f"{factor} has no arrow from {parent}")
+        if (child, parent) not in self.edges:
+            raise ValueError(f"{factor} has no edge from {parent}")
 
         def less(read: Parent) -> Parent | None:
             if read.relation == parent.relation or read.relation is None or parent.relation is None:
@@ -421,12 +421,12 @@ class Factorization:
         return dag
 
     def slice(self, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
-        """Return the graph of one step, with an edge from the parent to the variable at t for each of `arrows`.
+        """Return the graph of one step, with an edge from the parent to the variable at t for each of `edges`.
 
         Returns:
             networkx.DiGraph with nodes (name, subscript), such as ("x", "<t") and ("z", "t"), and (name, None) for
-            static variables, in the order of `arrows`. Node attributes are `kind`, as in `dag`, `label` in LaTeX, and
-            `side`: -1 for the past and for all steps, 0 for t, 1 for the future. The edge attribute is `arrow`.
+            static variables, in the order of `edges`. Node attributes are `kind`, as in `dag`, `label` in LaTeX, and
+            `side`: -1 for the past and for all steps, 0 for t, 1 for the future. The edge attribute is `edge`.
         """
         graph, observed = nx.DiGraph(), tuple(observed)
 
@@ -437,12 +437,12 @@ class Factorization:
 
         for factor in self.factors:
             add(factor.child, "t" if factor.local else None, 0)
-        for child, parent in self.arrows:
+        for child, parent in self.edges:
             relation = parent.relation
             side = 0 if relation in (None, NOW) else 1 if relation.intervals and relation & FUTURE == relation else -1
             subscript = None if relation is None else relation.name[1:-1]
             reads = add(parent.name, subscript, side), (child, "t" if self.local(child) else None)
-            graph.add_edge(*reads, arrow=(child, parent))
+            graph.add_edge(*reads, edge=(child, parent))
         return graph
 
     # text and figures --------------------------------------------------------------------------------------

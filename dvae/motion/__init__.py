@@ -9,7 +9,7 @@ torch.Size([75, 48])
 from . import bodies
 from .data.clips import Clip, MotionSet
 from .data.dataset import MotionData
-from .data.exchange import Exchanged
+from .data.exchange import ExchangedWindows
 from .data.occlusion import occlude
 from .data.protocols import PROTOCOLS, Poses, Protocol, Windows, windows
 from .data.simulator import simulate
@@ -25,7 +25,7 @@ from .segments.dataset import SegmentData
 from .segments.embodied import Segments
 from .segments.frames import TimedFrames
 from .segments.gait import Cycles, gait_cycles, reference_cycles
-from .segments.interpolation import Interpolation, falls, interpolate, latent_map, transferred
+from .segments.interpolation import Interpolation, falls, interpolate, latent_map, transfer
 from .segments.reconstruction import reconstruct_segments
 
 __all__ = [
@@ -38,7 +38,7 @@ __all__ = [
     "Bones",
     "Clip",
     "Cycles",
-    "Exchanged",
+    "ExchangedWindows",
     "Forecasts",
     "Heading",
     "Imputed",
@@ -74,7 +74,7 @@ __all__ = [
     "scores",
     "simulate",
     "statistics",
-    "transferred",
+    "transfer",
     "windows",
     "write_motion",
 ]

@@ -2,7 +2,7 @@
 
 The decoder f turns latents into a motion, and e corrects its poses: x = f(z_k + s m) + e. The move m shifts the latents
 from a draw z_k, in units of the prior's scale s. Every coordinate of e is a Gaussian process over frames that is 0 in
-the first pose. `bend` minimises
+the first pose. `follow_paths` minimises
 
     |m|^2 + e' K^-1 e / c^2 + |bone lengths / first - 1|^2 / stretch^2        where x is on the paths, exactly
 
@@ -36,7 +36,7 @@ ENOUGH = 0.01
 """Smallest decrease of the minimised sum per step; the optimiser stops below it."""
 
 
-def bend(
+def follow_paths(
     decode: Callable[[Tensor], Tensor],
     latents: Tensor,
     scale: Tensor,

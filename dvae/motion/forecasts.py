@@ -11,7 +11,7 @@ import numpy as np
 from .. import files
 from .data.clips import Clip, MotionSet
 from .files.archive import holds, write_arrays
-from .files.plain import read_arrays
+from .files.arrays import read_arrays
 from .geometry.skeleton import FIELDS, Skeleton
 
 
@@ -163,5 +163,5 @@ def _write(
     arrays |= zip(("split", "clip", "start"), map(np.array, zip(*keys, strict=True)), strict=True)
     for field, key in FIELDS.items():
         arrays[key] = np.array(getattr(skeleton, field), int if field in ("left", "right") else None)
-    with files.written(path) as file:
+    with files.atomic_write(path) as file:
         write_arrays(file, arrays.items())

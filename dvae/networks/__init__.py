@@ -9,7 +9,7 @@ from .base import Input, Network, NetworkSpec
 from .cosine import CosineDecoder, CosineEncoder
 from .graphconv import GraphConv
 from .graphs import FrameGraph, NodeGraph
-from .known import WithNoise
+from .known_noise import WithNoise
 from .linear import Linear
 from .recurrent import Dense, Recurrent
 from .sde import LinearSDE, LinearSDEGuide

@@ -318,7 +318,9 @@ class AttentionNetwork(Network):
         return self.norm(stream), state
 
     @override
-    def reach(self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def forward_last(
+        self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+    ) -> tuple[Tensor, Any]:
         return self.step(state, t + count - 1, drawn)  # `step` also adds all skipped tokens to the cache
 
 
@@ -396,7 +398,7 @@ class SelfAttentionNetwork(Network):
         return (state[t], state) if self.after is None else self.after.step(state, t, drawn)
 
     @override
-    def reach(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def forward_last(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         return self.step(state, t + count - 1, drawn)
 
 

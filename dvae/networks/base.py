@@ -58,7 +58,7 @@ class Network(nn.Module):
         features: H, number of features.
     """
 
-    law: ClassVar[Any] = None
+    head: ClassVar[Any] = None
     """Specification class of the distribution that the features parameterise, if no other can read them."""
 
     def __init__(self, inputs: Sequence[Input], local: bool, features: int):
@@ -94,7 +94,9 @@ class Network(nn.Module):
         """
         raise NotImplementedError
 
-    def stretch(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def forward_chunk(
+        self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+    ) -> tuple[Tensor, Any]:
         """Return the features (B, N, H) at N steps from t on, whose parents are already known, and the next state.
 
         The default calls `step` N times; networks override it if they can evaluate the steps at once.
@@ -109,12 +111,13 @@ class Network(nn.Module):
             features.append(found)
         return torch.stack(features, dim=1), state
 
-    def reach(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """Return only the features (B, H) at the last of N steps, and the next state, with arguments as in `stretch`.
+    def forward_last(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        """Return only the features (B, H) at the last of N steps, and the next state, with arguments as in
+        `forward_chunk`.
 
         Networks override it if they can skip the earlier features.
         """
-        features, state = self.stretch(state, t, count, drawn)
+        features, state = self.forward_chunk(state, t, count, drawn)
         return features[:, -1], state
 
     def refuse_ragged(self, lengths: Tensor | None) -> None:
@@ -132,7 +135,7 @@ class Network(nn.Module):
         return None
 
 
-class AtOnce(Network):
+class FixedLengthNetwork(Network):
     """A network that evaluates all steps together, for sequences of equal length."""
 
     @override

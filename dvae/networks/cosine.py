@@ -29,8 +29,8 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..factorization.relations import ALL
-from .base import AtOnce, Input, Network
-from .loop import once_valid
+from .base import FixedLengthNetwork, Input, Network
+from .loop import memoize_valid
 
 
 @lru_cache(maxsize=64)
@@ -129,7 +129,7 @@ def _apart(network: Network, spec: Any) -> tuple[list[Input], Input]:
     return over_time, static[0]
 
 
-class CosineEncoderNetwork(AtOnce):
+class CosineEncoderNetwork(FixedLengthNetwork):
     """Network of `CosineEncoder`. Networks may share `over_time`, `static`, `before` and `between`."""
 
     def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
@@ -150,7 +150,7 @@ class CosineEncoderNetwork(AtOnce):
         """Return the features; ragged batches are not supported."""
         self.refuse_ragged(lengths)
         source, static = (parents[name] for name in self.names)
-        first = once_valid(self.static, static, None)
+        first = memoize_valid(self.static, static, None)
         hidden = torch.cat([self.over_time(source), first[:, None].expand(-1, length, -1)], dim=-1)
         hidden = self.before(self.dropout(hidden + positions(length, self.features, hidden.dtype, hidden.device)))
         if self.spec.cosine:
@@ -159,7 +159,7 @@ class CosineEncoderNetwork(AtOnce):
         return functional.pad(self.after(self.between(hidden)), (0, 0, 0, length - hidden.shape[1]))
 
 
-class CosineDecoderNetwork(AtOnce):
+class CosineDecoderNetwork(FixedLengthNetwork):
     """Network of `CosineDecoder`. Networks may share `static`."""
 
     def __init__(self, spec: CosineDecoder, inputs: Sequence[Input], local: bool, size: int):
@@ -193,7 +193,7 @@ class CosineDecoderNetwork(AtOnce):
         values = values[:, :components]
         if self.spec.cosine:
             values = cosine_basis(length, components, values.dtype, values.device).T @ values
-        start = once_valid(self.static, first, None)
+        start = memoize_valid(self.static, first, None)
         joined = [start[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
         hidden = self.into(torch.cat(joined, dim=-1))
         hidden = self.transformer(

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from torch import Tensor, nn
 
 from .base import Input, perceptron
-from .loop import Rows, follow, once_valid
+from .loop import Rows, extend_features, memoize_valid
 
 
 class ExtractorSpec(Protocol):
@@ -50,7 +50,7 @@ class Extractors(nn.ModuleDict):
 
     def of(self, parents: Mapping[str, Tensor], lengths: Tensor | None) -> dict[str, Tensor]:
         """Return the parents, (B, T, D) or (B, D), with extracted features in place of values."""
-        return {**parents, **{n: once_valid(self[n], parents[n], lengths) for n in self.keys() & parents}}
+        return {**parents, **{n: memoize_valid(self[n], parents[n], lengths) for n in self.keys() & parents}}
 
     def start(self, length: int) -> dict[str, tuple[Any, Rows]]:
         """Return each extractor, prepared for a loop, and storage for its features at every step."""
@@ -60,14 +60,14 @@ class Extractors(nn.ModuleDict):
         self, kept: Mapping[str, tuple[Any, Rows]], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
     ) -> dict[str, Sequence[Tensor]]:
         """Return the draws of a loop so far with extracted features in place of values; each draw is evaluated once."""
-        found = {n: follow(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
+        found = {n: extend_features(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
         return {**drawn, **found}
 
 
 def share(name: str, *networks: Any) -> None:
     """Assign one extractor of a parent to all networks, taken from the first network that has one.
 
-    Its output is evaluated once for all of them by `once`.
+    Its output is evaluated once for all of them by `memoize`.
     """
     held = [network.extractors for network in networks if name in network.extractors]
     for extractors in held[1:]:

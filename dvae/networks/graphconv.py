@@ -24,7 +24,7 @@ from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
 from ..constants import indices
-from .base import AtOnce, Input
+from .base import FixedLengthNetwork, Input
 from .cosine import cosine_basis
 
 
@@ -58,7 +58,7 @@ class GraphConv:
         return GraphConvNetwork(self, inputs, local, size)
 
 
-class GraphConvNetwork(AtOnce):
+class GraphConvNetwork(FixedLengthNetwork):
     """Network of `GraphConv`; the features (B, T, D) are the child's coordinates."""
 
     def __init__(self, spec: GraphConv, inputs: Sequence[Input], local: bool, size: int):

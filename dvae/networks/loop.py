@@ -99,8 +99,8 @@ _ONCE: ContextVar[dict[Any, Any] | None] = ContextVar("once", default=None)
 
 
 @contextmanager
-def computing_once() -> Iterator[None]:
-    """Cache the results of `once` within the block: for one evaluation of guide and model with fixed parameters."""
+def memoizing() -> Iterator[None]:
+    """Cache the results of `memoize` within the block: for one evaluation of guide and model with fixed parameters."""
     if _ONCE.get() is not None:
         yield
         return
@@ -111,8 +111,8 @@ def computing_once() -> Iterator[None]:
         _ONCE.reset(token)
 
 
-def once(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
-    """Return compute(), or its cached result for the same owner and identical input objects, within `computing_once`.
+def memoize(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
+    """Return compute(), or its cached result for the same owner and identical input objects, within `memoizing`.
 
     Factors that share a module, such as h_t in SRNN, thus evaluate it once without a reference to each other.
     """
@@ -126,8 +126,8 @@ def once(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) 
     return result
 
 
-def keep(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
-    """Store a result for `once` that was computed in another way, such as within a loop."""
+def store_result(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
+    """Store a result for `memoize` that was computed in another way, such as within a loop."""
     kept = _ONCE.get()
     if kept is not None:
         kept[_key(owner, inputs)] = (inputs, result)
@@ -157,7 +157,7 @@ def each_at(drawn: Mapping[str, Sequence[Tensor]], parents: Sequence[Any], t: in
     return [at(drawn[parent.name], t + lag, like, parent.size) for parent, lag in parents if lag is not None]
 
 
-def over(values: Sequence[Tensor], t: int, count: int, like: Tensor, size: int) -> Tensor:
+def stack_steps(values: Sequence[Tensor], t: int, count: int, like: Tensor, size: int) -> Tensor:
     """Return (B, N, D) of a loop's draws at N steps from t on, with `at` for each step."""
     return torch.stack([at(values, s, like, size) for s in range(t, t + count)], dim=1)
 
@@ -167,41 +167,41 @@ def valid_steps(lengths: Tensor, length: int) -> Tensor:
     return torch.arange(length, device=lengths.device) < lengths[:, None]
 
 
-def again(values: Tensor, n: int) -> Tensor:
-    """Repeat all rows n times, (n B, ...); `once_valid` then computes features of the original rows only."""
+def repeat_batch(values: Tensor, n: int) -> Tensor:
+    """Repeat all rows n times, (n B, ...); `memoize_valid` then computes features of the original rows only."""
     repeated = values.repeat(n, *[1] * (values.dim() - 1))
-    keep(again, [repeated], (values, n))
+    store_result(repeat_batch, [repeated], (values, n))
     return repeated
 
 
 def steps_of(values: Tensor) -> Sequence[Tensor]:
     """Return the steps of values (B, T, ...); `whole_of` can restore the values without a copy."""
     steps = values.unbind(1)
-    keep(steps_of, steps, values)
+    store_result(steps_of, steps, values)
     return steps
 
 
 def whole_of(steps: Sequence[Tensor]) -> Tensor:
     """Return values (B, T, ...) from their steps, without a copy if `steps_of` returned them."""
-    return once(steps_of, steps, lambda: torch.stack(list(steps), dim=1))
+    return memoize(steps_of, steps, lambda: torch.stack(list(steps), dim=1))
 
 
-def once_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Tensor:
+def memoize_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Tensor:
     """Return the module's features of (B, T, D) or (B, D), 0 at padding; computed once for identical values."""
 
     def compute() -> Tensor:
-        first, n = once(again, [values], lambda: (values, 1))
+        first, n = memoize(repeat_batch, [values], lambda: (values, 1))
         if n > 1 and lengths is None:
-            return again(once_valid(module, first, None), n)
+            return repeat_batch(memoize_valid(module, first, None), n)
         found: Tensor = module(values)
         if lengths is None or found.dim() == 2:
             return found
         return found * valid_steps(lengths, found.shape[1])[..., None]
 
-    return once(module, [values, lengths], compute)
+    return memoize(module, [values, lengths], compute)
 
 
-def follow(
+def extend_features(
     rows: Rows,
     drawn: Sequence[Any],
     module: nn.Module,
@@ -213,7 +213,7 @@ def follow(
     Args:
         rows: outputs by step, which are extended.
         drawn: draws by step; None if not drawn yet.
-        module, lengths: as in `once_valid`.
+        module, lengths: as in `memoize_valid`.
         change: version of the module for single steps, with computations shared by all steps already done.
     """
     there = drawn.values if isinstance(drawn, Rows) else drawn
@@ -224,10 +224,10 @@ def follow(
         return (
             [(change or module)(values[0])]
             if len(values) == 1
-            else steps_of(once_valid(module, whole_of(values), None))
+            else steps_of(memoize_valid(module, whole_of(values), None))
         )
 
-    for s, made in zip(fresh, once(module, [lengths, *values], compute) if fresh else [], strict=True):
+    for s, made in zip(fresh, memoize(module, [lengths, *values], compute) if fresh else [], strict=True):
         rows[s] = made if lengths is None else made * (s < lengths)[:, None]
     return rows
 

@@ -16,7 +16,7 @@ from typing_extensions import override
 from .base import Chain, Hoisted, Input, Join, Network, part, perceptron
 from .cells import GRU, LSTM
 from .extract import Extract, Extractors
-from .loop import Rows, at, each_at, keep, once, over, reverse, select, shift
+from .loop import Rows, at, each_at, memoize, reverse, select, shift, stack_steps, store_result
 
 CELLS: dict[str, type[GRU] | type[LSTM]] = {"gru": GRU, "lstm": LSTM}
 
@@ -42,7 +42,8 @@ class Recurrent:
         extract: extractors by parent, applied first: widths of a perceptron, or the specification of another module,
             such as `NodeGraph()`. Their output is 0 outside the sequence.
         separate: whether each parent has its own forward and backward state.
-        apart: whether a parent read over {<=t} enters the forward network up to t-1 only and joins with its value at t.
+        join_current: whether a parent read over {<=t} enters the forward network up to t-1 only and joins with its
+            value at t.
         stack: whether the backward network also reads the forward states and only its states are joined; requires
             parents read over {1:T}.
         mean: whether to average the states and pointwise parents instead of concatenating them.
@@ -56,7 +57,7 @@ class Recurrent:
     activation: str = "tanh"
     extract: Extract = field(default_factory=dict)
     separate: bool = False
-    apart: bool = False
+    join_current: bool = False
     stack: bool = False
     mean: bool = False
 
@@ -103,7 +104,7 @@ class Memory(nn.Module):
             keys: {name: the parent itself}, which identifies states that have already been computed.
             lengths: (B,) numbers of valid steps in a ragged batch.
         """
-        return once(self, self.key(keys, lengths), lambda: self._states(values, keys, lengths))
+        return memoize(self, self.key(keys, lengths), lambda: self._states(values, keys, lengths))
 
     def key(self, keys: Mapping[str, Tensor], lengths: Tensor | None) -> list[Tensor | None]:
         """Return the inputs that determine the states."""
@@ -159,12 +160,12 @@ class Memory(nn.Module):
             value = new[0]
         return value
 
-    def stretch(self, state: MemoryState, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
+    def forward_chunk(self, state: MemoryState, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
         """Return the states (B, N, W) of a forward memory at N steps from t on; `state` is advanced in place."""
         if self.embed is None and len(state.live) < len(self.entries):  # part of its gates is known
             return torch.stack([self.step(state, s, drawn) for s in range(t, t + count)], dim=1)
         like = state.hidden[0][0]
-        parts = [over(drawn[parent.name], t + lag, count, like, parent.size) for parent, lag, _ in state.live]
+        parts = [stack_steps(drawn[parent.name], t + lag, count, like, parent.size) for parent, lag, _ in state.live]
         if self.embed is None:
             value = torch.cat(parts, dim=-1)
         else:
@@ -250,7 +251,7 @@ class RecurrentNetwork(Network):
                 last = (-1 if local and math.isinf(low) else 0) if math.isinf(high) else int(high)
                 # A memory covers one side of t; steps on the other side are joined as single steps.
                 if math.isinf(low):
-                    past.append((parent, min(last, -1 if spec.apart and local else 0)))
+                    past.append((parent, min(last, -1 if spec.join_current and local else 0)))
                     first = past[-1][1] + 1 if last >= 0 else 1
                 if math.isinf(high):
                     future.append((parent, max(0 if math.isinf(low) else int(low), 0)))
@@ -314,11 +315,11 @@ class RecurrentNetwork(Network):
         return self.join.add(state.hoisted, t, parts), state
 
     @override
-    def stretch(self, state: RecurrentState, t: int, count: int, drawn: Any) -> tuple[Tensor, Any]:
+    def forward_chunk(self, state: RecurrentState, t: int, count: int, drawn: Any) -> tuple[Tensor, Any]:
         values = self.extractors.drawn(state.extracted, drawn, state.lengths) if self.extractors else drawn
-        parts = [memory.stretch(memory_state, t, count, values) for memory, memory_state in state.memories]
+        parts = [memory.forward_chunk(memory_state, t, count, values) for memory, memory_state in state.memories]
         like = parts[0] if parts else state.hoisted.like
-        parts += [over(values[parent.name], t + lag, count, like, parent.size) for parent, lag in state.live]
+        parts += [stack_steps(values[parent.name], t + lag, count, like, parent.size) for parent, lag in state.live]
         return self.join.add(state.hoisted, slice(t, t + count), parts), state
 
     @override
@@ -336,7 +337,7 @@ class RecurrentNetwork(Network):
         ((parent, lag, _),) = memory_state.live
 
         def remember(drawn: Tensor, states: Tensor) -> None:
-            keep(memory, memory.key({**state.given, parent.name: drawn}, memory_state.lengths), states)
+            store_result(memory, memory.key({**state.given, parent.name: drawn}, memory_state.lengths), states)
 
         return Chain(lag, self.join, state.hoisted, self._layers(parent.name), cell, remember)
 

@@ -38,7 +38,7 @@ from typing_extensions import override
 
 from ..distributions.triangular import InverseCholesky, Triangular, refuse_half
 from .base import Input, Network, NetworkSpec
-from .loop import at, once, select, shift, valid_steps
+from .loop import at, memoize, select, shift, valid_steps
 from .recurrent import Recurrent
 
 ORDER = 22
@@ -54,9 +54,9 @@ class LinearSDE:
 
     Example:
         >>> networks = {"p(z)": dvae.networks.LinearSDE(), "q(z)": dvae.networks.LinearSDEGuide()}
-        >>> laws = {"p(z)": dvae.distributions.Triangular(), "q(z)": dvae.distributions.Triangular()}
+        >>> distributions = {"p(z)": dvae.distributions.Triangular(), "q(z)": dvae.distributions.Triangular()}
         >>> pair = "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T}, d_{1:T})"
-        >>> model = dvae.DynamicalVAE(*pair, {"z": 4, "x": 3, "d": 1}, networks, laws)
+        >>> model = dvae.DynamicalVAE(*pair, {"z": 4, "x": 3, "d": 1}, networks, distributions)
         >>> model.sample(batch={"d": 10 * torch.rand(5, 20, 1) + 0.1})["x"].shape
         torch.Size([5, 20, 3])
     """
@@ -168,7 +168,7 @@ class Equation(nn.Module):
             there[:, 0] = False
             return self.over(gaps[..., 0], there, name)
 
-        return once(self, [gaps, lengths], compute)
+        return memoize(self, [gaps, lengths], compute)
 
     def over(self, gaps: Tensor, there: Tensor, name: str, first: int = 0) -> tuple[Tensor, Tensor]:
         """Return F and the whitening matrix of Q, (B, T, D, D) each; equal gaps are computed once.
@@ -218,7 +218,7 @@ class LinearSDENetwork(Network):
         times: initial relaxation times, as in `LinearSDE`.
     """
 
-    law = Triangular
+    head = Triangular
 
     def __init__(self, inputs: Sequence[Input], before: Input, gap: str, times: tuple[float, float]):
         super().__init__(inputs, True, before.size + before.size**2)

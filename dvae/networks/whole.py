@@ -19,8 +19,8 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ..factorization.relations import ALL
-from .base import AtOnce, Input, Network, perceptron
-from .loop import once
+from .base import FixedLengthNetwork, Input, Network, perceptron
+from .loop import memoize
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Trunk(nn.Module):
         return made
 
 
-class WholeDecoderNetwork(AtOnce):
+class WholeDecoderNetwork(FixedLengthNetwork):
     """Network of `WholeDecoder`."""
 
     def __init__(self, spec: WholeDecoder, inputs: Sequence[Input], local: bool, size: int):
@@ -144,5 +144,5 @@ class WholeDecoderNetwork(AtOnce):
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         _refuse(length, self.trunk.length)
         given = [parents[parent.name] for parent in self.inputs]
-        made: Tensor = once(self.trunk, given, lambda: self.trunk(given))[:, :length, self.places]
+        made: Tensor = memoize(self.trunk, given, lambda: self.trunk(given))[:, :length, self.places]
         return made

@@ -18,7 +18,7 @@ from ..data.units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float3
 from ..data.views import View
 from ..distributions.product import ProductSupport
 from ..factorization.notation import Factorization
-from ..networks.loop import again, once, valid_steps
+from ..networks.loop import memoize, repeat_batch, valid_steps
 from .conditional import Conditional
 from .groups import Groups
 from .rollout import Rollout
@@ -41,7 +41,7 @@ class Reader:
         view: transformation of the data that the model sees.
         extras: names of other entries that a batch may have.
         made: data variables that are deterministic given their parents, and are not passed to a program.
-        laws: conditionals of the data, which give the support and the events of the values.
+        distributions: conditionals of the data, which give the support and the events of the values.
         density: whether the data have a density, and a view that changes volume needs a log-determinant.
         grouped: names of static latents that groups of sequences share.
     """
@@ -53,7 +53,7 @@ class Reader:
     view: View
     extras: tuple[str, ...]
     made: frozenset[str]
-    laws: Mapping[str, Conditional]
+    distributions: Mapping[str, Conditional]
     density: bool
     grouped: tuple[str, ...]
 
@@ -96,19 +96,21 @@ class Reader:
                 self._check_mask(name, mask, values)
         shown = self.view(values)
         made = {name for name in shown if name in self.made and name not in values}
-        seen = Batch({name: value for name, value in shown.items() if name not in made and name != "beside"})
+        seen = Batch({name: value for name, value in shown.items() if name not in made and name != "view_inputs"})
         if self.density and whole in values and values.log_det is None and not self.view.keeps_volume:
             seen["log_det"] = self.view.counted(values)
         narrow = [n for n, v in seen.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
         seen |= {name: _narrowed(name, seen[name], dtype, seen) for name in narrow}
         if "mask" in seen:  # masks of context fill its values and are then dropped
             known = {name: mask for name, mask in seen.masks().items() if name in seen}
-            for name in known.keys() & self.laws.keys():
-                for event in map(list, self.laws[name].events):
+            for name in known.keys() & self.distributions.keys():
+                for event in map(list, self.distributions[name].events):
                     if not torch.equal(known[name][..., event].any(-1), known[name][..., event].all(-1)):
                         raise ValueError(
-                            f"the mask of {name} hides some entries of a step and not others, but its law has one "
-                            f"density for {len(event)} of them; hide them together, or give {name} a law with one for "
+                            f"the mask of {name} hides some entries of a step and not others, but its distribution has "
+                            "one "
+                            f"density for {len(event)} of them; hide them together, or give {name} a distribution with "
+                            "one for "
                             "each, such as Normal()"
                         )
             fill = {name: means[name].to(seen[name].dtype) if name in means else 0.0 for name in known}
@@ -148,7 +150,7 @@ class Reader:
             ValueError: if the batch is invalid.
         """
         lengths, masks, index = batch.lengths, batch.masks(), batch.group if self.grouped else None
-        groups = None if index is None else once(self, [index], lambda: Groups.of(index))
+        groups = None if index is None else memoize(self, [index], lambda: Groups.of(index))
         values = {name: value for name, value in batch.items() if name in self.sizes}
         for name, value in values.items():
             self.check(name, value)
@@ -166,7 +168,7 @@ class Reader:
             values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
         self._check_context(factorization, values)
         checked = [length, lengths, *given, *masks.values()]  # memoized for guide and model
-        once(self, checked, lambda: self._check_values(values, masks, lengths, length))
+        memoize(self, checked, lambda: self._check_values(values, masks, lengths, length))
         return Rollout(
             factorization=factorization,
             conditionals=conditionals,
@@ -207,7 +209,7 @@ class Reader:
         wrong = {name: ~torch.isfinite(value.sum()) for name, value in values.items()}  # a NaN survives the sum
         outside = {
             name: found
-            for name in values.keys() & self.laws.keys()
+            for name in values.keys() & self.distributions.keys()
             if (found := self._outside(name, values[name], masks.get(name), lengths)) is not None
         }
         verdict = [*wrong.values(), *(found.any() for found in outside.values())]
@@ -223,20 +225,21 @@ class Reader:
                 )
         for name, found in outside.items():
             if found.any():
-                law, place = self.laws[name], found.nonzero()[0].tolist()
+                distribution, place = self.distributions[name], found.nonzero()[0].tolist()
                 raise ValueError(
                     f"{name} holds {values[name][tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}),"
-                    f" and by {law.factor}, {law.law.called}, values are {_meaning(law.support)}; give {name} another"
-                    " law, move such entries inside, or hide them by the 'mask' of the batch"
+                    f" and by {distribution.factor}, {distribution.head.label}, values are "
+                    f"{_meaning(distribution.support)}; give {name} another"
+                    " distribution, move such entries inside, or hide them by the 'mask' of the batch"
                 )
 
     def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:
         """Return which observed entries lie outside the support, as a mask of the value; None if none can be."""
-        law = self.laws[name]
-        if (support := law.support) is None:
+        distribution = self.distributions[name]
+        if (support := distribution.support) is None:
             return None
         wrong = ~support.check(value)
-        wrong = wrong[..., None].expand_as(value) if law.whole else wrong
+        wrong = wrong[..., None].expand_as(value) if distribution.whole else wrong
         if mask is not None:
             wrong = wrong & mask
         if lengths is not None and value.dim() == 3:
@@ -266,7 +269,7 @@ def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Col
     found = Batch()
     for name, each in batch.items():
         if isinstance(each, Mapping):
-            found[name] = _tensors(Batch(each), dtype, names if name == "beside" else (), ())
+            found[name] = _tensors(Batch(each), dtype, names if name == "view_inputs" else (), ())
             continue
         tensor = tensor_of(each)
         if tensor.is_floating_point() or name in names:
@@ -386,11 +389,11 @@ def repeat(value: Any, samples: int) -> Any:
     Each copy has its own groups.
     """
     if not isinstance(value, Mapping):
-        return again(value, samples)
+        return repeat_batch(value, samples)
     batch = value if isinstance(value, Batch) else Batch(value)
-    found = batch.map(partial(again, n=samples))
+    found = batch.map(partial(repeat_batch, n=samples))
     if batch.group is not None:
-        found["group"] = Groups.of(batch.group).again(samples).place
+        found["group"] = Groups.of(batch.group).repeat(samples).place
     found.reader = batch.reader
     return found
 

@@ -13,13 +13,13 @@ from torch import Tensor, nn
 
 from ..constants import constant
 from ..data.units import Units
-from ..distributions.base import LawSpec, Parameters, Shape, is_real
+from ..distributions.base import DistributionSpec, Parameters, Shape, is_real
 from ..distributions.chain import DERIVATIVES, gaussian_chain
-from ..distributions.families import NormalLaw
-from ..distributions.precise import Offset
+from ..distributions.families import NormalModule
+from ..distributions.precise import OffsetDistribution
 from ..factorization.notation import Factor
 from ..networks.base import Input, Network, NetworkSpec, indicator, presence
-from ..networks.loop import Rows, at, follow, once, once_valid, over, select, shift, valid_steps
+from ..networks.loop import Rows, at, extend_features, memoize, memoize_valid, select, shift, stack_steps, valid_steps
 from .groups import Groups
 
 CONSTANT = "1"
@@ -62,7 +62,7 @@ class Conditional(nn.Module):
         factor: the factor. Without parents, a generative factor has no network and a guide's factor reads a constant.
         sizes: dimension of every variable.
         network: description of the network.
-        law: description of the distribution.
+        distribution: description of the distribution.
         generative: True for p, False for q.
         data: names of the data variables.
         guide: q(w | ...) of a static latent without parents, which some priors contain.
@@ -73,17 +73,18 @@ class Conditional(nn.Module):
         ValueError: if the network and the distribution do not fit together.
 
     Attributes:
-        discrete, reparameterised, whole: as the distribution declares (`Law.discrete`, `Law.event_dim`).
+        discrete, reparameterised, whole: as the distribution declares (`ConditionalDistribution.discrete`,
+            `ConditionalDistribution.event_dim`).
     """
 
-    inside: Tensor | None
+    interior_point: Tensor | None
 
     def __init__(
         self,
         factor: Factor,
         sizes: Mapping[str, int],
         network: NetworkSpec,
-        law: LawSpec,
+        distribution: DistributionSpec,
         generative: bool,
         data: tuple[str, ...] = (),
         guide: Conditional | None = None,
@@ -99,50 +100,56 @@ class Conditional(nn.Module):
         inputs = [Input(p.name, wide[p.name], p.relation if p.local else None) for p in factor.parents]
         if inputs or not generative:
             self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
-            if self.network.law and not isinstance(law, self.network.law):
-                expected = f"distributions.{self.network.law.__name__}"
+            if self.network.head and not isinstance(distribution, self.network.head):
+                expected = f"distributions.{self.network.head.__name__}"
                 raise ValueError(
-                    f"the features of {factor} by {network} are the parameters of a {expected}, but its law is {law}; "
+                    f"the features of {factor} by {network} are the parameters of a {expected}, but its distribution "
+                    f"is {distribution}; "
                     f"give it {expected}()"
                 )
         features = 0 if self.network is None else self.network.features
-        self.law = law.build(Shape(self.size, features, factor.local, factor.child, data, guide))
+        self.head = distribution.build(Shape(self.size, features, factor.local, factor.child, data, guide))
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # the model registers them
-        self.discrete = self.law.discrete
-        self.reparameterised = self.law.reparameterised and not self.law.discrete
-        self.whole = self.law.event_dim == 1
-        self.support = None if self.law.support is None or is_real(self.law.support) else self.law.support
+        self.discrete = self.head.discrete
+        self.reparameterised = self.head.reparameterised and not self.head.discrete
+        self.whole = self.head.event_dim == 1
+        self.support = None if self.head.support is None or is_real(self.head.support) else self.head.support
         """Support of the values; None if it is the real line or depends on the parents."""
-        self.events = [range(self.size)] if self.whole else self.law.events
+        self.events = [range(self.size)] if self.whole else self.head.events
         """Groups of coordinates; each group is one event and is observed as a whole."""
-        self.register_buffer("inside", self.law.inside(self.size), persistent=False)
+        self.register_buffer("interior_point", self.head.interior_point(self.size), persistent=False)
         self._seen = False  # whether a distribution was compared with its declaration
         for length in range(2, 9):
             self.check(length)
 
-    def _declared(self, law: TorchDistribution) -> None:
-        """Check that a distribution matches the declaration of its `Law`.
+    def _declared(self, distribution: TorchDistribution) -> None:
+        """Check that a distribution matches the declaration of its `ConditionalDistribution`.
 
         Raises:
             ValueError: if its event shape or support differs.
         """
         event = (self.size,) if self.whole else ()
-        if tuple(law.event_shape) != event or not (self.whole or law.batch_shape[-1:] == (self.size,)):
+        if tuple(distribution.event_shape) != event or not (
+            self.whole or distribution.batch_shape[-1:] == (self.size,)
+        ):
             raise ValueError(
-                f"the law of {self.factor} makes a {type(law).__name__} of batch {tuple(law.batch_shape)} and event "
-                f"{tuple(law.event_shape)}; by its event_dim = {self.law.event_dim} it has "
+                f"the distribution of {self.factor} makes a {type(distribution).__name__} of batch "
+                f"{tuple(distribution.batch_shape)} and event "
+                f"{tuple(distribution.event_shape)}; by its event_dim = {self.head.event_dim} it has "
                 + (f"the event {event}" if self.whole else f"no event, and the last dimension {self.size} in its batch")
             )
         support: Any = None
         with suppress(NotImplementedError):  # some distributions have no support
-            support = law.support
+            support = distribution.support
         if support is not None and not is_real(support):
-            declared = self.law.support is None or not is_real(self.law.support)
+            declared = self.head.support is None or not is_real(self.head.support)
             if not declared or support.is_discrete != self.discrete:
                 raise ValueError(
-                    f"the law of {self.factor} makes a {type(law).__name__} on {support}; declare it in the class of "
-                    f"the law: support (of torch.distributions.constraints), and discrete = {support.is_discrete}"
+                    f"the distribution of {self.factor} makes a {type(distribution).__name__} on {support}; declare it "
+                    "in the class of "
+                    "the distribution: support (of torch.distributions.constraints), and discrete = "
+                    f"{support.is_discrete}"
                 )
         self._seen = True
 
@@ -153,9 +160,10 @@ class Conditional(nn.Module):
             ValueError: if the factor does not read the child's own value one step before.
         """
         own = self.factor.parent(self.factor.child)
-        if self.law.residual and not (own and own.relation and own.relation.reads(-1, length)):
+        if self.head.residual and not (own and own.relation and own.relation.reads(-1, length)):
             raise ValueError(
-                f"{self.factor} has a residual law, which adds {self.factor.child}_{{t-1}}, but it does not read that "
+                f"{self.factor} has a residual distribution, which adds {self.factor.child}_{{t-1}}, but it does not "
+                "read that "
                 f"at {length} steps; add {self.factor.child}_{{t-1}} or {self.factor.child}_{{<t}} to its parents, or "
                 "use residual=0"
             )
@@ -169,9 +177,9 @@ class Conditional(nn.Module):
             value: value of the child.
             counted: mask of the shape of `value`, or (...) for whole events.
         """
-        if self.inside is None or counted is None:
+        if self.interior_point is None or counted is None:
             return value
-        return torch.where(counted if counted.dim() == value.dim() else counted[..., None], value, self.inside)
+        return torch.where(counted if counted.dim() == value.dim() else counted[..., None], value, self.interior_point)
 
     def forward(
         self,
@@ -187,14 +195,14 @@ class Conditional(nn.Module):
         """
         if self.network is None:
             shape = (batch, length, 0) if self.factor.local else (batch, 0)
-            return self._in_units(self.law(like(self.law).new_empty(shape)))
+            return self._rescale(self.head(like(self.head).new_empty(shape)))
         read = self._read(parents, batch, lengths)
         features = self.network(read, length, lengths)
-        features = features if groups is None else groups.pooled(features)
+        features = features if groups is None else groups.pool(features)
         previous = None
-        if self.law.residual:
+        if self.head.residual:
             previous = shift((parents if self._made_in is None else read)[self.factor.child], -1)
-        return self._in_units(self.law(features, previous))
+        return self._rescale(self.head(features, previous))
 
     def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
         """Return the parents, standardised and with their indicators; a constant if the factor has none."""
@@ -202,7 +210,7 @@ class Conditional(nn.Module):
             return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
         read = [*self.parents, *map(presence, self.parents)]
         found = {name: values[name] for name in read if name in values}
-        found |= {n: once_valid(self.units[n], v, lengths) for n, v in found.items() if n in self.units}
+        found |= {n: memoize_valid(self.units[n], v, lengths) for n, v in found.items() if n in self.units}
         told = {n: self._indicated(found[n], values.get(indicator(n)), lengths) for n in self.indicators if n in found}
         return found | told
 
@@ -215,14 +223,14 @@ class Conditional(nn.Module):
                 told = told * valid_steps(lengths, value.shape[1])[..., None]
             return torch.cat([value, told], -1)
 
-        return once(self, [value, seen, lengths], compute)
+        return memoize(self, [value, seen, lengths], compute)
 
     @property
     def _made_in(self) -> Units | None:
         """Units of the child, if the parameters of its distribution can be transformed to them."""
-        return self.units.get(self.factor.child) if self.law.location_scale else None
+        return self.units.get(self.factor.child) if self.head.location_scale else None
 
-    def _in_units(self, parameters: Parameters) -> Parameters:
+    def _rescale(self, parameters: Parameters) -> Parameters:
         if parameters and torch.is_autocast_enabled(parameters[0].device.type):
             # networks may compute in half precision, but densities, divergences and draws must not
             parameters = tuple(parameter.to(like(self).dtype) for parameter in parameters)
@@ -231,15 +239,15 @@ class Conditional(nn.Module):
             return parameters
         offset = self.offset
         mean = units.mean if offset is None else units.mean - offset
-        return self.law.in_units(parameters, mean.to(units.scale.dtype), units.scale)
+        return self.head.rescale(parameters, mean.to(units.scale.dtype), units.scale)
 
     @property
     def offset(self) -> Tensor | None:
         """Mean (D,) in float64 that parameters exclude; None if values are in the model's precision."""
         units = self._made_in
-        if units is None or not units.wide or not self.law.centred:
+        if units is None or not units.wide or not self.head.centred:
             return None
-        return units.mean if self.law.centred is True else units.mean * constant(self.law.centred, units.mean)
+        return units.mean if self.head.centred is True else units.mean * constant(self.head.centred, units.mean)
 
     def centred(self, value: Tensor) -> Tensor:
         """Return the value (..., D) of the child minus the offset, to match the parameters."""
@@ -247,24 +255,24 @@ class Conditional(nn.Module):
         return value if offset is None else (value - offset).to(like(self).dtype)
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """Return the distribution of the child for these parameters (`Law.distribution`)."""
-        law, offset = self.law.distribution(parameters), self.offset
+        """Return the distribution of the child for these parameters (`ConditionalDistribution.distribution`)."""
+        distribution, offset = self.head.distribution(parameters), self.offset
         if not self._seen:
-            self._declared(law)
-        return law if offset is None else Offset(law, offset, parameters[0].dtype)
+            self._declared(distribution)
+        return distribution if offset is None else OffsetDistribution(distribution, offset, parameters[0].dtype)
 
     def mean(self, parameters: Parameters) -> Tensor:
         """Return the mean of the child, (..., D)."""
-        return self._placed(self.law.mean(parameters))
+        return self._placed(self.head.mean(parameters))
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Return values (..., D) of the child (`Law.draw`)."""
-        return self._placed(self.law.draw(parameters, noise))
+        """Return values (..., D) of the child (`ConditionalDistribution.draw`)."""
+        return self._placed(self.head.draw(parameters, noise))
 
     @property
     def drawing(self) -> Callable[[Parameters, Tensor], Tensor]:
         """`draw` for use in a loop: the method of the distribution itself if values have no offset."""
-        return self.law.draw if self.offset is None else self.draw
+        return self.head.draw if self.offset is None else self.draw
 
     def _placed(self, value: Tensor) -> Tensor:
         offset = self.offset
@@ -276,7 +284,7 @@ class Conditional(nn.Module):
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
         # these are read from the draws, even if given
-        own = self.factor.child if self.law.residual and self._made_in is not None else None
+        own = self.factor.child if self.head.residual and self._made_in is not None else None
         live = [name for name in self.units if name in self.parents and (name not in given or name == own)]
         if not live:
             return state
@@ -291,31 +299,33 @@ class Conditional(nn.Module):
             return tuple(p[t] for p in state), state
         inner, read = self._without_unit(state, drawn)
         if count > 1:
-            features, inner = self.network.reach(inner, t + 1 - count, count, read)
+            features, inner = self.network.forward_last(inner, t + 1 - count, count, read)
         else:
             features, inner = self.network.step(inner, t, read)
         previous = None
-        if self.law.residual:
+        if self.head.residual:
             previous = at((drawn if self._made_in is None else read)[self.factor.child], t - 1, features, self.size)
-        return self._in_units(self.law(features, previous, t)), self._advanced(state, inner)
+        return self._rescale(self.head(features, previous, t)), self._advanced(state, inner)
 
-    def stretch(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Parameters, Any]:
+    def forward_chunk(
+        self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+    ) -> tuple[Parameters, Any]:
         """Return the parameters (B, N, D) at N steps from t on, with all their inputs known, and the next state."""
         if self.network is None:
             return tuple(torch.stack(p[t : t + count], dim=1) for p in state), state
         inner, read = self._without_unit(state, drawn)
-        features, inner = self.network.stretch(inner, t, count, read)
+        features, inner = self.network.forward_chunk(inner, t, count, read)
         previous = None
-        if self.law.residual:
+        if self.head.residual:
             own = (drawn if self._made_in is None else read)[self.factor.child]
-            previous = over(own, t - 1, count, features, self.size)
-        return self._in_units(self.law(features, previous, t)), self._advanced(state, inner)
+            previous = stack_steps(own, t - 1, count, features, self.size)
+        return self._rescale(self.head(features, previous, t)), self._advanced(state, inner)
 
     def _without_unit(self, state: Any, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
         """Return the state of the network, and the draws standardised as the network reads them."""
         if not isinstance(state, Standardised):
             return state, drawn
-        found = {n: follow(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
+        found = {n: extend_features(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
         return state.network, {**drawn, **found}
 
     def select(self, state: Any, rows: Tensor) -> Any:
@@ -344,9 +354,9 @@ class Conditional(nn.Module):
         form = None if self.network is None else self.network.chain(state)
         if form is None or form.lag != -direction or form.join.kind not in DERIVATIVES:
             return None
-        if not isinstance(self.law, NormalLaw) or self.law.residual:
+        if not isinstance(self.head, NormalModule) or self.head.residual:
             return None
-        join, out = form.join, self.law.out
+        join, out = form.join, self.head.out
         batch, length, _ = noise.shape
         hoisted = form.hoisted if join.first else join.hoist(form.hoisted.known, batch, length, out)
         linear = [layer for layer in join.rest if isinstance(layer, nn.Linear)]
@@ -364,7 +374,7 @@ class Conditional(nn.Module):
             [(hoisted.weights[0], None), *following],
             before=form.before,
             cell=None if form.cell is None else (into(form.cell[0]), form.cell[1]),
-            min_scale=self.law.min_scale,
+            min_scale=self.head.min_scale,
             activation=join.kind,
         )
         value, *parameters = map(back, drawn)

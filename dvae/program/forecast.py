@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..data.batch import WHOLE, Batch
 from ..data.sequences import refuse_table
-from ..networks.loop import computing_once
+from ..networks.loop import memoizing
 from ..options import Count, Range, require
 from .batch import AnyBatch, in_chunks, repeat, rows
 from .conditional import like
@@ -62,13 +62,13 @@ def forecast(
     alike = model.forks and not redrawn and not model.grouped and model.latents[:1] == model.prior_order[:1]
     forked = model.latents[:1] if alike else ()
 
-    @computing_once()
+    @memoizing()
     def futures(part: slice, count: int) -> dict[str, Tensor]:
         known, held = (repeat(rows(each, part), count) for each in (data, fixed))
         observed = rows(seen, part) if forked else repeat(rows(seen, part), count)
         for name in redrawn:
-            law, some = model.shared[name].distribution(model.sizes[name]), len(known[name]) // count
-            known[name] = observed[name] = law.sample((count,)).to(known[name]).repeat_interleave(some, 0)
+            distribution, some = model.shared[name].distribution(model.sizes[name]), len(known[name]) // count
+            known[name] = observed[name] = distribution.sample((count,)).to(known[name]).repeat_interleave(some, 0)
         latents = {name: value for name, value in held.items() if name in model.latents}
         if past:
             latents = poutine.condition(model.guide, latents)(observed, draws=dict.fromkeys(forked, count))
@@ -81,9 +81,11 @@ def forecast(
         out = program(known, length=past + horizon, prefix=prefix, mean_emission=not drawn)
         made = {name: out[name].unflatten(0, (count, -1)) for name in (*model.observed, *model.latents, *model.summed)}
         made |= {name: made[name][:, :, past:] for name in model.observed}
-        made = model.shown(made, rows(data, part))
+        made = model.to_data_space(made, rows(data, part))
         again = {n: rows(v, part).expand_as(made[n]) for n, v in given.items() if n in model.observed}
-        return model.shown({**made, **again}) if again else made  # the original, since the view's round trip rounds
+        return (
+            model.to_data_space({**made, **again}) if again else made
+        )  # the original, since the view's round trip rounds
 
     # Identical samples are computed once: rows of one matrix product may differ in their last bits.
     distinct = samples if model.latents or model.summed or redrawn or drawn else 1
@@ -127,7 +129,7 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
             if name in model.observed:
                 found[name] = model.generator[name].mean(rollout.parameters(name, rollout.values[name]))
         made = {name: mean.unflatten(0, (count, -1)) for name, mean in found.items()}
-        return model.shown(made, rows(data, part))
+        return model.to_data_space(made, rows(data, part))
 
     return in_chunks(means, whole.batch, samples, _together(model, data, whole.batch, chunk))
 
@@ -193,10 +195,10 @@ def _filled(model: Any, batch: AnyBatch, samples: int, chunk: int, particles: in
             rollout.states = rollout.summation.draw()
         rollout.drawing = True
         values = {name: {**rollout.values, **rollout.history(name)}[name] for name in model.observed}
-        made = model.shown({n: v.unflatten(0, (count, -1)) for n, v in values.items()}, rows(data, part))
+        made = model.to_data_space({n: v.unflatten(0, (count, -1)) for n, v in values.items()}, rows(data, part))
         if particles > 1:
             drawn = (*model.latents, *model.observed)
-            ratio = sum(rollout.law(name).log_prob(rollout.values[name]) for name in drawn)
+            ratio = sum(rollout.distribution(name).log_prob(rollout.values[name]) for name in drawn)
             ratio = ratio - sum(guide.nodes[name]["fn"].log_prob(guide.nodes[name]["value"]) for name in model.latents)
             made[WEIGHT] = ratio.unflatten(0, (count, -1))
         return made

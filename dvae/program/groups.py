@@ -48,14 +48,14 @@ class Groups:
         first = rows.new_full((len(count),), len(place)).scatter_reduce(0, place, rows, "amin")
         return cls(place, first, count[place])
 
-    def again(self, n: int) -> Groups:
+    def repeat(self, n: int) -> Groups:
         """Return the groups of the batch repeated n times; each copy has its own groups."""
         groups = len(self.first)
         copies = torch.arange(n, device=self.place.device)[:, None]
         place, first = (self.place + groups * copies).flatten(), (self.first + len(self.place) * copies).flatten()
         return Groups(place, first, self.count.repeat(n))
 
-    def pooled(self, features: Tensor) -> Tensor:
+    def pool(self, features: Tensor) -> Tensor:
         """Return the mean of features (B, H) over the group of each sequence, (B, H)."""
         total = features.new_zeros(len(self.first), features.shape[-1]).index_add(0, self.place, features)
         return total[self.place] / self.count[:, None].to(features)
@@ -68,7 +68,7 @@ class Groups:
         """Return sums (..., G) of values (..., B) over the groups."""
         return values.new_zeros(*values.shape[:-1], len(self.first)).index_add(-1, self.place, values)
 
-    def dealt(self, values: Tensor) -> Tensor:
+    def split_evenly(self, values: Tensor) -> Tensor:
         """Return an equal share of values (..., G) for each sequence of a group, (..., B)."""
         return values[..., self.place] / self.count.to(values)
 

@@ -24,22 +24,22 @@ from torch import Tensor, nn
 from ..data.batch import Batch
 from ..data.units import Coordinate, Units, exceeds_float32
 from ..data.views import View
-from ..distributions.base import LawSpec
+from ..distributions.base import DistributionSpec
 from ..distributions.families import Normal, StandardNormal
 from ..distributions.family import FAMILIES
 from ..distributions.subset import Subset
 from ..factorization.inversion import guide
 from ..factorization.notation import Factor, Factorization, check_pair
 from ..factorization.relations import MaskFunction
+from ..locking import serialized
 from ..networks import NetworkSpec, Recurrent
-from ..networks.loop import once
+from ..networks.loop import memoize
 from ..options import Range, kind_of, problem
-from ..turns import alone
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
+from .enumeration import Discrete, EnumerationPlan
 from .forecast import forecast, impute, reconstruct, states
-from .rollout import InputNoise, Rollout, SelfFeeding
-from .summed import Discrete, Sums
+from .rollout import InputNoise, Rollout, ScheduledSampling
 
 _COUNT = itertools.count()
 SHARED: Any = {"shared": True}
@@ -52,14 +52,14 @@ class DynamicalVAE(nn.Module):
     Args:
         generative: text such as "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", or a `Factorization`.
         inference: text such as "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"; "" for a model without latents.
-            "faithful" is the smallest guide that keeps every dependency of the posterior (`faithful`). None uses the
-            prior as the guide, and every KL term is exactly zero.
+            "faithful" is the smallest guide that keeps every dependency of the posterior (`faithful_inverse`). None
+            uses the prior as the guide, and every KL term is exactly zero.
         sizes: dimension of every variable, context included. A `Discrete` size makes a latent categorical, and the
             model sums it out.
         network: description of the networks, or a mapping from factors to descriptions. Its keys are "p(x)" for one
             factor, "p" for all generative factors, "q" for all factors of the guide, and "default".
-        laws: distributions of the factors, with the same keys; the default is `distributions.Normal()`. A generative
-            factor without parents is N(0, I), unless "p(w)" itself is a key, for example with
+        distributions: distributions of the factors, with the same keys; the default is `distributions.Normal()`. A
+            generative factor without parents is N(0, I), unless "p(w)" itself is a key, for example with
             `distributions.Mixture()`.
         observed: names of the data variables; every other variable with a generative factor is a latent.
         masks: custom relations, name to function of T (`Factorization.parse`).
@@ -91,7 +91,7 @@ class DynamicalVAE(nn.Module):
     per: str = "frame"
     """Unit of one log-likelihood: "frame" or "window"."""
 
-    @alone
+    @serialized
     @torch.inference_mode(False)  # keeps parameters trainable if the model is built in inference mode
     def __init__(
         self,
@@ -99,7 +99,7 @@ class DynamicalVAE(nn.Module):
         inference: str | Factorization | None,
         sizes: Mapping[str, int],
         network: NetworkSpec | Mapping[str, NetworkSpec] | None = None,
-        laws: LawSpec | Mapping[str, LawSpec] | None = None,
+        distributions: DistributionSpec | Mapping[str, DistributionSpec] | None = None,
         observed: tuple[str, ...] = ("x",),
         masks: Mapping[str, MaskFunction] | None = None,
         *,
@@ -111,7 +111,7 @@ class DynamicalVAE(nn.Module):
         super().__init__()
         self._name = f"dvae{next(_COUNT)}"  # unique: Pyro's store is global
         self.generative = Factorization.parse(generative, masks)
-        self.feeding: SelfFeeding | InputNoise = SelfFeeding(0.0)
+        self.feeding: ScheduledSampling | InputNoise = ScheduledSampling(0.0)
         if not isinstance(view, View | None):
             raise TypeError(f"the view is {kind_of(view)}; expected an instance such as dvae.data.views.View()")
         self.view = view or View()
@@ -122,14 +122,16 @@ class DynamicalVAE(nn.Module):
         self.latents, self.observed, self.context = check_pair(
             self.generative, self.inference, observed, sizes, self.summed
         )
-        self.sums = Sums(self.generative, {name: self.sizes[name] for name in self.summed}) if self.summed else None
+        self.sums = (
+            EnumerationPlan(self.generative, {name: self.sizes[name] for name in self.summed}) if self.summed else None
+        )
         for name in self.sizes:
             if hasattr(nn.ModuleDict, name):
                 raise ValueError(f"a variable cannot be named {name!r}, which is an attribute of torch's modules")
         self.networks = _by_factor(network, Recurrent(), "network")
-        self.laws = _by_factor(laws, Normal(), "law")
+        self.distributions = _by_factor(distributions, Normal(), "distribution")
         keys = {f"{f.kind}({f.child})" for f in (*self.generative.factors, *self.inference.factors)}
-        for key in {*self.networks, *self.laws} - keys - {"p", "q", "default"}:
+        for key in {*self.networks, *self.distributions} - keys - {"p", "q", "default"}:
             raise ValueError(f"no factor {key!r}; keys are {', '.join(sorted(keys))}, 'p', 'q' and 'default'")
         self.view.check(self.sizes, self.context, self.generative)
         self.shared = dict(shared or {})
@@ -164,7 +166,7 @@ class DynamicalVAE(nn.Module):
             self.context,
             self.view,
             self.extras,
-            frozenset(name for name in self.view.parts or () if self.generator[name].law.deterministic),
+            frozenset(name for name in self.view.parts or () if self.generator[name].head.deterministic),
             {name: self.generator[name] for name in self.observed},
             self.likelihood,
             self.grouped,
@@ -174,9 +176,9 @@ class DynamicalVAE(nn.Module):
     def _conditionals(self, factors: Iterable[Factor], guides: Mapping[str, Conditional] | None = None) -> Any:
         def pick(table: Mapping[str, Any], factor: Factor) -> Any:
             own = f"{factor.kind}({factor.child})"
-            if table is self.laws and isinstance(self.sizes[factor.child], Discrete):
+            if table is self.distributions and isinstance(self.sizes[factor.child], Discrete):
                 return table.get(own, FAMILIES["category"])
-            if table is self.laws and factor.kind == "p" and not factor.parents:
+            if table is self.distributions and factor.kind == "p" and not factor.parents:
                 return table.get(own, StandardNormal())
             return table.get(own, table.get(factor.kind, table["default"]))
 
@@ -186,7 +188,7 @@ class DynamicalVAE(nn.Module):
                     factor,
                     self.sizes,
                     pick(self.networks, factor),
-                    pick(self.laws, factor),
+                    pick(self.distributions, factor),
                     generative=factor.kind == "p",
                     data=self.observed,
                     guide=guides[factor.child] if guides and factor.child in guides else None,
@@ -213,25 +215,26 @@ class DynamicalVAE(nn.Module):
                 if conditional.discrete or (conditional is self.encoder[name] and not conditional.reparameterised):
                     what = "are discrete" if conditional.discrete else "are not reparameterised"
                     raise ValueError(
-                        f"the draws of the latent {name} {what} by the law of {conditional.factor}, so that no "
-                        f"gradient would reach the guide through them; give it a continuous law such as "
+                        f"the draws of the latent {name} {what} by the distribution of {conditional.factor}, so that "
+                        "no "
+                        f"gradient would reach the guide through them; give it a continuous distribution such as "
                         f"distributions.Normal(), name {name} as observed where it is data, or have a categorical one "
                         f"summed out: sizes={{{name!r}: dvae.Discrete(states)}}"
                     )
         for name in self.summed:
-            if (law := self.generator[name].law.called) != "OneHotCategorical":
+            if (distribution := self.generator[name].head.label) != "OneHotCategorical":
                 raise ValueError(
-                    f"{name} is summed out over its {self.sizes[name]} states, but the law of "
-                    f"{self.generator[name].factor} is {law}; leave it to be that of categories"
+                    f"{name} is summed out over its {self.sizes[name]} states, but the distribution of "
+                    f"{self.generator[name].factor} is {distribution}; leave it to be that of categories"
                 )
 
     @torch.inference_mode(False)
     def standardise(self, name: str, coordinates: Sequence[Coordinate] = ()) -> Units:
         """Make the networks read a variable standardised; call `fit` on the result to set mean and scale.
 
-        If the distribution of the variable has a location and a scale (`Law.location_scale`), networks also produce its
-        parameters standardised. Probabilities and rates are produced unchanged. Densities and values stay in the
-        variable's own unit. Call this method before the model is fitted.
+        If the distribution of the variable has a location and a scale (`ConditionalDistribution.location_scale`),
+        networks also produce its parameters standardised. Probabilities and rates are produced unchanged. Densities and
+        values stay in the variable's own unit. Call this method before the model is fitted.
 
         Args:
             name: name of the variable.
@@ -261,27 +264,27 @@ class DynamicalVAE(nn.Module):
 
         Models without one (`distributions.Delta`) have no bound.
         """
-        return not any(self.generator[name].law.deterministic for name in self.observed)
+        return not any(self.generator[name].head.deterministic for name in self.observed)
 
     @property
-    def gradual(self) -> bool:
+    def has_curriculum(self) -> bool:
         """Whether a curriculum affects the programs, through the draws of shared context."""
         return bool(self.shared)
 
     def is_drawn(self, means: bool = False) -> bool:
         """Return whether forecasts draw the data if `draw_emission` is not given.
 
-        They do, unless the emission's scale is the weight of a squared error (`Law.error_weight`).
+        They do, unless the emission's scale is the weight of a squared error (`ConditionalDistribution.error_weight`).
 
         Args:
             means: prefer means, for scores that are published for means. Data are drawn anyway if they are discrete,
                 since a mean is then not a possible value. They are also drawn if the model has no latents, since all
                 samples would be equal.
         """
-        laws = [self.generator[name] for name in self.observed]
-        if means and (self.latents or self.summed) and not any(each.discrete for each in laws):
+        distributions = [self.generator[name] for name in self.observed]
+        if means and (self.latents or self.summed) and not any(each.discrete for each in distributions):
             return False
-        return not any(each.law.error_weight for each in laws)
+        return not any(each.head.error_weight for each in distributions)
 
     def rollout(
         self, batch: AnyBatch | None, length: int | None = None, size: int = 1, *, guide: bool = False
@@ -316,7 +319,7 @@ class DynamicalVAE(nn.Module):
         size: int = 1,
         prefix: Mapping[str, Tensor] | None = None,
         mean_emission: bool | Collection[str] = False,
-        self_feeding: SelfFeeding | InputNoise | float | None = None,
+        scheduled_sampling: ScheduledSampling | InputNoise | float | None = None,
         draws: Mapping[str, int] | None = None,
         curriculum: float = 1.0,
     ) -> dict[str, Tensor]:
@@ -333,8 +336,9 @@ class DynamicalVAE(nn.Module):
                 summed out.
             mean_emission: in a free run, set the data variables, or the named ones, to their means instead of drawing
                 them.
-            self_feeding: replacement for the data's history: a `SelfFeeding` (scheduled sampling), an `InputNoise`, or
-                a number. A number sets the probability or the share of the noise of the model's attribute `feeding`.
+            scheduled_sampling: replacement for the data's history: a `ScheduledSampling`, an
+                `InputNoise`, or a number. A number sets the probability or the share of the noise of the model's
+                attribute `feeding`.
             draws: latent to a number n: the program draws this variable n times for each sequence and continues each
                 draw. Later variables have n times as many rows, ordered draw by draw.
             curriculum: progress of the curriculum for the draws of shared context, from 0 to 1
@@ -362,9 +366,9 @@ class DynamicalVAE(nn.Module):
         rollout.prefix = prefixed
         names = self.observed if mean_emission else ()
         rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
-        if isinstance(self_feeding, int | float):
-            self_feeding = self.feeding.at(self_feeding)
-        rollout.feeding = self_feeding
+        if isinstance(scheduled_sampling, int | float):
+            scheduled_sampling = self.feeding.at(scheduled_sampling)
+        rollout.feeding = scheduled_sampling
         for block in self.generative.blocks:
             for name in block.names:
                 if name in self.summed:
@@ -397,12 +401,12 @@ class DynamicalVAE(nn.Module):
 
     def _site(self, name: str, rollout: Rollout) -> Tensor:
         data = rollout.values.get(name)
-        if self.generator[name].law.deterministic:  # a deterministic site in Pyro's sense, with no density to score
+        if self.generator[name].head.deterministic:  # a deterministic site in Pyro's sense, with no density to score
             value = rollout.draw(name) if data is None else data
             infer: Any = {**_note(self.generative, rollout), "_deterministic": True}
-            law = dist.Delta(value, event_dim=value.dim() - 1, validate_args=False).mask(False)
-            return pyro.sample(name, law, obs=value, infer=infer)
-        return pyro.sample(name, rollout.law(name), obs=data, infer=_note(self.generative, rollout))
+            distribution = dist.Delta(value, event_dim=value.dim() - 1, validate_args=False).mask(False)
+            return pyro.sample(name, distribution, obs=value, infer=infer)
+        return pyro.sample(name, rollout.distribution(name), obs=data, infer=_note(self.generative, rollout))
 
     def guide(
         self, batch: AnyBatch, *, draws: Mapping[str, int] | None = None, curriculum: float = 1.0, **_: Any
@@ -423,8 +427,8 @@ class DynamicalVAE(nn.Module):
             n = (draws or {}).get(name, 1)
             one, rollout = rollout, rollout.fork(n)
             with rollout.plate:
-                law = rollout.law(name) if self.inference.local(name) else one.law(name, n)
-                values[name] = pyro.sample(name, law, infer=_note(self.inference, rollout))
+                distribution = rollout.distribution(name) if self.inference.local(name) else one.distribution(name, n)
+                values[name] = pyro.sample(name, distribution, infer=_note(self.inference, rollout))
                 rollout.know(name, values[name])
         return values
 
@@ -464,7 +468,7 @@ class DynamicalVAE(nn.Module):
         """
         with self.running():
             data = self.read(batch, size=n)
-            return self.shown(self.model(data, length=length, size=n), data)
+            return self.to_data_space(self.model(data, length=length, size=n), data)
 
     @torch.no_grad()
     def forecast(
@@ -601,7 +605,7 @@ class DynamicalVAE(nn.Module):
     @contextmanager
     def running(self) -> Iterator[None]:
         """Switch to evaluation mode for a block that runs programs of the model; other threads wait."""
-        with alone, evaluating(self) if self.training else nullcontext():
+        with serialized, evaluating(self) if self.training else nullcontext():
             yield
 
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
@@ -632,21 +636,21 @@ class DynamicalVAE(nn.Module):
         means = {name: units.filling for name, units in self.units.items()}
         # guide and model both read the batch
         wide = {name for name in self.units if name in self.wide or (precise and _is_wide(batch, name))}
-        data = Batch(once(self, [batch], lambda: self.reader.read(batch, reader[1], means, wide)))
+        data = Batch(memoize(self, [batch], lambda: self.reader.read(batch, reader[1], means, wide)))
         one = {name: data.pop(name) for name in self.shared if name in data and data[name].dim() == 1}
         size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
         for name, spec in self.shared.items():
             if name not in data:
-                law = spec.distribution(self.sizes[name], curriculum)
-                value = one[name] if name in one else pyro.sample(name, law, infer=SHARED)
-                data[name] = once(self, [value, size], partial(self._of_each, value, size))  # memoized for both
+                distribution = spec.distribution(self.sizes[name], curriculum)
+                value = one[name] if name in one else pyro.sample(name, distribution, infer=SHARED)
+                data[name] = memoize(self, [value, size], partial(self._of_each, value, size))  # memoized for both
         data.reader = None if precise else reader
         return data
 
     def _of_each(self, value: Tensor, size: int) -> Tensor:
         return value.to(like(self)).expand(size, -1)
 
-    def shown(self, values: Mapping[str, Tensor], data: Batch | None = None) -> dict[str, Tensor]:
+    def to_data_space(self, values: Mapping[str, Tensor], data: Batch | None = None) -> dict[str, Tensor]:
         """Map data variables that the model produced back to data space, through the inverse of the view.
 
         Args:

@@ -22,22 +22,22 @@ import scipy
 import torch
 from torch import Tensor
 
-from ..distributions.families import FixedNormal, FixedNormalLaw, Gaussian
+from ..distributions.families import FixedNormal, FixedNormalModule, Gaussian
 from ..distributions.family import Family
 from ..factorization.inversion import FAITHFUL, guide
 from ..factorization.notation import Factor, Factorization
+from ..locking import seeded
 from ..networks.base import indicator
 from ..networks.linear import Linear, LinearNetwork
 from ..networks.loop import valid_steps
 from ..options import Count, kind_of, require
-from ..turns import seeded
 from .conditional import Conditional, like
+from .enumeration import Discrete
 from .model import DynamicalVAE
 from .rollout import Rollout
-from .summed import Discrete
 
 
-def twin(
+def linear_gaussian_surrogate(
     generative: str | Factorization,
     inference: str | Factorization | None,
     sizes: Mapping[str, int],
@@ -55,14 +55,15 @@ def twin(
         scale: standard deviation of the weights.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> model.sample(5, length=4)["x"].shape
         torch.Size([5, 4, 2])
     """
     model = Factorization.parse(generative)
     summed = tuple(name for name, size in sizes.items() if isinstance(size, Discrete) and name not in observed)
     equations = (model, guide(model, inference, observed, summed=summed))
-    laws = {
+    distributions = {
         f"{factor.kind}({factor.child})": Family("OneHotCategorical", project=False)
         if factor.child in summed
         else FixedNormal(scale=0.7, learned=True, project=False, steps=steps if factor.local else 0)
@@ -71,7 +72,9 @@ def twin(
         if factor.parents or factor.kind == "q"
     }
     with seeded(seed):
-        return DynamicalVAE(generative, inference, sizes, Linear(steps, scale), laws, observed=observed).double()
+        return DynamicalVAE(
+            generative, inference, sizes, Linear(steps, scale), distributions, observed=observed
+        ).double()
 
 
 def _is_partial(run: Rollout) -> bool:
@@ -104,7 +107,7 @@ class Oracle:
     variable reads padding.
 
     Args:
-        model: a `twin`, or any `DynamicalVAE` of Linear networks with fixed scales.
+        model: a `linear_gaussian_surrogate`, or any `DynamicalVAE` of Linear networks with fixed scales.
         steps: T.
 
     Raises:
@@ -113,17 +116,20 @@ class Oracle:
             raise it if a batch has another length, has groups, or misses a data variable.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> dvae.Oracle(model, 4).evidence(torch.randn(3, 4, 2).double()).shape
         torch.Size([3])
     """
 
     def __init__(self, model: DynamicalVAE, steps: int):
         if not isinstance(model, DynamicalVAE):
-            raise TypeError(f"the model is {kind_of(model)}; expected a DynamicalVAE, such as dvae.twin(...)")
+            raise TypeError(
+                f"the model is {kind_of(model)}; expected a DynamicalVAE, such as dvae.linear_gaussian_surrogate(...)"
+            )
         require(Count, steps=steps)
         if model.context:
-            raise ValueError(f"the oracle knows no law of the context {', '.join(model.context)}")
+            raise ValueError(f"the oracle knows no distribution of the context {', '.join(model.context)}")
         if type(model).penalties is not DynamicalVAE.penalties:
             raise ValueError(f"{type(model).__name__} adds energies to the log joint, which is not normal then")
         # float32 does not resolve affine functions of a variable far from 0
@@ -204,11 +210,11 @@ class Oracle:
 
     def _require_linear(self, conditional: Conditional) -> None:
         units = self.model.units
-        linear = isinstance(conditional.network, LinearNetwork) and isinstance(conditional.law, FixedNormalLaw)
-        if not linear and not (conditional.network is None and isinstance(conditional.law, Gaussian)):
+        linear = isinstance(conditional.network, LinearNetwork) and isinstance(conditional.head, FixedNormalModule)
+        if not linear and not (conditional.network is None and isinstance(conditional.head, Gaussian)):
             raise ValueError(
                 f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
-                "distributions.FixedNormal, as dvae.program.oracle.twin builds, or without parents a normal"
+                "distributions.FixedNormal, as dvae.program.oracle.surrogate builds, or without parents a normal"
             )
         if read := [name for name in conditional.parents if name in units and units[name].logarithms]:
             raise ValueError(f"{conditional.factor} reads logarithms of {', '.join(read)}, and is not linear in them")
@@ -244,7 +250,7 @@ class Oracle:
         white = (kept / system.scale)[..., None] * own * kept[:, None] + torch.diag_embed(missing)
         moved, logs = system.bias[:, None], torch.zeros(1, dtype=torch.float64)
         if model.sums is not None:
-            states = model.sums.courses(self.steps)
+            states = model.sums.state_sequences(self.steps)
             logs = sum((self._log_probability(name, states) for name in model.summed), logs)
             moved = moved + self._stack(states, model.summed) @ system.data_weights.mT
         means = torch.linalg.solve(rest, moved.mT).mT * kept[:, None]
@@ -253,8 +259,8 @@ class Oracle:
     def _log_probability(self, name: str, states: Mapping[str, Tensor]) -> Tensor:
         """Return log probabilities (C,) of state sequences of one variable given the other summed-out variables."""
         conditional, value = self.model.generator[name], states[name]
-        law = conditional.law.distribution(conditional(states, len(value), self.steps))
-        logs: Tensor = (law.logits * value).flatten(1).sum(1)
+        distribution = conditional.head.distribution(conditional(states, len(value), self.steps))
+        logs: Tensor = (distribution.logits * value).flatten(1).sum(1)
         return logs
 
     def _guide(self, run: Rollout | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -279,9 +285,11 @@ class Oracle:
         data = self._stack(run.values, self.model.observed) * counted
         start = means.shape[-1] - data.shape[1]
         covariance = torch.linalg.inv(precision)[:, None, start:, start:]
-        law = torch.distributions.MultivariateNormal(means[..., start:], covariance)
+        distribution = torch.distributions.MultivariateNormal(means[..., start:], covariance)
         # uncounted entries are 0, and independent N(0, 1)
-        weighed: Tensor = logs + law.log_prob(data[:, None]) + (1 - counted).sum(1, True) * math.log(2 * math.pi) / 2
+        weighed: Tensor = (
+            logs + distribution.log_prob(data[:, None]) + (1 - counted).sum(1, True) * math.log(2 * math.pi) / 2
+        )
         return weighed
 
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -372,7 +380,7 @@ class Oracle:
         return float(self.gap().detach())
 
 
-def price(
+def kl_gap(
     generative: str | Factorization,
     inference: str | Factorization | None,
     sizes: Mapping[str, int],
@@ -393,16 +401,19 @@ def price(
         seeds: number of random models.
 
     Example:
-        >>> dvae.price("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, steps=3, seeds=1) > 0
+        >>> dvae.kl_gap("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, steps=3, seeds=1) > 0
         tensor([True])
     """
     if min(steps, seeds) < 1:
-        raise ValueError(f"a price is of at least 1 step and 1 model, not of {steps} and {seeds}")
+        raise ValueError(f"a cost is of at least 1 step and 1 model, not of {steps} and {seeds}")
     model = Factorization.parse(generative)
     read = guide(model, inference, observed)
     context = _context(model, read)
     model, data = _drawing(model, context), (*observed, *(factor.child for factor in context))
-    gaps = [Oracle(twin(model, read, sizes, steps, seed, data), steps).fit_guide() for seed in range(seeds)]
+    gaps = [
+        Oracle(linear_gaussian_surrogate(model, read, sizes, steps, seed, data), steps).fit_guide()
+        for seed in range(seeds)
+    ]
     return torch.tensor(gaps, dtype=torch.float64)
 
 
@@ -417,7 +428,7 @@ def _drawing(model: Factorization, context: tuple[Factor, ...]) -> Factorization
     return replace(model, factors=(*context, *model.factors))
 
 
-def model_price(
+def model_kl_gap(
     generative: str | Factorization,
     reduced: str | Factorization,
     sizes: Mapping[str, int],
@@ -427,7 +438,7 @@ def model_price(
 ) -> Tensor:
     """Return the smallest expected loss of evidence of a model with fewer edges, in nats per sequence, (seeds,).
 
-    Each seed is a linear-Gaussian model p with random weights, the same as in `price`. The cost is the minimum of
+    Each seed is a linear-Gaussian model p with random weights, the same as in `kl_gap`. The cost is the minimum of
     KL(p(x) || r(x)) over linear-Gaussian models r with the reduced factorization. Both are normals with known
     covariances, and no guide is involved. Without latents the search is convex. With latents it has local minima. The
     search then starts at the weights of p without the missing edges, and at twelve random points near them. The result
@@ -444,18 +455,21 @@ def model_price(
         ValueError: if the two models have different variables, or `steps` or `seeds` is below 1.
 
     Example:
-        >>> dvae.model_price("p(x_t | x_{t-1})", "p(x_t)", {"x": 1}, steps=3, seeds=1) > 0
+        >>> dvae.model_kl_gap("p(x_t | x_{t-1})", "p(x_t)", {"x": 1}, steps=3, seeds=1) > 0
         tensor([True])
     """
     if min(steps, seeds) < 1:
-        raise ValueError(f"a price is of at least 1 step and 1 model, not of {steps} and {seeds}")
+        raise ValueError(f"a cost is of at least 1 step and 1 model, not of {steps} and {seeds}")
     whole, less = Factorization.parse(generative), Factorization.parse(reduced)
     if {*whole.variables} != {*less.variables}:
         names = ", ".join(whole.variables)
         raise ValueError(f"a reduced model has the variables of the whole one, {names}, but it is {less.text!r}")
     context = _context(whole, less)
     whole, less, data = _drawing(whole, context), _drawing(less, context), (*observed, *(f.child for f in context))
-    lost = [_lost(Oracle(twin(whole, None, sizes, steps, seed, data), steps), less) for seed in range(seeds)]
+    lost = [
+        _lost(Oracle(linear_gaussian_surrogate(whole, None, sizes, steps, seed, data), steps), less)
+        for seed in range(seeds)
+    ]
     return torch.tensor(lost, dtype=torch.float64)
 
 
@@ -511,7 +525,7 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
     return float(least)
 
 
-def arrow_prices(
+def edge_costs(
     generative: str | Factorization,
     inference: str | Factorization | None = FAITHFUL,
     sizes: Mapping[str, int] | None = None,
@@ -519,56 +533,56 @@ def arrow_prices(
     seeds: int = 5,
     observed: tuple[str, ...] = ("x",),
 ) -> dict[str, Tensor]:
-    """Return the cost of removing each edge of a guide, one at a time, in nats per sequence (`price`).
+    """Return the cost of removing each edge of a guide, one at a time, in nats per sequence (`kl_gap`).
 
     Args:
         generative, inference, observed: as in `DynamicalVAE`.
         sizes: dimension of every variable; 1 each by default, for which a faithful guide has no cost.
-        steps: as in `price`.
-        seeds: as in `price`.
+        steps: as in `kl_gap`.
+        seeds: as in `kl_gap`.
 
     Returns:
         {edge: (seeds,), increase of the KL gap without the edge in each random model}, largest mean first.
 
     Example:
-        >>> {arrow: bool((cost > 0).all()) for arrow, cost in dvae.arrow_prices(
+        >>> {edge: bool((cost > 0).all()) for edge, cost in dvae.edge_costs(
         ...     "p(z_t) p(x_t | z_t)", "q(z_t | x_t, z_{t-1})", steps=3, seeds=2).items()}
         {'x_t to z_t': True, 'z_{t-1} to z_t': False}
     """
     model = Factorization.parse(generative)
     written = guide(model, inference, observed)
     known = sizes or ones(model, written)
-    whole = price(model, written, known, steps, seeds, observed)
-    return _dearest_first(written, lambda less: price(model, less, known, steps, seeds, observed) - whole)
+    whole = kl_gap(model, written, known, steps, seeds, observed)
+    return _costliest_first(written, lambda less: kl_gap(model, less, known, steps, seeds, observed) - whole)
 
 
-def model_arrow_prices(
+def model_edge_costs(
     generative: str | Factorization,
     sizes: Mapping[str, int] | None = None,
     steps: int = 5,
     seeds: int = 5,
     observed: tuple[str, ...] = ("x",),
 ) -> dict[str, Tensor]:
-    """Return the cost of removing each edge of a model, one at a time, in nats per sequence (`model_price`).
+    """Return the cost of removing each edge of a model, one at a time, in nats per sequence (`model_kl_gap`).
 
     Args:
         generative, observed: as in `DynamicalVAE`.
         sizes: dimension of every variable. By default 2 for data, since data of size 1 can often replace a removed path
             by another one, and 1 for other variables.
-        steps: as in `model_price`.
-        seeds: as in `model_price`.
+        steps: as in `model_kl_gap`.
+        seeds: as in `model_kl_gap`.
 
     Returns:
         {edge: (seeds,), loss of evidence without the edge in each random model}, largest mean first.
 
     Example:
-        >>> {arrow: bool((cost > 1e-6).all()) for arrow, cost in dvae.model_arrow_prices(
+        >>> {edge: bool((cost > 1e-6).all()) for edge, cost in dvae.model_edge_costs(
         ...     "p(z_t | z_{t-1}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2).items()}
         {'x_{<t} to x_t': True, 'z_t to x_t': True, 'z_{t-1} to z_t': False}
     """
     model = Factorization.parse(generative)
     known = sizes or {**ones(model), **dict.fromkeys(observed, 2)}
-    return _dearest_first(model, lambda less: model_price(model, less, known, steps, seeds, observed))
+    return _costliest_first(model, lambda less: model_kl_gap(model, less, known, steps, seeds, observed))
 
 
 def ones(*equations: Factorization) -> dict[str, int]:
@@ -576,7 +590,7 @@ def ones(*equations: Factorization) -> dict[str, int]:
     return dict.fromkeys((name for part in equations for name in (*part.variables, *part.context)), 1)
 
 
-def _dearest_first(written: Factorization, cost: Callable[[Factorization], Tensor]) -> dict[str, Tensor]:
+def _costliest_first(written: Factorization, cost: Callable[[Factorization], Tensor]) -> dict[str, Tensor]:
     """Return the cost of each edge by its name, largest mean first."""
-    found = {written.arrow(*arrow): cost(written.without(*arrow)) for arrow in written.arrows}
+    found = {written.describe_edge(*edge): cost(written.without(*edge)) for edge in written.edges}
     return dict(sorted(found.items(), key=lambda item: -float(item[1].mean())))

@@ -23,25 +23,25 @@ def reference(model: Any, batch: AnyBatch) -> None:
     known = {name: value for name, value in rollout.values.items() if name not in model.observed}
     size, length = rollout.batch, rollout.length
 
-    def law(name: str, sofar: Mapping[str, list[Tensor]]) -> Any:
+    def distribution(name: str, sofar: Mapping[str, list[Tensor]]) -> Any:
         conditional = model.generator[name]
         parents = dict(known)
         for other, values in sofar.items():
             later = torch.randn(size, length - len(values), model.sizes[other]).to(like(model))
             parents[other] = torch.cat([torch.stack(values, 1), later], 1) if values else later
-        return conditional.law, conditional(parents, size, length)
+        return conditional.head, conditional(parents, size, length)
 
     with pyro.plate("sequences", size, dim=-1):
         for block in model.generative.blocks:
             if not model.generative.local(block.names[0]):
                 (name,) = block.names
-                own, parameters = law(name, {})
+                own, parameters = distribution(name, {})
                 known[name] = pyro.sample(name, own.joint(parameters))
                 continue
             sofar: dict[str, list[Tensor]] = {name: [] for name in block.names}
             for t in pyro.markov(range(length), history=length):
                 for name in block.names:
-                    own, parameters = law(name, sofar)
+                    own, parameters = distribution(name, sofar)
                     at_t = own.joint(tuple(p[:, t] for p in parameters))
                     data = rollout.values[name][:, t] if name in model.observed else None
                     sofar[name].append(pyro.sample(f"{name}_{t + 1}", at_t, obs=data))

@@ -23,14 +23,14 @@ from torch.distributions import constraints
 from ..distributions.base import Parameters
 from ..factorization.notation import Block, Factorization
 from ..networks.base import indicator, presence
-from ..networks.loop import again, computing_once, steps_of, valid_steps
+from ..networks.loop import memoizing, repeat_batch, steps_of, valid_steps
 from .conditional import Conditional, like
+from .enumeration import Enumeration, EnumerationPlan
 from .groups import Grouped, Groups
-from .summed import Summation, Sums
 
 
 @dataclass(frozen=True)
-class SelfFeeding:
+class ScheduledSampling:
     """Scheduled sampling: the model's own means replace frames of the data's history (Bengio et al., 2015).
 
     Args:
@@ -48,7 +48,8 @@ class SelfFeeding:
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
-        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), self_feeding=dvae.SelfFeeding(0.5))
+        >>> own = dvae.ScheduledSampling(0.5)
+        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), scheduled_sampling=own)
     """
 
     probability: float
@@ -63,7 +64,7 @@ class SelfFeeding:
         if self.blocks is not None and (len(self.blocks) != 2 or min(self.blocks) < 1):
             raise ValueError(f"blocks are numbers of frames from 1, as they are and replaced, got {self.blocks}")
 
-    def at(self, level: float) -> SelfFeeding:
+    def at(self, level: float) -> ScheduledSampling:
         """Return a copy with this probability, for schedules."""
         return replace(self, probability=level)
 
@@ -77,7 +78,7 @@ class SelfFeeding:
             fed &= (place >= kept)[:, None]
         return fed
 
-    def told(self, length: int) -> list[bool] | None:
+    def fixed_frames(self, length: int) -> list[bool] | None:
         """Return which of T frames stay unchanged, if this is not random; otherwise None."""
         if self.probability < 1:
             return None
@@ -96,7 +97,7 @@ class InputNoise:
 
     Example:
         >>> model = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})
-        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), self_feeding=dvae.InputNoise(0.5))
+        >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), scheduled_sampling=dvae.InputNoise(0.5))
     """
 
     scale: float
@@ -123,7 +124,7 @@ class Hidden:
 
     entries: Tensor
     detached: Tensor | None = None
-    told: list[bool] | None = None
+    fixed_frames: list[bool] | None = None
 
     def fill(self, value: Tensor, mean: Tensor, steps: int | slice = slice(None)) -> Tensor:
         """Return the value (B, T, D) with the mean at these entries; for one step, both are (B, D)."""
@@ -169,12 +170,12 @@ class Rollout:
     present: Mapping[str, Tensor] = field(default_factory=dict)
     prefix: Mapping[str, Tensor] = field(default_factory=dict)
     mean_emission: Collection[str] = ()
-    feeding: SelfFeeding | InputNoise | None = None
+    feeding: ScheduledSampling | InputNoise | None = None
     draws: int = 1
     drawing: bool = False
     groups: Groups | None = None
     grouped: Collection[str] = ()
-    sums: Sums | None = None
+    sums: EnumerationPlan | None = None
     states: dict[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -185,7 +186,7 @@ class Rollout:
         self._drawn: dict[str, Tensor] = {}
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}
         self._unfed = list(self.factorization.blocks)
-        self._summation: Summation | None = None
+        self._summation: Enumeration | None = None
         self._valid = None if self.lengths is None else valid_steps(self.lengths, self.length)[..., None]
 
     @cached_property
@@ -198,13 +199,13 @@ class Rollout:
 
         Copies share all known values.
         """
-        return self if n == 1 else self.again(n)
+        return self if n == 1 else self.repeat(n)
 
-    def again(self, n: int) -> Rollout:
+    def repeat(self, n: int) -> Rollout:
         """Return a new run with every row repeated n times, draw by draw."""
 
         def each(values: Any) -> Any:
-            return {name: again(value, n) for name, value in values.items()}
+            return {name: repeat_batch(value, n) for name, value in values.items()}
 
         return replace(
             self,
@@ -216,10 +217,10 @@ class Rollout:
             observed=each(self.observed),
             present=each(self.present),
             prefix=each(self.prefix),
-            groups=None if self.groups is None else self.groups.again(n),
+            groups=None if self.groups is None else self.groups.repeat(n),
         )
 
-    def law(self, name: str, draws: int = 1) -> TorchDistribution:
+    def distribution(self, name: str, draws: int = 1) -> TorchDistribution:
         """Return the distribution of a variable, for its Pyro site.
 
         Args:
@@ -230,19 +231,21 @@ class Rollout:
         """
         if self.sums is not None and name in self.sums.readers:
             return Marginal(self, name)
-        return self.conditional_law(name, draws)
+        return self.conditional_distribution(name, draws)
 
-    def conditional_law(self, name: str, draws: int = 1) -> TorchDistribution:
+    def conditional_distribution(self, name: str, draws: int = 1) -> TorchDistribution:
         """Return the distribution of a variable given drawn states of the summed-out latents."""
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
         known, groups = {**self.known, **self.history(name)}, self.groups if name in self.grouped else None
         parameters = conditional(known, self.batch, self.length, self.lengths, groups)
-        law = conditional.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
+        distribution = conditional.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
         mask = self.mask(name)
-        law = (law if mask is None else law.mask(mask)).to_event(1 - len(law.event_shape))
-        return law if groups is None else Grouped(law, groups.again(draws))
+        distribution = (distribution if mask is None else distribution.mask(mask)).to_event(
+            1 - len(distribution.event_shape)
+        )
+        return distribution if groups is None else Grouped(distribution, groups.repeat(draws))
 
     @property
     def known(self) -> dict[str, Tensor]:
@@ -316,7 +319,7 @@ class Rollout:
         """Draw a summed-out latent, (B, T, C) or (B, C), given the earlier draws."""
         if name not in self.states:
             local = self.conditionals[name].factor.local
-            self.states[name] = self.draw(name) if local else self.conditional_law(name).sample()
+            self.states[name] = self.draw(name) if local else self.conditional_distribution(name).sample()
         return self.states[name]
 
     def _draw_states(self, block: Block) -> None:
@@ -327,12 +330,12 @@ class Rollout:
                     self.state(parent)
 
     @property
-    def summation(self) -> Summation:
+    def summation(self) -> Enumeration:
         """The sum over discrete latents, given all other variables."""
         assert self.sums is not None
         made = self._summation
         if made is None or any(made.values.get(name) is not value for name, value in self.values.items()):
-            self._summation = made = Summation(self.sums, self)
+            self._summation = made = Enumeration(self.sums, self)
         return made
 
     @property
@@ -375,7 +378,7 @@ class Rollout:
         """Data entries that the model may not read: missing ones, and frames that scheduled sampling replaces."""
         missing = {name: ~seen for name, seen in self.observed.items() if name in self.values and not seen.all()}
         hidden = {name: Hidden(entries) for name, entries in missing.items()}
-        if not isinstance(self.feeding, SelfFeeding) or not self.feeding.probability:
+        if not isinstance(self.feeding, ScheduledSampling) or not self.feeding.probability:
             return hidden
         fed = self.feeding.frames(self.batch, self.length, next(iter(self.values.values())).device)
         for name in self.data & self.values.keys():
@@ -383,7 +386,9 @@ class Rollout:
                 absent = missing.get(name)
                 entries = fed if absent is None else fed | absent
                 detached = None if self.feeding.gradient else fed if absent is None else fed & ~absent
-                hidden[name] = Hidden(entries, detached, self.feeding.told(self.length) if absent is None else None)
+                hidden[name] = Hidden(
+                    entries, detached, self.feeding.fixed_frames(self.length) if absent is None else None
+                )
         return hidden
 
     def _feed(self, block: Block) -> dict[str, Tensor]:
@@ -392,7 +397,7 @@ class Rollout:
         if not names:
             return {}
         feeding = self.feeding
-        if not isinstance(feeding, SelfFeeding) or feeding.passes is None or not feeding.probability:
+        if not isinstance(feeding, ScheduledSampling) or feeding.passes is None or not feeding.probability:
             return self._run(block, self._fed, self.hidden)
         known = {**self.known, **self._fed}
         for _ in range(feeding.passes):
@@ -412,7 +417,7 @@ class Rollout:
         given = {name: value for name, value in told.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
-            name: self.conditionals[name].law.noise(
+            name: self.conditionals[name].head.noise(
                 (self.batch, self.length, self.conditionals[name].size), like(self.conditionals[name])
             )
             for name in live
@@ -436,7 +441,7 @@ class Rollout:
                 self._evaluated[name] = (drawn[name], parameters)
         return drawn
 
-    @computing_once()
+    @memoizing()
     def _loop(
         self,
         block: Block,
@@ -471,7 +476,7 @@ class Rollout:
             for name in live:
                 conditional = self.conditionals[name]
                 if count > 1 and kept:
-                    at_all, states[name] = conditional.stretch(states[name], first, count, drawn)
+                    at_all, states[name] = conditional.forward_chunk(states[name], first, count, drawn)
                     parameters = tuple(p[:, -1] for p in at_all)
                 else:
                     parameters, states[name] = conditional.step(states[name], t, drawn, count)
@@ -505,7 +510,7 @@ class Rollout:
         end = min(told[name].shape[1] for name in live)
         known, seen = [True] * end, []
         for name in live:
-            if hidden is not None and (told_at := hidden[name].told) is not None:
+            if hidden is not None and (told_at := hidden[name].fixed_frames) is not None:
                 known = [before and now for before, now in zip(known, told_at, strict=False)]
             elif (mask := self.observed.get(name) if hidden is None else ~hidden[name].entries) is not None:
                 seen.append(mask[:, :end].all(-1).all(0))
@@ -552,7 +557,7 @@ class Sequence(TorchDistribution):
         if sample_shape:
             raise NotImplementedError(
                 f"a Sequence draws one batch at a time, but shape {tuple(sample_shape)} was asked for; repeat the "
-                "batch, as forecast(samples=...) and importance_bound(particles=...) do"
+                "batch, as forecast(samples=...) and iwae_bound(particles=...) do"
             )
         return self.rollout.draw(self.name)
 
@@ -593,7 +598,7 @@ class Sequence(TorchDistribution):
         if torch.Size(batch_shape) != self.batch_shape:
             raise NotImplementedError(
                 f"a Sequence of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}; "
-                "vectorised particles are had by repeating the batch (importance_bound(particles=...))"
+                "vectorised particles are had by repeating the batch (iwae_bound(particles=...))"
             )
         return self
 
@@ -621,12 +626,14 @@ class Marginal(Sequence):
         for parent in self.rollout.conditionals[self.name].parents:
             if parent in self.rollout.sums.sizes:  # type: ignore[union-attr]
                 self.rollout.state(parent)
-        law = self.rollout.conditional_law(self.name)
-        return law.rsample() if law.has_rsample else law.sample()  # type: ignore[no-any-return]
+        distribution = self.rollout.conditional_distribution(self.name)
+        return distribution.rsample() if distribution.has_rsample else distribution.sample()  # type: ignore[no-any-return]
 
     def steps(self, value: Tensor) -> TorchDistribution:
         """Raise an error: with states summed out, steps depend on one another."""
-        raise NotImplementedError(f"with what {self.name} reads summed out, its steps have no laws by themselves")
+        raise NotImplementedError(
+            f"with what {self.name} reads summed out, its steps have no distributions by themselves"
+        )
 
     def by_step(self, value: Tensor) -> Tensor:
         """Return the log density of each step given all earlier ones, (B, T), or (B,) if static."""

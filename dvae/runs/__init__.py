@@ -1,4 +1,4 @@
-"""Runs: directories that hold a fit and all it takes to go on with it, one run or many."""
+"""Runs: directories that contain a fit and everything needed to resume it, single runs and sweeps."""
 
 from typing import TYPE_CHECKING
 

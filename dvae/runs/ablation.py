@@ -1,17 +1,16 @@
-"""Ablations: every arrow of a model and of its guide left out in turn, and what each is worth.
+"""Ablations: leave out every edge of a model and of its guide in turn, and measure the cost of each.
 
-Two prices, which answer two questions. On linear-Gaussian twins (`dvae.program.oracle`) it is computed: the
-evidence that a model loses without an arrow, and how much wider the gap of a guide becomes. It says which arrows can
-matter. On data it is measured: the whole and every reduced pair of equations are fitted with the same seeds (`sweep`)
-and compared on the test windows (`compare`), with errors over clips and seeds, and p-values for all arrows at once
-(Holm, 1979).
+There are two costs. On linear-Gaussian surrogates (`dvae.program.oracle`) the cost is computed: the evidence that a
+model loses without an edge, or the increase of the gap of a guide. It shows which edges can matter. On data the cost is
+measured. The whole and every reduced pair of equations are fitted with the same seeds (`sweep`) and compared on the
+test windows (`compare`), with errors over clips and seeds, and p-values adjusted for all edges (Holm, 1979).
 
-Both prices are of the same: of a model's arrow the evidence, on data the importance-weighted bound, which is near it
-whatever the guide; of a guide's arrow the evidence lower bound, from which an importance-weighted one is made to hide
-how far the guide is from the posterior.
+The cost of a model's edge is a loss of evidence. On data it is measured by the IWAE bound, which is near the evidence
+even if the guide is not. The cost of a guide's edge is a loss of the ELBO, because an IWAE bound hides the distance of
+the guide from the posterior.
 
-All pairs are fitted with networks of one kind (the method `equations`), as those of a paper are made for its arrows:
-SRNN's three factors share the state of x_{<t}, and none of them could do without it alone.
+All pairs are fitted with networks of one kind (the method `equations`), because the networks of a paper are designed
+for its edges. For example, SRNN's three factors share the state of x_{<t}, so that it cannot be removed from one alone.
 """
 
 from __future__ import annotations
@@ -28,20 +27,20 @@ import numpy as np
 from typing_extensions import override
 
 from ..data.schema import Schema
-from ..data.sequences import called
+from ..data.sequences import axis_names
 from ..factorization.drawing import draw_slice
 from ..factorization.notation import Factorization, Parent, check_pair
 from ..inference.evaluation.compare import compare
 from ..inference.evaluation.comparison import Comparison
 from ..inference.evaluation.estimates import Estimate, number
+from ..inference.evaluation.multiple_comparisons import holm
 from ..inference.evaluation.record import Dims
-from ..inference.evaluation.result import Result, Table, canvas, progress_bar
+from ..inference.evaluation.result import Result, Table, new_figure, progress_bar
 from ..inference.training.checkpoints import ENDED
-from ..inference.training.many import holm
 from ..inference.training.options import Training
 from ..models.family.equations import Equations
 from ..models.method import Method
-from ..program.oracle import model_price, ones, price
+from ..program.oracle import kl_gap, model_kl_gap, ones
 from .directory import load, training_of
 from .kinds import Dataset
 from .sweep import sweep
@@ -49,29 +48,29 @@ from .sweep import sweep
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-METRIC = {"p": "importance bound", "q": "ELBO"}
-"""By which arrows of a model, and of a guide, are priced on data."""
+METRIC = {"p": "IWAE bound", "q": "ELBO"}
+"""Bound that measures the cost of edges of a model ("p") and of a guide ("q") on data."""
 WHOLE = "whole"
-"""The run of all arrows."""
+"""Name of the run with all edges."""
 FAMILY = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "autoregressive")
-"""Methods that are their equations, which networks of one kind can have."""
+"""Methods defined by their equations alone, which can therefore have networks of one kind."""
 LEVEL = 0.05
-"""From which p-value on an arrow is drawn pale."""
+"""Smallest p-value of an edge that is drawn pale."""
 MOST = 1000
-"""Random models of an ablation that is read from a file."""
+"""Maximum number of surrogates of an ablation read from a file."""
 WORDS = {"<=": "upto-", ">=": "from-", "<": "before-", ">": "after-", ":": ".."}
-"""In names of directories, which have none of these signs."""
+"""Replacements of signs in directory names."""
 
 
 @dataclass(frozen=True)
-class Arrow:
-    """An arrow of a model or of its guide.
+class AblatedEdge:
+    """An edge of a model or of its guide.
 
     Args:
-        kind: "p" of the model, "q" of the guide.
-        child: the variable that reads.
-        parent: what it reads.
-        name: such as "x_{<t} to z_t".
+        kind: "p" for the model, "q" for the guide.
+        child: variable that reads the parent.
+        parent: parent with its relation in time.
+        name: name of the edge, such as "x_{<t} to z_t".
     """
 
     kind: Literal["p", "q"]
@@ -81,12 +80,12 @@ class Arrow:
 
     @property
     def of(self) -> str:
-        """What it is an arrow of, in a word."""
+        """Owner of the edge: "model" or "guide"."""
         return {"p": "model", "q": "guide"}[self.kind]
 
     @property
     def run(self) -> str:
-        """What is fitted without it, such as "guide-without-x_before-t-to-z_t"."""
+        """Name of the run without the edge, such as "guide-without-x_before-t-to-z_t"."""
         name = self.name.replace("{", "").replace("}", "").replace(" ", "-")
         for sign, word in WORDS.items():
             name = name.replace(sign, word)
@@ -95,26 +94,27 @@ class Arrow:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ablation(Result):
-    """What every arrow of a model and its guide is worth.
+    """Costs of every edge of a model and its guide.
 
     Attributes:
-        equations: "generative" and "inference".
-        sizes: of the variables of the twins.
-        steps: T of the twins.
-        prices: by `Arrow.run`, the price in each of the twins, in nats a sequence.
-        notes: by `Arrow.run`, what keeps an arrow from being left out on data, or what becomes of the rest without it.
-        comparison: of the fitted models, `WHOLE` and those by `Arrow.run`; None where none were fitted.
+        equations: equations of the model, "generative", and of the guide, "inference".
+        sizes: sizes of the variables of the surrogates.
+        steps: number T of time steps of the surrogates.
+        costs: {`AblatedEdge.run`: cost on each of the surrogates, in nats per sequence}.
+        notes: {`AblatedEdge.run`: reason why the reduced equations were not fitted, or data that no longer depend on a
+            latent}.
+        comparison: comparison of the fitted models, `WHOLE` and one for each `AblatedEdge.run`; None without fits.
 
     Example:
-        >>> found = dvae.ablate(("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"), steps=3, twins=2)
-        >>> [arrow.name for arrow in found.arrows if max(found.prices[arrow.run]) < 1e-6]
+        >>> found = dvae.ablate(("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"), steps=3, surrogates=2)
+        >>> [edge.name for edge in found.edges if max(found.costs[edge.run]) < 1e-6]
         ['x_{<t} to z_t']
     """
 
     equations: dict[str, str]
     sizes: dict[str, int]
     steps: int
-    prices: Annotated[dict[str, np.ndarray], Dims("twin", name="{}")]
+    costs: Annotated[dict[str, np.ndarray], Dims("surrogate", name="{}")]
     notes: dict[str, str]
     comparison: Comparison | None = None
 
@@ -133,70 +133,71 @@ class Ablation(Result):
         return self._pair[1]
 
     @property
-    def arrows(self) -> tuple[Arrow, ...]:
-        """Of the model and of the guide, each the dearest on the twins first."""
-        found = arrows_of(self.generative, self.inference)
-        return tuple(sorted(found, key=lambda arrow: (arrow.kind, -float(np.mean(self.prices[arrow.run])))))
+    def edges(self) -> tuple[AblatedEdge, ...]:
+        """Edges of the model, then of the guide, in decreasing order of cost on the surrogates."""
+        found = edges_of(self.generative, self.inference)
+        return tuple(sorted(found, key=lambda edge: (edge.kind, -float(np.mean(self.costs[edge.run])))))
 
     @cached_property
     def differences(self) -> dict[str, Estimate]:
-        """By `Arrow.run`, what the whole has above that without the arrow, by its `METRIC`, in nats a frame."""
+        """{`AblatedEdge.run`: `METRIC` of the whole minus `METRIC` without the edge, in nats per frame}."""
         if self.comparison is None:
             return {}
-        fitted = [arrow for arrow in self.arrows if arrow.run in self.comparison.rows]
-        return {arrow.run: self.comparison.difference(WHOLE, arrow.run, METRIC[arrow.kind]) for arrow in fitted}
+        fitted = [edge for edge in self.edges if edge.run in self.comparison.rows]
+        return {edge.run: self.comparison.difference(WHOLE, edge.run, METRIC[edge.kind]) for edge in fitted}
 
     @property
     def p_values(self) -> dict[str, float]:
-        """By `Arrow.run`, of no difference, for all arrows at once; NaN of one seed or one clip."""
+        """{`AblatedEdge.run`: p-value of no difference, adjusted for all edges}; NaN with a single seed or clip."""
         adjusted = holm([estimate.p_value() for estimate in self.differences.values()])
         return dict(zip(self.differences, map(float, adjusted), strict=True))
 
     def table(self) -> Table:
-        """A line for each arrow."""
+        """Return a table with a line for each edge."""
         sizes = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
-        twins = len(next(iter(self.prices.values()), ()))
+        surrogates = len(next(iter(self.costs.values()), ()))
         lines = [
-            f"twin: mean (least to largest) of {twins} linear-Gaussian models of {self.steps} steps, sizes {sizes};",
-            "of the model the evidence lost, of the guide the gap that is wider, in nats a sequence",
+            f"surrogate: mean (least to largest) of {surrogates} linear-Gaussian models of {self.steps} steps, sizes "
+            f"{sizes};",
+            "lost evidence of the model, or increase of the gap of the guide, in nats a sequence",
         ]
         if self.comparison is not None:
             lines += [
-                f"fitted: what the whole has more, of the model in the bound of K = {self.comparison.particles}, of "
-                f"the guide in the ELBO, in nats a {self._frame},",
-                "± standard errors over clips ± over seeds; 95 % from both; p: for all arrows at once (Holm)",
+                f"fitted: loss without the edge, for the model in the IWAE bound with K = {self.comparison.particles}, "
+                f"for the guide in the ELBO, in nats a {self._frame},",
+                "± standard errors over clips ± over seeds; 95 % from both; p: adjusted for all edges (Holm)",
             ]
         table = Table(title=f"{self.generative.text}\n{self.inference.text}".strip(), caption="\n".join(lines))
         columns = ("fitted", "95 %", "p") if self.comparison is not None else ()
-        for name in ("arrow", "of", "twin", *columns, *(["note"] if self.notes else [])):
-            table.add_column(name, justify="right" if name in ("twin", *columns) else "left", overflow="fold")
-        for arrow in self.arrows:
-            costs = np.array(self.prices[arrow.run])
+        for name in ("edge", "of", "surrogate", *columns, *(["note"] if self.notes else [])):
+            table.add_column(name, justify="right" if name in ("surrogate", *columns) else "left", overflow="fold")
+        for edge in self.edges:
+            costs = np.array(self.costs[edge.run])
             cells = [f"{number(costs.mean())} ({number(costs.min())} to {number(costs.max())})"]
-            if columns and (found := self.differences.get(arrow.run)) is not None:
+            if columns and (found := self.differences.get(edge.run)) is not None:
                 low, high = map(number, found.interval())
-                cells += [str(found), low if low == "–" else f"{low} to {high}", number(self.p_values[arrow.run])]
+                cells += [str(found), low if low == "–" else f"{low} to {high}", number(self.p_values[edge.run])]
             elif columns:
                 cells += ["–"] * 3
-            table.add_row(arrow.name, arrow.of, *cells, *([self.notes.get(arrow.run, "")] if self.notes else []))
+            table.add_row(edge.name, edge.of, *cells, *([self.notes.get(edge.run, "")] if self.notes else []))
         return table
 
     def plot(self) -> Figure:
-        """Model and guide of one step, arrows as thick as their price: on twins and, where there are fits, on data."""
+        """Draw model and guide of one step, with edges as wide as their cost, on surrogates and on data (if fitted)."""
         parts = [part for part in (self.generative, self.inference) if part.factors]
-        on_twins = {run: float(np.mean(costs)) for run, costs in self.prices.items()}
-        rows: list[tuple[str, dict[str, float], set[str]]] = [("nats a sequence, on twins", on_twins, set())]
+        on_surrogates = {run: float(np.mean(costs)) for run, costs in self.costs.items()}
+        rows: list[tuple[str, dict[str, float], set[str]]] = [("nats a sequence, on surrogates", on_surrogates, set())]
         if self.comparison is not None:
             fitted = {run: estimate.mean for run, estimate in self.differences.items()}
             unsure = {run for run, p in self.p_values.items() if not p < LEVEL}
             rows.append((f"nats a {self._frame}, on data\n(pale: p ≥ {LEVEL})", fitted, unsure))
-        figure = canvas(5 * len(parts), 3.6 * len(rows))
+        figure = new_figure(5 * len(parts), 3.6 * len(rows))
         panels = figure.subplots(len(rows), len(parts), squeeze=False)
         for (unit, costs, pale), row in zip(rows, panels, strict=True):
             top = max(costs.values(), default=0.0)
             for part, panel in zip(parts, row, strict=True):
                 graph = part.slice(self.observed)
-                runs = {edge[:2]: arrow_of(part, *edge[2]).run for edge in graph.edges.data("arrow")}
+                runs = {edge[:2]: edge_of(part, *edge[2]).run for edge in graph.edges.data("edge")}
                 of_edges = {edge: costs[run] for edge, run in runs.items() if run in costs}
                 draw_slice(graph, of_edges, panel, top, [edge for edge, run in runs.items() if run in pale])
                 panel.set_title(f"{'model' if part.kind == 'p' else 'guide'}: {unit}", fontsize=10)
@@ -204,12 +205,12 @@ class Ablation(Result):
 
     @property
     def _frame(self) -> str:
-        """What bounds are per."""
-        return called(self.comparison.data)[1] if self.comparison is not None else ""
+        """Name of a time step: bounds are per such step."""
+        return axis_names(self.comparison.data)[1] if self.comparison is not None else ""
 
     @property
     def observed(self) -> tuple[str, ...]:
-        """What the model draws and the guide does not."""
+        """Variables of the model that the guide does not draw."""
         return tuple(name for name in self.generative.variables if name not in self.inference.variables)
 
     @override
@@ -219,39 +220,42 @@ class Ablation(Result):
 
     @override
     def check(self) -> None:
-        runs = {arrow.run for arrow in arrows_of(self.generative, self.inference)}
+        runs = {edge.run for edge in edges_of(self.generative, self.inference)}
         fitted = set() if self.comparison is None else self.comparison.rows.keys() - {WHOLE}
-        if self.prices.keys() != runs or not runs >= self.notes.keys() | fitted:
-            raise ValueError("prices, notes or fits name other edges than those of the equations")
-        counts = {len(costs) for costs in self.prices.values()}
+        if self.costs.keys() != runs or not runs >= self.notes.keys() | fitted:
+            raise ValueError("costs, notes or fits name edges that are not in the equations; give one cost per edge")
+        counts = {len(costs) for costs in self.costs.values()}
         if len(counts) > 1 or not all(0 < count <= MOST for count in counts):
-            raise ValueError(f"every arrow has a price in each of the same 1 to {MOST} random models")
-        if not all(np.isfinite(costs).all() for costs in self.prices.values()):
-            raise ValueError("a price is finite")
+            raise ValueError(
+                f"the edges have {', '.join(map(str, sorted(counts)))} costs; every edge must have a cost on each of "
+                f"the same 1 to {MOST} surrogates"
+            )
+        if not all(np.isfinite(costs).all() for costs in self.costs.values()):
+            raise ValueError("costs must be finite")
         if self.comparison is not None:
             self.comparison.check()
-        self.table()  # of a comparison that has the whole and all that its table needs
+        self.table()  # fails if the comparison does not contain the whole and all values of the table
 
 
-def arrows_of(generative: Factorization, inference: Factorization) -> tuple[Arrow, ...]:
-    """Every arrow of a model and of its guide."""
-    return tuple(arrow_of(part, *arrow) for part in (generative, inference) for arrow in part.arrows)
+def edges_of(generative: Factorization, inference: Factorization) -> tuple[AblatedEdge, ...]:
+    """Return every edge of a model and of its guide."""
+    return tuple(edge_of(part, *edge) for part in (generative, inference) for edge in part.edges)
 
 
-def arrow_of(part: Factorization, child: str, parent: Parent) -> Arrow:
-    """One of them."""
-    return Arrow(part.kind, child, parent, part.arrow(child, parent))
+def edge_of(part: Factorization, child: str, parent: Parent) -> AblatedEdge:
+    """Return one edge of a model or of its guide."""
+    return AblatedEdge(part.kind, child, parent, part.describe_edge(child, parent))
 
 
 def as_equations(method: Method | tuple[str, str], schema: Schema | None = None) -> Equations:
-    """A method as equations with networks of one kind, its options where these have them.
+    """Return a method as `Equations`, with networks of one kind and the options that both have.
 
     Args:
         method: one of `FAMILY`, `equations`, or a pair of equations (generative, inference).
-        schema: of the data, whose covariates factors read as those of the method do.
+        schema: schema of the data, whose covariates the factors read as in the method.
 
     Raises:
-        ValueError: a method that is more than its equations.
+        ValueError: the method is not defined by its equations alone, or sums out a latent.
     """
     if isinstance(method, tuple):
         generative, inference = method
@@ -259,18 +263,18 @@ def as_equations(method: Method | tuple[str, str], schema: Schema | None = None)
     if isinstance(method, Equations):
         if method.states:
             raise ValueError(
-                f"{', '.join(method.states)} is summed out, and twins with states have no price that is known; fit the "
-                "reduced equations by a sweep (--grid), and compare them"
+                f"{', '.join(method.states)} is summed out, and the cost of an edge is unknown for surrogates with "
+                "discrete states; fit the reduced equations with a sweep (--grid), and compare them"
             )
         return method
     if method.name not in FAMILY:
         raise ValueError(
-            f"{method.name} is more than its equations, with networks that are made for the arrows it has; an ablation "
-            f"is of {', '.join(FAMILY)}, which are fitted with networks of one kind, or of equations: "
+            f"{method.name} is more than its equations: its networks are designed for its edges; ablate one of "
+            f"{', '.join(FAMILY)}, which can be fitted with networks of one kind, or equations: "
             "dvae.method('equations', generative=…, inference=…)"
         )
     covariates = ((), ()) if schema is None else schema.covariates
-    pair = [part.given(*covariates, getattr(method, "apart", ())) for part in method.equations()]
+    pair = [part.given(*covariates, getattr(method, "without_covariates", ())) for part in method.equations()]
     known = {option.name for option in fields(Equations)} - {"generative", "inference", "latents"}
     options = {name: value for name, value in vars(method).items() if name in known and value is not None}
     sizes = {name: size for name, size in method.sizes().items() if size != options.get("latent")}
@@ -288,93 +292,93 @@ def ablate(
     observed: Sequence[str] = ("x",),
     sizes: Mapping[str, int] | None = None,
     steps: int = 5,
-    twins: int = 5,
+    surrogates: int = 5,
     bound_particles: int = 64,
     seed: int = 0,
     progress: bool = True,
 ) -> Ablation:
-    """Prices every arrow of a model and of its guide, left out in turn: on linear-Gaussian twins, and on data.
+    """Return the cost of every edge of a model and of its guide, on linear-Gaussian surrogates and on data.
 
-    Without data it is the twins alone. With data, one run for the whole and one for each arrow are fitted with each
-    seed, and compared on the test windows. The same call again continues what was stopped, and leaves finished runs as
-    they are. A model without one of its arrows keeps the guide that is written; a guide that is "faithful" is derived
-    anew.
+    Without data, costs are computed on the surrogates only. With data, the whole and the equations without each edge
+    are fitted with each seed, and compared on the test windows. The same call continues interrupted runs and keeps
+    finished ones. The guide stays the same if a model loses an edge; only a "faithful" guide is derived again.
 
     Args:
         method: one of vae, dkf, storn, vrnn, srnn, rvae-causal, rvae-noncausal, dsae and autoregressive, whose
             equations are fitted with networks of one kind; `equations`; or a pair of equations (generative,
-            inference), with the options that `equations` has by default.
-        data: with windows to train, validate and test on, such as `dvae.motion.MotionData` or `dvae.tables.PanelData`.
-        out: where the run directories go.
-        seeds: of the runs of each arrow.
-        training: options of the runs, or some of them beside those of `equations`.
-        jobs: runs at a time.
-        observed: names of the observed variables where there are no data, which else name them.
-        sizes: of the variables of the twins; by default 2 of data and 1 of others.
-        steps: T of the twins.
-        twins: random models on which arrows are priced.
-        bound_particles: of the importance-weighted bound.
-        seed: of the draws of that bound.
+            inference), with the default options of `equations`.
+        data: data with training, validation and test windows, such as `dvae.motion.MotionData` or
+            `dvae.tables.PanelData`.
+        out: directory for the run directories.
+        seeds: seeds of the runs of each edge.
+        training: all training options of the runs, or those that replace the defaults of `equations`.
+        jobs: number of runs in parallel.
+        observed: names of the observed variables, if there are no data.
+        sizes: sizes of the variables of the surrogates; by default 2 for data and 1 for others.
+        steps: number T of time steps of the surrogates.
+        surrogates: number of random surrogates.
+        bound_particles: number of particles of the IWAE bound.
+        seed: seed of the draws of the IWAE bound.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: a method that is more than its equations; data without `out`; a latent that the guide
-            does not draw; as `sweep`, `price` and `compare`.
-        RuntimeError: a run has failed; the same call tries it again.
+        ValueError: the method is not defined by its equations alone; data without `out`; the guide does not draw a
+            latent; as in `sweep`, `kl_gap` and `compare`.
+        RuntimeError: a run failed; the same call retries it.
         SweepInterrupted: after Ctrl-C or SIGTERM.
 
     Example:
-        >>> found = dvae.ablate(("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"), steps=3, twins=1)
-        >>> len(found.arrows), found.arrows[-1].of, found.arrows[-1].name
+        >>> found = dvae.ablate(("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"), steps=3, surrogates=1)
+        >>> len(found.edges), found.edges[-1].of, found.edges[-1].name
         (6, 'guide', 'x_{<t} to z_t')
     """
     if (data is None) != (out is None):
-        raise ValueError("fits need data, and a directory for their runs: give both `data` and `out`, or none of them")
+        raise ValueError("fits need data and a directory for their runs; give both `data` and `out`, or neither")
     whole = as_equations(method, None if data is None else data.schema)
     model, read = whole.equations()
     if data is None:
         check_pair(model, read, observed)
     observed = tuple(name for name in model.variables if name not in read.variables)
     known = dict(sizes or {**ones(model, read), **dict.fromkeys(observed, 2)})
-    arrows = arrows_of(model, read)
+    edges = edges_of(model, read)
     parts = {"p": model, "q": read}
-    less = {arrow: parts[arrow.kind].without(arrow.child, arrow.parent) for arrow in arrows}
+    less = {edge: parts[edge.kind].without(edge.child, edge.parent) for edge in edges}
 
-    of_twins = known, steps, twins, observed
-    prices: dict[str, np.ndarray] = {}
+    of_surrogates = known, steps, surrogates, observed
+    costs: dict[str, np.ndarray] = {}
     with progress_bar(progress) as bar:
-        gaps = price(model, read, *of_twins)
-        for arrow in bar.track(arrows, description="prices on twins"):
-            if arrow.kind == "p":
-                costs = model_price(model, less[arrow], *of_twins)
+        gaps = kl_gap(model, read, *of_surrogates)
+        for edge in bar.track(edges, description="costs on surrogates"):
+            if edge.kind == "p":
+                cost = model_kl_gap(model, less[edge], *of_surrogates)
             else:
-                costs = price(model, less[arrow], *of_twins) - gaps
-            prices[arrow.run] = costs.numpy()
+                cost = kl_gap(model, less[edge], *of_surrogates) - gaps
+            costs[edge.run] = cost.numpy()
 
     notes = {
-        arrow.run: f"no data depend on {', '.join(sorted(idle))} then"
-        for arrow in arrows
-        if arrow.kind == "p" and (idle := _idle(less[arrow], observed) - _idle(model, observed))
+        edge.run: f"without it, no data depend on {', '.join(sorted(idle))}"
+        for edge in edges
+        if edge.kind == "p" and (idle := _idle(less[edge], observed) - _idle(model, observed))
     }
-    found = Ablation({"generative": model.text, "inference": read.text}, known, steps, prices, notes)
+    found = Ablation({"generative": model.text, "inference": read.text}, known, steps, costs, notes)
     if data is None or out is None:
         return found
     named: dict[str, Method] = {WHOLE: whole}
     whole.build(data.schema)
-    for arrow in arrows:
+    for edge in edges:
         try:
-            changed: dict[str, Any] = {"generative" if arrow.kind == "p" else "inference": less[arrow].text}
+            changed: dict[str, Any] = {"generative" if edge.kind == "p" else "inference": less[edge].text}
             reduced = replace(whole, **changed)
             reduced.build(data.schema)
         except ValueError as error:
-            notes[arrow.run] = f"not fitted: {error}"
+            notes[edge.run] = f"not fitted: {error}"
         else:
-            named[arrow.run] = reduced
+            named[edge.run] = reduced
     told = training if isinstance(training, Training) else {"progress": progress, **(training or {})}
     results = sweep(named, data, out, seeds, training_of(whole, data, told), jobs)
     if failed := [str(result) for result in results if result.status not in ENDED]:
         raise RuntimeError(
-            "\n".join([f"{len(failed)} of {len(results)} runs failed; the same again tries them anew", *failed])
+            "\n".join([f"{len(failed)} of {len(results)} runs failed; the same call retries them", *failed])
         )
     comparison = compare(
         {name: [load(Path(out) / f"{name}-seed{each}").model for each in seeds] for name in named},
@@ -390,7 +394,7 @@ def ablate(
 
 
 def _idle(model: Factorization, observed: tuple[str, ...]) -> set[str]:
-    """Latents on which no data depend."""
+    """Return the latents on which no data depend."""
     reads = nx.DiGraph([(parent.name, factor.child) for factor in model.factors for parent in factor.parents])
     reads.add_nodes_from(model.variables)
     return {*model.variables}.difference(observed, *(nx.ancestors(reads, name) for name in observed))

@@ -1,8 +1,8 @@
-"""Runs of methods on data: resume and load a run directory, which says all it takes to do so.
+"""Load and resume runs from their directories.
 
-`config.json` of such a run (format 2) holds the method with its options; the schema of the data, from which the model
-is built again without them; where the data were, with the fingerprint of their content; and the options of training. A
-relative path stays relative, so that a project folder can be moved.
+`config.json` of a run (format 2) contains the method with its options, the schema of the data, the path of the data
+with the fingerprint of their content, and the training options. The model is rebuilt from the schema, without the data.
+A relative path stays relative, so a project folder can be moved.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from ..inference.training.schedules import from_config as option_from_config
 from ..inference.training.trackers import Tracker
 from ..models.registry import configured
 from ..options import flat
-from .kinds import DATA, SCHEMAS, Dataset, opened
+from .kinds import DATA, SCHEMAS, Dataset, open_data
 
 
 @dataclass(frozen=True)
 class Config:
-    """What `config.json` of a run says.
+    """Content of `config.json` of a run.
 
     Args:
-        method: with its options.
-        schema: of the data.
-        kind: of the data.
-        data: where they were, as they `recorded` it.
-        training: how it was fitted.
+        method: method with its options.
+        schema: schema of the data.
+        kind: kind of the data.
+        data: source of the data, as returned by `Dataset.recorded`.
+        training: training options.
     """
 
     method: Trainable
@@ -49,19 +49,19 @@ class Config:
     training: Training
 
     def written(self) -> dict[str, Any]:
-        """Return it in JSON's types, but for the training, which `fit` adds."""
+        """Return the config in JSON's types, without the training options, which `fit` adds."""
         return run_config(self.method, self.schema, self.kind, self.data)
 
 
 @dataclass
 class Loaded:
-    """A run, read back: `loaded.model.forecast(...)`, `loaded.data.windows("test")`.
+    """A loaded run, as in `loaded.model.forecast(...)` and `loaded.data.windows("test")`.
 
     Args:
-        path: the run directory.
-        config: what it says.
-        model: the model with the run's best weights, in evaluation mode.
-        where: path of the data, if the one in the run no longer leads there.
+        path: run directory.
+        config: content of its `config.json`.
+        model: model with the run's best weights, in evaluation mode.
+        where: path of the data, if the path in the run is no longer valid.
     """
 
     path: Path
@@ -71,32 +71,32 @@ class Loaded:
 
     @property
     def method(self) -> Any:
-        """The method with its options."""
+        """Method with its options."""
         return self.config.method
 
     @property
     def schema(self) -> Any:
-        """Of the data that it was fitted on."""
+        """Schema of the data that the run was fitted on."""
         return self.config.schema
 
     @cached_property
     def data(self) -> Any:
-        """The data that it was fitted on, opened when they are first asked for.
+        """Data that the run was fitted on, opened at first use.
 
         Raises:
-            CheckpointError: they are not here, or have changed.
+            CheckpointError: the data are missing or have changed.
         """
-        return opened(self.path, self.config.kind, self.config.data, self.schema, self.where)
+        return open_data(self.path, self.config.kind, self.config.data, self.schema, self.where)
 
     @property
     def failed(self) -> bool:
-        """Whether the weights are of a fit that failed or has not made a step."""
+        """Whether the fit failed or has made no step."""
         state = Run(self.path).state
         return state["status"] == "failed" or (state["step"] == 0 and state["status"] not in ENDED)
 
     @property
     def unfinished(self) -> str:
-        """A sentence on a run that has not ended; "" for one that has."""
+        """Sentence that describes an unfinished run; "" for a finished one."""
         state = Run(self.path).state
         if state["status"] in ENDED:
             return ""
@@ -105,19 +105,19 @@ class Loaded:
         return f"{self.path} has not ended ({reached}){initial}; {advice(self.path)}"
 
     def alike(self, other: Loaded) -> bool:
-        """Whether another run was fitted on the same windows of the same data, whatever the models see of them."""
+        """Return whether another run was fitted on the same windows of the same data, regardless of its view."""
         data, others = self.config.data.fingerprint, other.config.data.fingerprint
         return bool(data == others and self.schema.windows == other.schema.windows)
 
-    def on(self, path: str | os.PathLike[str], **read: Any) -> Any:
-        """Other data of the same kind, under the run's schema.
+    def with_data(self, path: str | os.PathLike[str], **read: Any) -> Any:
+        """Open other data of the same kind under the run's schema.
 
         Args:
-            path: where they are.
-            **read: fields of the run's source that are others for them, such as missing=True.
+            path: path of the other data.
+            **read: fields of the run's source to replace, such as missing=True.
 
         Raises:
-            ValueError: data with another schema, such as other joints.
+            ValueError: the data have another schema, such as other joints.
         """
         other = DATA[self.config.kind].reopened(replace(self.config.data, **read), self.schema, path)
         here, there = (dict(flat(schema.config())) for schema in (self.schema, other.schema))
@@ -129,7 +129,7 @@ class Loaded:
 
 
 def advice(path: str | os.PathLike[str]) -> str:
-    """Return how a run is continued: after a failure, which the same steps would repeat, at a lower learning rate."""
+    """Return how to continue a run: after a failure at a lower learning rate, as the same steps would fail."""
     run = Run(path)
     if run.state["status"] != "failed":
         return f"continue it with: dvae resume {path}"
@@ -139,7 +139,7 @@ def advice(path: str | os.PathLike[str]) -> str:
 
 
 def training_of(method: Trainable, data: Dataset, training: Training | Mapping[str, Any] | None) -> Training:
-    """How a method is fitted to data: as is said, or by the method's own options but for those that are said."""
+    """Return the training options of a method for data: `training`, or the method's own with those in `training`."""
     return training if isinstance(training, Training) else replace(method.training(data.schema), **(training or {}))
 
 
@@ -150,23 +150,23 @@ def resume(
     callbacks: Sequence[Callback] = (),
     **options: Any,
 ) -> Fit:
-    """Continues a run from its last checkpoint, under the options it was started with.
+    """Continue a run from its last checkpoint with its original options.
 
-    What is a share of the run, the falling end of the learning rate and the rise of self-feeding, is laid out anew
-    over other steps.
+    If the number of steps changes, schedules that cover a share of the run are stretched accordingly: the decay of the
+    learning rate and the rise of scheduled sampling.
 
     Args:
-        path: the run directory.
-        data: where the data lie now, if the path in the run no longer leads there.
+        path: run directory.
+        data: where the data are now, if the path in the run is no longer valid.
         trackers: further receivers of the log's rows.
-        callbacks: hooks of the loop.
+        callbacks: hooks of the training loop.
         **options: options of `Training` to change, such as steps=4000 for a longer run.
 
     Raises:
-        CheckpointError: no run, a damaged one, or one whose data have changed.
+        CheckpointError: the run is missing or damaged, or its data have changed.
     """
     run = _load(path, data)
-    training = replace(run.config.training, self_feeding=0.0, **options)
+    training = replace(run.config.training, scheduled_sampling=0.0, **options)
     train, validation = run.data.windows("train"), run.data.windows("validation")
     recipe = run.config.method.train(train, validation, training.steps)
     told: dict[str, Any] = {"out": path, "config": run.config.written(), "trackers": trackers, "callbacks": callbacks}
@@ -174,16 +174,16 @@ def resume(
 
 
 def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Loaded:
-    """Reads a run back: method, and model with its best weights; its data when they are asked for.
+    """Load a run: its method, and its model with the best weights. Its data are opened at first use.
 
-    Warns of a run that failed or has not made a step.
+    Warns if the run failed or has made no step.
 
     Args:
-        path: the run directory, as `dvae fit` writes it.
-        data: where the data lie now, if the path in the run no longer leads there.
+        path: run directory, as `dvae fit` writes it.
+        data: where the data are now, if the path in the run is no longer valid.
 
     Raises:
-        CheckpointError: no run, or a damaged one.
+        CheckpointError: the run is missing or damaged.
 
     Example:
         >>> import tempfile
@@ -197,7 +197,7 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
     """
     loaded = _load(path, data)
     if loaded.failed:
-        warnings.warn(loaded.unfinished, stacklevel=3)  # `alone` is between
+        warnings.warn(loaded.unfinished, stacklevel=3)  # `serialized` is between
     return loaded
 
 
@@ -210,13 +210,13 @@ def _load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None) -> 
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:
-    """Reads and checks the config of a run.
+    """Read and check the config of a run.
 
     Args:
-        path: the run directory.
+        path: run directory.
 
     Raises:
-        CheckpointError: no run, or a damaged one.
+        CheckpointError: the run is missing or damaged.
     """
     run = Run(path)
     with reading_config(path):
@@ -228,8 +228,8 @@ def read_config(path: str | os.PathLike[str]) -> Config:
             )
         schema, source, training = dict(config["schema"]), dict(config["data"]), config["training"]
         kind, described = source.pop("kind"), schema.pop("kind")
-        if described != DATA[kind].described:
-            raise ValueError(f"data of the kind {kind!r} are {DATA[kind].described}, not {described!r}")
+        if described != DATA[kind].schema_kind:
+            raise ValueError(f"data of the kind {kind!r} are {DATA[kind].schema_kind}, not {described!r}")
         return Config(
             configured(config["method"]),
             SCHEMAS[described].from_config(schema),
@@ -241,15 +241,15 @@ def read_config(path: str | os.PathLike[str]) -> Config:
 
 @contextmanager
 def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
-    """What fails within it is the config of a run."""
+    """Raise errors in the block as a `CheckpointError` about the config of a run."""
     try:
         yield
     except (CheckpointError, OSError):
         raise
-    except Exception as error:  # a method of somebody else's may fail in any way at options that are not its own
-        what = f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
+    except Exception as error:  # a third-party method may raise any error for unknown options
+        what = f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
         raise CheckpointError(
-            f"{Path(path) / CONFIG} does not tell method, schema, data and training of a run "
+            f"{Path(path) / CONFIG} does not describe method, schema, data and training of a run "
             f"({what[:400]}{'…' * (len(what) > 400)}); it is damaged, or was not written by `dvae fit` with these "
-            "methods"
+            "methods; fit again"
         ) from error

@@ -1,23 +1,23 @@
-"""Grids: what a sweep fits, as a file says it; named pairs of equations and methods, with options and their values.
+"""Grids: files that list what a sweep fits, as named pairs of equations and methods with values of their options.
 
     seeds = [0, 1, 2]
 
-    [training]                       # of all runs, where it is not each method's own
+    [training]                       # for all runs, in place of each method's defaults
     steps = 2000
 
-    [filter]                         # where no method is named, a pair of equations
+    [filter]                         # without a method: a pair of equations
     generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
     inference = "q(z_t | z_{t-1}, x_{<=t})"
 
     [smoother]
     generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
     inference = "faithful"
-    each.latent = [8, 16]            # a run for each value, and for each combination where there are several
+    each.latent = [8, 16]            # one run for each value, or for each combination of several options
 
     [srnn]
     method = "srnn"
 
-The file is TOML, at most a mebibyte long. Run directories have the names of the file, with the options that vary:
+The file is TOML of at most one mebibyte. Run directories have the names in the file and the options that vary, such as
 smoother-latent=8-seed0.
 """
 
@@ -39,23 +39,23 @@ from ..models.method import Method
 from ..options import nearest, tuples
 
 LARGEST = 2**20
-"""Bytes of a grid."""
+"""Maximum size of a grid in bytes."""
 MOST = 1000
-"""Methods of a grid, with all their options, and seeds."""
+"""Maximum number of methods in a grid, counted with all combinations of their options, and of seeds."""
 NAME = r"\w[\w.=+-]{0,199}"
-"""Of a run directory, before its seed."""
+"""Pattern of the name of a run directory without its seed."""
 SEEDS, TRAINING, METHOD, EACH = "seeds", "training", "method", "each"
 EQUATIONS = "equations"
 
 
 @dataclass(frozen=True)
 class Grid:
-    """What a file says.
+    """Content of a grid file.
 
     Attributes:
-        methods: name to method with its options.
-        seeds: of the runs of each; None where the file has none.
-        training: options that are not each method's own.
+        methods: {name: method with its options}.
+        seeds: seeds of the runs of each method; None if the file has none.
+        training: training options that replace each method's defaults.
     """
 
     methods: dict[str, Method]
@@ -64,25 +64,26 @@ class Grid:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], options: Mapping[str, Any] | None = None) -> Self:
-        """From a file.
+        """Read a grid from a file.
 
         Args:
-            path: of the TOML file.
-            options: of all methods, where the file says nothing else.
+            path: path of the TOML file.
+            options: options of all methods, unless the file gives others.
 
         Raises:
-            ValueError: no TOML, or what is no grid, naming the table; methods, options or values that there are not.
+            ValueError: the file is not TOML or not a grid, or a method, option or value is unknown; the message names
+                the table.
             FileRefused, OSError: the file cannot be read, or is too large.
         """
         text = files.read(path, LARGEST, links=True)
         try:
             told = tomllib.loads(text.decode("utf-8"))
-        except (ValueError, RecursionError) as error:  # of TOML, of UTF-8, of numbers and nesting without end
+        except (ValueError, RecursionError) as error:  # bad TOML or UTF-8, too long numbers, too deep nesting
             raise ValueError(f"{path} is not TOML in UTF-8: {error}") from error
         seeds, training = told.pop(SEEDS, None), told.pop(TRAINING, {})
         if seeds is not None and not _are_seeds(seeds):
             raise ValueError(
-                f"{path}: seeds are some whole numbers, each once, such as [0, 1, 2], not {reprlib.repr(seeds)}"
+                f"{path}: seeds is {reprlib.repr(seeds)}; it must list distinct whole numbers, such as [0, 1, 2]"
             )
         try:
             training = tuples(_training(training))
@@ -93,7 +94,9 @@ class Grid:
         methods: dict[str, Method] = {}
         for name, table in told.items():
             if not isinstance(table, dict):
-                raise ValueError(f"{path}: {name} = {table!r} is in no table; of all runs are seeds and [training]")
+                raise ValueError(
+                    f"{path}: {name} = {table!r} is in no table; only seeds and [training] apply to all runs"
+                )
             try:
                 found = _methods(name, table, options or {}, MOST - len(methods))
                 if twice := found.keys() & methods.keys():
@@ -110,28 +113,28 @@ def _are_seeds(told: Any) -> bool:
 
 
 def _training(told: Any) -> dict[str, Any]:
-    """Options of the training of all runs.
+    """Return the checked training options of all runs.
 
     Raises:
-        TypeError, ValueError: something else, or what is no option, or none of a sweep.
+        TypeError, ValueError: `told` is not a table, or an option is unknown, wrong, or not available in a sweep.
     """
     if not isinstance(told, dict):
-        raise ValueError(f"it is a table, of options such as steps, not {reprlib.repr(told)}")
+        raise ValueError(f"it must be a table of options such as steps, got {reprlib.repr(told)}")
     known = {option.name for option in fields(Training)} - {"seed", "devices"}
     for name in told:
         if name not in known:
-            said = "; seeds = [...] says it" if name == "seed" else nearest(name, known)
-            raise ValueError(f"there is no option {name!r} of all runs{said}")
+            said = "; give seeds = [...] instead" if name == "seed" else nearest(name, known)
+            raise ValueError(f"unknown training option {name!r} of a sweep{said}")
     Training(**told)
     return told
 
 
 def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], room: int) -> dict[str, Method]:
-    """The methods of a table, by what they are called."""
+    """Return the methods of a table by name."""
     own = {**options, **table}
     kind, each = own.pop(METHOD, EQUATIONS), own.pop(EACH, {})
     if not isinstance(kind, str) or not isinstance(each, dict):
-        raise ValueError("method is a name, and each a table of options with lists of values")
+        raise ValueError("`method` must be a name, and `each` a table of options with lists of values")
     count = 1
     for option, values in each.items():
         if not isinstance(values, list) or not values:
@@ -140,7 +143,7 @@ def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], ro
             raise ValueError(f"each.{option} has a value twice: {reprlib.repr(values)}")
         count *= len(values)
     if count > room:
-        raise ValueError(f"with {count} methods more the grid has over {MOST}; leave some values out")
+        raise ValueError(f"{count} more methods exceed the maximum of {MOST} in a grid; leave some values out")
     found = {}
     for values in product(*each.values()):
         varied = dict(zip(each, values, strict=True))
@@ -150,8 +153,8 @@ def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], ro
         label = "-".join([name, *labels])
         if not re.fullmatch(NAME, label):
             raise ValueError(
-                f"{reprlib.repr(label)} is to be the name of run directories, at most 200 letters, digits and -_.=+; "
-                "give values that are texts a table each"
+                f"{reprlib.repr(label)} cannot name run directories; names have at most 200 letters, digits and "
+                "-_.=+; give each text value its own table"
             )
         found[label] = method
     return found

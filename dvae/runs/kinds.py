@@ -1,4 +1,4 @@
-"""Kinds of data that runs are fitted on, and of their schemas: known by name, and loaded when they are used."""
+"""Kinds of data that runs are fitted on, and of their schemas: registered by name, and imported at first use."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ DATA = Registry(
     },
     "dvae.data",
 )
-"""Kinds of schemas and of data, by the name that a config gives them."""
+"""Kinds of schemas and of data, by their name in a config."""
 
 
 class Dataset(Protocol):
     """Data that runs are fitted on, such as `dvae.motion.MotionData`."""
 
     kind: ClassVar[str]
-    described: ClassVar[str]
-    """The kind of their schema."""
+    schema_kind: ClassVar[str]
+    """Kind of the schema."""
     source: ClassVar[type[Any]]
-    """What `recorded` is: a dataclass of JSON's types with at least a path and a fingerprint, which a run keeps."""
+    """Type returned by `recorded`: a dataclass of JSON's types with at least a path and a fingerprint."""
 
     @classmethod
     def open(cls, path: str, *, skip_bad: bool = False, **options: Any) -> Self:
-        """Reads a file, with options of this kind, which the command line gives."""
+        """Read a file, with the options of this kind from the command line."""
 
     @property
     def location(self) -> str:
-        """Where they are, as any process finds them."""
+        """Path of the data that is valid in any process."""
 
     @property
     def fingerprint(self) -> str:
@@ -52,41 +52,41 @@ class Dataset(Protocol):
 
     @property
     def schema(self) -> Schema:
-        """What a model must know of them."""
+        """Schema of the data; models are built with it."""
 
     def windows(self, split: str) -> Any:
-        """The sequences of "train", "validation" or "test"."""
+        """Return the windows of "train", "validation" or "test"."""
 
     def recorded(self) -> Any:
-        """Where they are."""
+        """Return the source of the data, which a run stores."""
 
     @classmethod
     def reopened(cls, source: Any, schema: Any, path: str | os.PathLike[str] | None = None) -> Self:
-        """The data that were recorded, from there or from another path, whatever they are now."""
+        """Open recorded data from their own or another path, without a check of their content."""
 
 
-def opened(
+def open_data(
     run: str | os.PathLike[str], kind: str, source: Any, schema: Any, where: str | os.PathLike[str] | None = None
 ) -> Any:
-    """The data of a run.
+    """Open the data of a run.
 
     Args:
-        run: its directory.
-        kind: of the data.
-        source: where they were, as they `recorded` it.
-        schema: of them.
-        where: they lie now.
+        run: run directory.
+        kind: kind of the data.
+        source: source of the data, as returned by `Dataset.recorded`.
+        schema: schema of the data.
+        where: path of the data now; by default the path in `source`.
 
     Raises:
-        CheckpointError: they are not there, or have changed.
+        CheckpointError: the data are missing or have changed.
     """
     where = os.fspath(where or source.path)
     try:
         found = DATA[kind].reopened(source, schema, where)
     except FileNotFoundError as error:
         raise CheckpointError(
-            f"{run} was fitted on {source.path}, but {where} is not here; relative paths count from the working "
-            "directory, so change to where it was fitted, or tell where the data lie now, or other data (--data)"
+            f"{run} was fitted on {source.path}, but {where} does not exist; relative paths start from the working "
+            "directory, so change to the directory of the fit, or give the path of these or other data (--data)"
         ) from error
     if found.fingerprint != source.fingerprint:
         raise CheckpointError(

@@ -1,6 +1,6 @@
 """Sweeps: methods x seeds fitted in parallel by joblib, one process and one torch thread per run.
 
-Every run has a directory of its own, as `dvae.fit` writes it, with the same weights bit for bit. The same call again
+Every run has its own directory, as `dvae.fit` writes it, with bit-for-bit the same weights. Calling `sweep` again
 continues a sweep: finished runs are skipped, others continue from their last checkpoint.
 """
 
@@ -27,18 +27,17 @@ from typing_extensions import override
 
 from .. import files
 from ..data.schema import Schema
-from ..inference.evaluation.result import Plain, Table, reason
+from ..inference.evaluation.result import PlainConsole, Table, error_message
 from ..inference.training.checkpoints import ENDED, Run
 from ..inference.training.fit import Callback, Fit, fit
 from ..inference.training.options import Training
-from ..inference.training.processes import by_torchrun
+from ..inference.training.processes import is_torchrun
 from ..inference.training.recipe import Trainable
 from ..inference.training.schedules import clamp
 from ..inference.training.svi import State
 from ..inference.training.trackers import LARGEST_LOG, JSONLines, row_of
 from ..models.method import Method
 from ..options import flat, require
-from ..turns import alone
 from .directory import read_config, resume, training_of
 from .kinds import Dataset
 
@@ -48,15 +47,15 @@ class Outcome:
     """A run of a sweep.
 
     Args:
-        path: the run directory.
-        method: the method with its options.
-        seed: of initial weights, batches and draws.
+        path: run directory.
+        method: method with its options.
+        seed: seed of initial weights, batches and draws.
         status: "finished", "stopped early", "interrupted" or "failed".
-        step: the last step.
-        best_bound: the best validation bound, in nats per frame, as in `Fit`.
-        best: what is best, where, in words.
-        seconds: that this sweep spent on the run; 0 where an earlier one has finished it.
-        error: why it failed.
+        step: last step.
+        best_bound: best validation bound, in nats per frame, as in `Fit`.
+        best: best validation value and its step, in words.
+        seconds: time that this sweep spent on the run; 0 if an earlier sweep finished it.
+        error: message of the error, if the run failed.
     """
 
     path: Path
@@ -77,17 +76,17 @@ class Outcome:
 
 
 class SweepInterrupted(KeyboardInterrupt):
-    """A sweep was stopped by Ctrl-C or SIGTERM. The same sweep, started again, continues.
+    """Error for a sweep stopped by Ctrl-C or SIGTERM; the same sweep, started again, continues.
 
     Args:
-        results: of the runs that have ended.
-        total: how many runs the sweep has.
+        results: results of the runs that have ended.
+        total: number of runs in the sweep.
         signal: number of the signal; a command line exits with 128 + signal.
     """
 
     def __init__(self, results: Sequence[Outcome], total: int, signal: int) -> None:
         ended = sum(result.status in ENDED for result in results)
-        super().__init__(f"interrupted with {ended} of {total} runs finished; the same sweep again continues them")
+        super().__init__(f"interrupted with {ended} of {total} runs finished; start the same sweep again to continue")
         self.results = results
         self.signal = signal
 
@@ -100,36 +99,37 @@ def sweep(
     training: Training | Mapping[str, Any] | None = None,
     jobs: int = 2,
 ) -> list[Outcome]:
-    """Fits each method with each seed, several runs at a time.
+    """Fit each method with each seed, several runs in parallel.
 
-    A run directory has the name of the method, the options in which methods of that name differ, and the seed, such as
-    srnn-z8-seed0. Runs are spread over processes of this machine, or as the caller's `joblib.parallel_config` says;
-    workers on other machines need the file system of `out`. Ctrl-C stops all runs at once; the same sweep continues
+    The name of a run directory contains the method, the options in which methods of that name differ, and the seed,
+    such as srnn-z8-seed0. Runs use processes of this machine, or the backend of the caller's `joblib.parallel_config`.
+    Workers on other machines need access to the file system of `out`. Ctrl-C stops all runs; the same sweep continues
     them from their last checkpoints.
 
     Args:
-        methods: with their options; a mapping gives them names of its own.
-        data: training and validation windows are taken from it.
-        out: where the run directories go.
-        seeds: of the runs of each method; `training` has none to tell.
-        training: the other options, or some of them beside each method's own. `progress` shows the runs: a table on a
-            terminal, or else a line as each starts and ends.
-        jobs: runs at a time; a cluster of joblib's has as many as workers.
+        methods: methods with their options; a mapping also gives their names.
+        data: data with training and validation windows.
+        out: directory for the run directories.
+        seeds: seeds of the runs of each method, which replace the seed in `training`.
+        training: all training options, or those that replace each method's defaults. `progress` shows the runs: a table
+            on a terminal, otherwise a line when each starts and ends.
+        jobs: number of runs in parallel; on a joblib cluster, the number of workers replaces it.
 
     Returns:
-        A result for each run, by seed and then by method, also for those that failed.
+        A result for each run, ordered by seed and then by method, including failed runs.
 
     Raises:
-        ValueError: nothing to fit, a run given twice, a run of other options in its directory, or no jobs.
-        CheckpointError: a damaged run.
+        ValueError: there is nothing to fit, a run is given twice, its directory contains a run with other options, or
+            `jobs` is 0.
+        CheckpointError: a run is damaged.
         SweepInterrupted: after Ctrl-C or SIGTERM.
 
     Example:
         methods = [dvae.method("srnn", latent=latent) for latent in (8, 16)]
         results = sweep(methods, MotionData.open("people.npz"), "runs", training=dvae.Training(steps=4000), jobs=4)
     """
-    if by_torchrun():
-        raise ValueError("a sweep starts processes itself; start it without torchrun")
+    if is_torchrun():
+        raise ValueError("a sweep starts its own processes; start it without torchrun")
     out = Path(out)
     source = data.location
     runs = [
@@ -144,12 +144,12 @@ def sweep(
         for name, method in _named(methods).items()
     ]
     if not runs or len({run.path for run in runs}) < len(runs):
-        raise ValueError(f"a sweep has at least one method and one seed, each once; seeds are {list(seeds)}")
+        raise ValueError(f"a sweep needs at least one method and one seed, each once, got seeds {list(seeds)}")
     require(int, jobs=jobs)
     if not jobs:
         raise ValueError("jobs is 0; it must be the number of runs at a time, or -1 for one per core")
     if devices := [run.training.devices for run in runs if run.training.devices != 1]:
-        raise ValueError(f"devices is {devices[0]}; a run of a sweep has one device, fit it alone for more")
+        raise ValueError(f"devices is {devices[0]}; a run of a sweep has one device; for more, use dvae.fit")
     results = {run.path: result for run in runs if (result := _earlier(run)) is not None}
     waiting = [run for run in runs if run.path not in results]
     notes: list[str] = []
@@ -173,13 +173,13 @@ def sweep(
     if stopped is not None:
         raise SweepInterrupted(given, len(runs), getattr(stopped, "signal", signal.SIGINT))
     if blind := [result.path for result in given if result.status in ENDED and not Run(result.path).exists]:
-        raise RuntimeError(f"a worker wrote {blind[0]} elsewhere; give a directory that all workers see")
+        raise RuntimeError(f"a worker wrote {blind[0]} elsewhere; give a directory that all workers can access")
     return given
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What a worker needs. Its working directory may be another, so paths are absolute."""
+    """Arguments of a worker. Paths are absolute, because a worker may have another working directory."""
 
     path: Path
     method: Method
@@ -189,17 +189,21 @@ class _Run:
 
 
 def _parallel(runs: Sequence[_Run], jobs: int) -> Iterator[tuple[Outcome, list[str]]]:
-    """Results in the order in which they come, with the warnings of each, by the backend that the caller has chosen."""
-    with _ignored_signals():  # by the workers, which joblib ends
+    """Yield results with their warnings as runs end, from the joblib backend that the caller has chosen."""
+    with _ignored_signals():  # for the workers, which joblib ends
         found: Iterator[Any] = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
             delayed(_fit)(run) for run in runs
         )
     yield from found
 
 
+_ONE_AT_A_TIME = threading.Lock()
+"""Lock held during a run: threads of one process share the caught warnings and torch's number of threads."""
+
+
 def _fit(run: _Run) -> tuple[Outcome, list[str]]:
     """Fit or resume a run in a worker; return its result and the warnings."""
-    with alone, _one_thread(), warnings.catch_warnings(record=True) as caught:
+    with _ONE_AT_A_TIME, _one_thread(), warnings.catch_warnings(record=True) as caught:
         begin, error = time.monotonic(), ""
         try:
             if Run(run.path).exists:
@@ -208,9 +212,9 @@ def _fit(run: _Run) -> tuple[Outcome, list[str]]:
             else:
                 training = replace(run.training, progress=False)
                 ended = fit(run.method, run.data, out=run.path, callbacks=[_EndsWithParent()], **vars(training))
-        except Exception as failure:  # of any type, and it may not survive the way to the sweep's process
+        except Exception as failure:  # of any type, which may not be picklable for the sweep's process
             ended = Fit([], 0, None, None, "failed", run.path)
-            error = f"{type(failure).__name__}: {reason(failure)}"
+            error = f"{type(failure).__name__}: {error_message(failure)}"
         seconds = time.monotonic() - begin
     return _outcome(run, ended, seconds=seconds, error=error), [str(warning.message) for warning in caught]
 
@@ -221,7 +225,7 @@ def _outcome(run: _Run, fit: Fit, **more: Any) -> Outcome:
 
 
 class _EndsWithParent(Callback):
-    """Ends a worker whose sweep was killed."""
+    """Callback that ends a worker if its sweep was killed."""
 
     def __init__(self) -> None:
         self.own, self.parent, self.next = multiprocessing.parent_process() is None, os.getppid(), 0.0
@@ -236,7 +240,7 @@ class _EndsWithParent(Callback):
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Within it SIGTERM raises KeyboardInterrupt, as Ctrl-C does."""
+    """Make SIGTERM raise KeyboardInterrupt in the block, as Ctrl-C does."""
 
     def stop(number: int, _: Any) -> None:
         interrupt = KeyboardInterrupt()
@@ -255,7 +259,7 @@ def _terminable() -> Iterator[None]:
 
 @contextmanager
 def _ignored_signals() -> Iterator[None]:
-    """Processes started within it ignore the terminal's Ctrl-C, at which one that waits would break the pool."""
+    """Make processes started in the block ignore Ctrl-C, because an interrupted idle worker would break the pool."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -279,7 +283,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def _named(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Method]:
-    """Methods by what their run directories are called."""
+    """Return methods by the names of their run directories, without the seed."""
     if isinstance(methods, Mapping):
         named = dict(methods)
     else:
@@ -294,41 +298,43 @@ def _named(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Method
             named[name] = method
     for name in named:
         if not re.fullmatch(r"[\w.=+-]+", name):
-            raise ValueError(f"{name!r} is no name for a directory; name the methods: sweep({{'a': …, 'b': …}}, …)")
+            raise ValueError(f"{name!r} cannot name a directory; name the methods: sweep({{'a': …, 'b': …}}, …)")
     return named
 
 
 def _earlier(run: _Run) -> Outcome | None:
-    """The result of a run that an earlier sweep has finished.
+    """Return the result of a run that an earlier sweep has finished; None for other runs.
 
     Raises:
-        ValueError: the directory holds a run of other options.
+        ValueError: the directory contains a run with other options, or is a link or a file.
     """
     earlier = Run(run.path)
     if run.path.is_symlink():
         raise ValueError(f"{run.path} is a link, which could lead anywhere; put the run's own directory in its place")
     if not earlier.exists:
         if run.path.is_file():
-            raise ValueError(f"{run.path} is a file, where a run is to go; choose another directory for the sweep")
+            raise ValueError(f"{run.path} is a file, not a run directory; choose another directory for the sweep")
         return None
     config, state = read_config(run.path), earlier.state
     there = _options(config.method, config.schema, config.training, config.data.fingerprint)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the run itself tells which schedules it makes shorter
+        warnings.simplefilter("ignore")  # the run itself warns about shortened schedules
         training = clamp(run.training, run.training.steps)
-    here = _options(run.method.suited(run.data.windows("train")), run.data.schema, training, run.data.fingerprint)
+    here = _options(
+        run.method.resolve_defaults(run.data.windows("train")), run.data.schema, training, run.data.fingerprint
+    )
     if changed := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
         name = changed[0]
         others = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
         raise ValueError(
-            f"{run.path} holds a run of other options: its {name} is {there.get(name)!r}, the sweep's "
-            f"{here.get(name)!r}{others}; give the sweep those options, or another directory"
+            f"{run.path} contains a run with other options: its {name} is {there.get(name)!r}, the sweep's "
+            f"{here.get(name)!r}{others}; use the same options, or another directory"
         )
     return _outcome(run, _left(run)) if state["status"] in ENDED else None
 
 
 def _left(run: _Run) -> Fit:
-    """What a run has left in its directory."""
+    """Return the result stored in a run's directory."""
     if not (earlier := Run(run.path)).exists:
         return Fit([], 0, None, None, "failed", run.path)
     state = earlier.state
@@ -339,14 +345,14 @@ def _left(run: _Run) -> Fit:
 
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:
-    """All that makes a run what it is, wherever it is made. The method tells the self-feeding of the training."""
-    apart = ("self_feeding", "progress", "accelerator")
+    """Return the options that define a run on any machine; the method determines scheduled sampling."""
+    apart = ("scheduled_sampling", "progress", "accelerator")
     told = {name: value for name, value in vars(training).items() if name not in apart}
     return {**method.config(), **told, **dict(flat(schema.config(), "data's ")), "data's fingerprint": fingerprint}
 
 
 class _Log:
-    """What the log of a run tells, while another process writes it."""
+    """Progress of a run, read from its log while another process writes it."""
 
     def __init__(self, run: Path, steps: int) -> None:
         self.path = run / "log.jsonl"
@@ -358,8 +364,8 @@ class _Log:
         self._before, self._read = self._stamp(), 0
 
     def look(self) -> bool:
-        """Reads what is new; whether the run has just begun."""
-        began = self.begin is None and self._stamp() != self._before  # both fit and resume begin with a new file
+        """Read the new rows; return whether the run has just started."""
+        began = self.begin is None and self._stamp() != self._before  # both fit and resume start a new file
         if began:
             self.begin = time.monotonic()
         if self.begin is not None:
@@ -368,7 +374,7 @@ class _Log:
                 whole, end, _ = file.read(LARGEST_LOG).rpartition(b"\n")
                 self._read += len(whole + end)
                 for row in map(row_of, whole.split(b"\n")):
-                    if row is None:  # whoever reads the log for its rows says what is wrong with it
+                    if row is None:  # a damaged row, which `JSONLines.read` reports
                         continue
                     self.step = row["step"]
                     self.bound = row.get("validation/self_fed/bound", row.get("validation/bound", self.bound))
@@ -382,14 +388,14 @@ class _Log:
 
 
 class _Progress:
-    """A line as each run ends. Meanwhile, a live table of the runs; away from a terminal, a line as each starts."""
+    """Progress of a sweep: a line when each run ends, and a live table, or without a terminal a line at each start."""
 
     def __init__(self, runs: Sequence[_Run], shown: bool) -> None:
-        self.console = Plain(stderr=True, quiet=not shown, force_jupyter=False)
+        self.console = PlainConsole(stderr=True, quiet=not shown, force_jupyter=False)
         self.total = len(runs)
         self.bound = f"bound (nats a {runs[0].data.schema.per if runs else Fit.per})"
         self.logs = {run.path: _Log(run.path, run.training.steps) for run in runs}
-        # away from a terminal nothing is drawn, but the logs are looked at all the same
+        # without a terminal nothing is drawn, but the logs are still read
         self.live = Live(console=self.console, get_renderable=self._look, refresh_per_second=2, transient=True)
 
     def __enter__(self) -> _Progress:
@@ -400,7 +406,7 @@ class _Progress:
         self.live.stop()
 
     def end(self, result: Outcome) -> None:
-        """Shows a result, unless it is that of a run that has not begun."""
+        """Print a result, unless its run has not started."""
         self.live.refresh()
         log = self.logs.pop(result.path, None)
         if result.status != "interrupted" or (log is not None and log.begin is not None):
@@ -409,7 +415,7 @@ class _Progress:
         self.live.refresh()
 
     def _look(self) -> Table:
-        """Reads what is new in the logs, and draws the table."""
+        """Read the new rows of the logs, and return the table."""
         logs = list(self.logs.values())
         for log in logs:
             if log.look() and not self.console.is_terminal:

@@ -7,16 +7,17 @@
 {'riders': 'count', 'open': 'binary'}
 """
 
+from .column_inference import ColumnHints, infer_columns
 from .columns import Column, Columns
 from .dataset import PanelData
 from .forecasts import PanelForecasts, PanelImputed, panel_scores
 from .panel import Panel, Series
-from .proposing import Told, proposed
 from .protocol import Cut
 from .windows import PanelWindows
 
 __all__ = [
     "Column",
+    "ColumnHints",
     "Columns",
     "Cut",
     "Panel",
@@ -25,7 +26,6 @@ __all__ = [
     "PanelImputed",
     "PanelWindows",
     "Series",
-    "Told",
+    "infer_columns",
     "panel_scores",
-    "proposed",
 ]

@@ -74,7 +74,7 @@ class Calendar:
         steps = Counter(_step(self._local(own)) for own in some if len(own) > 2) if self.kind == "dates" else None
         return replace(found, step=steps.most_common(1)[0][0]) if steps else found
 
-    def shown(self, times: np.ndarray) -> Any:
+    def to_pandas(self, times: np.ndarray) -> Any:
         """Return times (N,) as pandas objects: dates in their zone, or durations; numbers are unchanged."""
         import pandas as pd
 
@@ -88,7 +88,7 @@ class Calendar:
 
     def text(self, time: float) -> str:
         """Return a time as text."""
-        return f"{time:.15g}" if self.kind == "numbers" else str(self.shown(np.array([time]))[0])
+        return f"{time:.15g}" if self.kind == "numbers" else str(self.to_pandas(np.array([time]))[0])
 
     def after(self, times: np.ndarray, count: int) -> np.ndarray:
         """Return the next `count` times.
@@ -123,7 +123,7 @@ class Calendar:
 
     def _local(self, times: np.ndarray) -> Any:
         """Return dates as local times of their zone, without a zone."""
-        dates = self.shown(times)
+        dates = self.to_pandas(times)
         return dates if self.zone is None else dates.tz_localize(None)
 
     def _seconds(self, local: Any) -> np.ndarray:

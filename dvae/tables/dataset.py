@@ -9,17 +9,17 @@ from typing import Any, ClassVar, Self
 
 from ..options import check, require
 from .ahead import ahead
+from .column_inference import ColumnHints
 from .columns import Columns
 from .encoding import PanelSchema
 from .panel import SPLITS, Panel
-from .proposing import Told
 from .protocol import Cut
 from .reading import is_domain, read_panel, schema_beside
 from .windows import PanelWindows
 
 
 @dataclass(frozen=True)
-class Tabled:
+class PanelSource:
     """The source of a panel, as stored in a run.
 
     Args:
@@ -45,8 +45,8 @@ class PanelData:
     """
 
     kind: ClassVar[str] = "panel"
-    described: ClassVar[str] = PanelSchema.kind
-    source: ClassVar[type[Tabled]] = Tabled
+    schema_kind: ClassVar[str] = PanelSchema.kind
+    source: ClassVar[type[PanelSource]] = PanelSource
     onto: ClassVar[bool] = False
 
     path: str
@@ -66,10 +66,10 @@ class PanelData:
         Args:
             path: path of a CSV, Parquet, npz or npy file, or of a folder of npy files; or the name of a data set of
                 `dvae.tables.domains`.
-            columns: a schema, or the targets as in `Told`; replaces the schema file.
+            columns: a schema, or the targets as in `ColumnHints`; replaces the schema file.
             cut: how to split and cut sequences; by default from the schema file, otherwise a choice that suits the
                 data.
-            **told: further fields of `Told` and of `Cut`.
+            **told: further fields of `ColumnHints` and of `Cut`.
 
         Raises:
             FileNotFoundError: if the file does not exist.
@@ -81,20 +81,20 @@ class PanelData:
         how = {field.name: told.pop(field.name) for field in fields(Cut) if field.name in told}
         beside, beside_cut = schema_beside(name)
         if not isinstance(columns, Columns):
-            words = Told(tuple(columns), **told)
-            columns = beside if words == Told() and beside is not None else words  # type: ignore[assignment]
+            words = ColumnHints(tuple(columns), **told)
+            columns = beside if words == ColumnHints() and beside is not None else words  # type: ignore[assignment]
         panel = read_panel(name, columns)  # type: ignore[arg-type]
-        cut = replace(cut or beside_cut or suited(panel), **how)
-        return cls(name, panel, PanelSchema.under(panel, cut))
+        cut = replace(cut or beside_cut or default_cut(panel), **how)
+        return cls(name, panel, PanelSchema.from_data(panel, cut))
 
     @classmethod
     def of(cls, data: Any, columns: Any = None, cut: Cut | None = None, name: str = "panel") -> Self:
         """Wrap data in memory, as in `Panel.of`; a run fitted to them cannot reopen them by a path."""
         require(Cut | None, cut=cut)
         panel = Panel.of(data, columns, name)
-        return cls(name, panel, PanelSchema.under(panel, cut or suited(panel)))
+        return cls(name, panel, PanelSchema.from_data(panel, cut or default_cut(panel)))
 
-    def on(self, data: Any) -> Self:
+    def with_data(self, data: Any) -> Self:
         """Return other data, of any type that `Panel.of` accepts, with the columns, cut and units of this schema."""
         return replace(self, panel=Panel.of(data, self.panel.columns, self.panel.name))
 
@@ -161,12 +161,12 @@ class PanelData:
         """How sequences are split and cut."""
         return self.schema.cut
 
-    def recorded(self) -> Tabled:
+    def recorded(self) -> PanelSource:
         """Return the source of the data, for `reopened`."""
-        return Tabled(self.path, self.fingerprint)
+        return PanelSource(self.path, self.fingerprint)
 
     @classmethod
-    def reopened(cls, source: Tabled, schema: PanelSchema, path: str | os.PathLike[str] | None = None) -> Self:
+    def reopened(cls, source: PanelSource, schema: PanelSchema, path: str | os.PathLike[str] | None = None) -> Self:
         """Read a recorded panel with the schema of the run, from its path or another one.
 
         The content may have changed.
@@ -178,7 +178,7 @@ class PanelData:
         return cls(name, read_panel(name, schema.columns), schema)
 
 
-def suited(panel: Panel) -> Cut:
+def default_cut(panel: Panel) -> Cut:
     """Return a default cut: fewer than 10 sequences without a given split are split by time, otherwise by sequence.
 
     The horizon is a tenth of the median length, at most 24 steps, and three times as many steps are observed.

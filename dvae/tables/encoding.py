@@ -24,9 +24,9 @@ from typing_extensions import override
 
 from ..data.blocks import ColumnSummary, blocks, row_blocks
 from ..data.schema import Schema
-from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_lost
-from ..data.views import Offered, View
-from ..distributions.base import LawSpec
+from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_imprecise
+from ..data.views import ContextView, View
+from ..distributions.base import DistributionSpec
 from ..distributions.family import FAMILIES
 from ..distributions.product import Product
 from ..options import Amount, Positive, Range, tuples
@@ -71,7 +71,7 @@ class PanelSchema(Schema):
     means: Mapping[str, Annotated[float, Range()]] = field(default_factory=dict)
     scales: Mapping[str, Positive] = field(default_factory=dict)
     logarithms: Mapping[str, tuple[Positive, Annotated[float, Range()], Positive]] = field(default_factory=dict)
-    lacking: tuple[str, ...] = ()
+    with_missing: tuple[str, ...] = ()
     step: Amount = 0.0
     calendar: Calendar = NUMBERS
 
@@ -80,7 +80,7 @@ class PanelSchema(Schema):
         for name, roles in ((COVARIATES, ("known", "past")), (STATICS, ("static",))):
             covariates = self.columns.of(*roles)
             if covariates:
-                lacking = sum(column.name in self.lacking for column in covariates)
+                lacking = sum(column.name in self.with_missing for column in covariates)
                 found[name] = sum(len(column.coordinates) for column in covariates) + lacking
         if self.step:
             found[GAPS] = 1
@@ -90,11 +90,11 @@ class PanelSchema(Schema):
         covariates = self.columns.of("known", "past", "static")
         if lost := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
             raise ValueError(f"no mean and scale of {', '.join(sorted(lost))}, by which models read it without unit")
-        if lost := {c.name for c in self.columns.of("past")} - {*self.lacking}:
+        if lost := {c.name for c in self.columns.of("past")} - {*self.with_missing}:
             raise ValueError(f"no indicator of {', '.join(sorted(lost))}, which ends with the present")
 
     @classmethod
-    def under(cls, panel: Panel, cut: Cut) -> Self:
+    def from_data(cls, panel: Panel, cut: Cut) -> Self:
         """Return the schema of a panel, with units from its training sequences."""
         starts = cut.starts(panel, "train")
         ends = [panel.present(panel.series[n]) if cut.length is None else last + cut.length for n, _, last in starts]
@@ -141,7 +141,9 @@ class PanelSchema(Schema):
         middle = float(np.median(gaps)) if len(gaps) else 0.0
         step = middle if len(gaps) and (gaps.max() > EVEN * middle or middle > EVEN * gaps.min()) else 0.0
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
-        return cls(columns=panel.columns, cut=cut, **units, lacking=tuple(lacking), step=step, calendar=panel.calendar)
+        return cls(
+            columns=panel.columns, cut=cut, **units, with_missing=tuple(lacking), step=step, calendar=panel.calendar
+        )
 
     @property
     def protocol(self) -> Cut:
@@ -157,11 +159,11 @@ class PanelSchema(Schema):
     @override
     def view(self) -> View:
         """The identity, with the context as optional inputs."""
-        return Offered(tuple(name for name in self.sizes if name != "x"))
+        return ContextView(tuple(name for name in self.sizes if name != "x"))
 
     @property
     @override
-    def emission(self) -> LawSpec:
+    def emission(self) -> DistributionSpec:
         """Distribution of the targets: a single one if all have the same family, else a product."""
         parts: dict[tuple[str, str], list[int]] = {}
         place = 0
@@ -186,14 +188,14 @@ class PanelSchema(Schema):
     @override
     def indicators(self) -> tuple[str, ...]:
         """("x",) if a target has missing values, else ()."""
-        return ("x",) if any(column.name in self.lacking for column in self.columns.targets) else ()
+        return ("x",) if any(column.name in self.with_missing for column in self.columns.targets) else ()
 
     @property
     @override
     def together(self) -> Sequence[int]:
         """Index of the column of each coordinate; all 0 if a step is observed or missing as a whole."""
         targets = enumerate(self.columns.targets)
-        return [0 if whole(self.columns) else place for place, column in targets for _ in column.coordinates]
+        return [0 if is_whole(self.columns) else place for place, column in targets for _ in column.coordinates]
 
     @property
     @override
@@ -253,7 +255,7 @@ class PanelSchema(Schema):
         for column in self.columns.of("known", "static"):
             gone = (np.isnan(part[:, self.places[column.name]]) for part in parts)
             lacks = any(each.all() if column.role == "static" else each.any() for each in gone)
-            found += [column.name] if lacks and column.name not in self.lacking else []
+            found += [column.name] if lacks and column.name not in self.with_missing else []
         return found
 
     def gaps(self, one: Series) -> np.ndarray:
@@ -276,7 +278,7 @@ class PanelSchema(Schema):
             else:
                 mean, scale = self.means[column.name], self.scales[column.name]
                 parts.append(((np.where(last >= 0, filled, mean) - mean) / scale)[:, None])
-            if column.name in self.lacking:
+            if column.name in self.with_missing:
                 parts.append(known[:, None].astype(float))
         return np.concatenate(parts, 1)
 
@@ -290,14 +292,14 @@ class PanelSchema(Schema):
             if column.role == "past":
                 held += range(place, place + width)
                 indicators.append(place + width)
-            place += width + (column.name in self.lacking)
+            place += width + (column.name in self.with_missing)
         return held, indicators
 
     @override
     def config(self) -> dict[str, Any]:
         """Return the schema as JSON types."""
         own: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
-        own |= {"lacking": list(self.lacking), "step": self.step, "calendar": asdict(self.calendar)}
+        own |= {"with_missing": list(self.with_missing), "step": self.step, "calendar": asdict(self.calendar)}
         return {"columns": self.columns.config(), "cut": asdict(self.cut), **own}
 
     @classmethod
@@ -307,7 +309,7 @@ class PanelSchema(Schema):
         own = tuples(config)
         own |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
         own["logarithms"] = tuples(config["logarithms"])
-        own["calendar"] = Calendar(**config.get("calendar", {}))  # older runs have none
+        own["calendar"] = Calendar(**config["calendar"])
         return cls(**own)
 
 
@@ -322,7 +324,7 @@ def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
 def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequence[tuple[str, np.ndarray]]) -> None:
     """Warn if float32 does not resolve how a column varies in sequences, after the mean of all is subtracted."""
     center = np.array([means.get(name, 0.0) for name in columns.names])
-    lost = np.array([is_lost(ColumnSummary.of(blocks(values)), center) for _, values in training])
+    lost = np.array([is_imprecise(ColumnSummary.of(blocks(values)), center) for _, values in training])
     for column, mean, sequences in zip(columns.columns, center, lost.T, strict=True):
         if sequences.any() and column.family not in ("binary", "category"):
             warnings.warn(
@@ -342,6 +344,6 @@ def _encoded(values: np.ndarray, column: Column) -> np.ndarray:
     return found
 
 
-def whole(columns: Columns) -> bool:
+def is_whole(columns: Columns) -> bool:
     """Return whether a step is always observed or missing as a whole."""
     return any(column.family in WHOLE_STEPS for column in columns.targets)

@@ -12,8 +12,8 @@ import numpy as np
 
 from .. import files
 from ..data.sequences import HeldOutWindows, columns_of
-from ..inference.evaluation.result import canvas
-from ..inference.evaluation.scores import CRPS, Measure, by_column, calibrated, reaching
+from ..inference.evaluation.result import new_figure
+from ..inference.evaluation.scores import CRPS, Measure, by_column, calibrated, samples_needed
 from ..options import nearest
 from .calendar import NUMBERS, Calendar
 
@@ -63,7 +63,7 @@ class PanelForecasts:
         window, step, place = (index.ravel() for index in np.indices((count, horizon, size)))
         found = _rows(self.keys, window, step)
         if self.times is not None:
-            found["time"] = self.calendar.shown(self.times[:, -horizon:].reshape(-1).repeat(size))
+            found["time"] = self.calendar.to_pandas(self.times[:, -horizon:].reshape(-1).repeat(size))
         found["ahead"] = step + 1
         found |= _columns(self.columns, place) | _quantiles(self.draws.reshape(len(self.draws), -1))
         return pd.DataFrame({**found, "truth": self.truth.ravel()})
@@ -96,7 +96,7 @@ class PanelForecasts:
         chosen = list(columns or names)[:most]
         across = min(2, len(chosen))
         down = -(-len(chosen) // across)
-        figure = canvas(5 * across, 1.9 * down + 0.4)
+        figure = new_figure(5 * across, 1.9 * down + 0.4)
         panels = figure.subplots(down, across, squeeze=False, sharex=True).ravel()
         for axis, name in zip(panels, chosen, strict=False):
             self.fan(axis, window, name)
@@ -119,7 +119,7 @@ class PanelForecasts:
         observed, horizon = self.past.shape[1], self.draws.shape[2]
         steps: Any = np.arange(observed + horizon) if self.times is None else self.times[window]
         if dated := self.times is not None and self.calendar.kind == "dates":
-            steps = self.calendar.shown(steps)
+            steps = self.calendar.to_pandas(steps)
         before, after, draws = steps[:observed], steps[observed:], self.draws[:, window, :, place]
         if np.isin(self.draws[..., place], (0, 1)).all():  # binary: a share instead of bands
             axis.plot(after, draws.mean(0), "C0", linewidth=1.2)
@@ -127,7 +127,7 @@ class PanelForecasts:
             axis.set_ylim(-0.05, 1.05)
         else:
             for level, shade in BANDS.items():
-                if reaching(level) > len(draws):
+                if samples_needed(level) > len(draws):
                     continue
                 low, high = _quantile(draws, [(1 - level) / 2, (1 + level) / 2])
                 axis.fill_between(after, low, high, color="C0", alpha=shade, linewidth=0, label=f"{level:.0%}")
@@ -157,7 +157,7 @@ class PanelImputed:
     """
 
     draws: np.ndarray
-    lacking: np.ndarray
+    missing: np.ndarray
     columns: Mapping[str, str]
     keys: Sequence[tuple[str, int]]
     times: np.ndarray | None = None
@@ -167,10 +167,10 @@ class PanelImputed:
         """Return a pandas frame with a row for each missing entry: mean, and quantiles as in `PanelForecasts.table`."""
         import pandas as pd
 
-        window, step, place = np.nonzero(self.lacking)
+        window, step, place = np.nonzero(self.missing)
         found = _rows(self.keys, window, step)
         if self.times is not None:
-            found["time"] = self.calendar.shown(self.times[window, step])
+            found["time"] = self.calendar.to_pandas(self.times[window, step])
         return pd.DataFrame(found | _columns(self.columns, place) | _quantiles(self.draws[:, window, step, place]))
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -179,7 +179,7 @@ class PanelImputed:
         Raises:
             ValueError: if the extension is unknown, or pyarrow is missing for Parquet.
         """
-        _save(self, path, filled=self.draws, observed=~self.lacking)
+        _save(self, path, filled=self.draws, observed=~self.missing)
 
 
 def needed(quantile: float) -> int:
@@ -187,7 +187,7 @@ def needed(quantile: float) -> int:
 
     With fewer draws, the quantile lies beyond all of them.
     """
-    return 1 if quantile == 0.5 else reaching(abs(1 - 2 * quantile))
+    return 1 if quantile == 0.5 else samples_needed(abs(1 - 2 * quantile))
 
 
 def _rows(keys: Sequence[tuple[str, int]], window: np.ndarray, step: np.ndarray) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         raise ValueError(f"{path} ends in none of {', '.join(FORMATS)}")
-    with files.written(path) as file:
+    with files.atomic_write(path) as file:
         if suffix == ".csv":
             table = found.table()
             if "time" in table and found.calendar.kind == "numbers":

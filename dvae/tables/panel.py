@@ -29,10 +29,10 @@ from ..data.sequences import check_real
 from ..options import nearest
 from .calendar import NUMBERS, Calendar
 from .clocks import time_of
+from .column_inference import LARGEST, TIMES, ColumnHints, is_date
 from .columns import Column, Columns
 from .numerals import read_numbers
 from .parsing import is_duration, is_number, numeric, tabular, texts, times
-from .proposing import LARGEST, TIMES, Told, is_date
 
 SPLITS = ("train", "validation", "test")
 COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
@@ -209,13 +209,13 @@ class Panel:
         return replace(self, series=[own[name] for name in names])
 
     @classmethod
-    def of(cls, data: Any, columns: Columns | Told | Sequence[str] | None = None, name: str = "panel") -> Panel:
+    def of(cls, data: Any, columns: Columns | ColumnHints | Sequence[str] | None = None, name: str = "panel") -> Panel:
         """Build a panel from a common data structure.
 
         Args:
             data: a pandas frame in the long form, arrays, a list of arrays, or an xarray `Dataset`.
-            columns: a schema, or targets as in `Told`, with the rest inferred. For arrays, a schema, or names of real
-                targets; by default x0, x1, …
+            columns: a schema, or targets as in `ColumnHints`, with the rest inferred. For arrays, a schema, or names of
+                real targets; by default x0, x1, …
             name: name for titles.
 
         Raises:
@@ -231,11 +231,11 @@ class Panel:
             return data
         kind = type(data).__module__.partition(".")[0]
         if kind in ("pandas", "xarray"):
-            if not isinstance(columns, Columns | Told):
-                columns = Told(columns=tuple(columns or ()))
+            if not isinstance(columns, Columns | ColumnHints):
+                columns = ColumnHints(columns=tuple(columns or ()))
             if kind == "xarray":
                 data, columns = _of_grid(data, columns)
-            columns = columns.of(data) if isinstance(columns, Told) else columns
+            columns = columns.of(data) if isinstance(columns, ColumnHints) else columns
             frame = tabular(data)
             series, calendar = _of_frame(frame, columns)
             return cls(series, columns, name, calendar)
@@ -294,13 +294,13 @@ class Panel:
         return cls(series, Columns((own,)), name, calendar.stepping(one.times for one in series))
 
 
-def plain_columns(columns: Columns | Told | Sequence[str] | None, size: int) -> Columns:
+def plain_columns(columns: Columns | ColumnHints | Sequence[str] | None, size: int) -> Columns:
     """Return columns of arrays: as given, or real targets x0, x1, …
 
     Raises:
         ValueError: if a given entry does not apply to arrays, such as a time.
     """
-    if isinstance(columns, Told):
+    if isinstance(columns, ColumnHints):
         if strange := [name for name, value in vars(columns).items() if value and name != "columns"]:
             raise ValueError(
                 f"arrays have no names by which to tell {', '.join(strange)}; give a schema, in Python as "
@@ -335,11 +335,11 @@ def _counts(values: np.ndarray) -> np.ndarray:
     return found
 
 
-def _of_grid(data: Any, columns: Columns | Told) -> tuple[Any, Columns | Told]:
+def _of_grid(data: Any, columns: Columns | ColumnHints) -> tuple[Any, Columns | ColumnHints]:
     """Return an xarray as a frame; by default one dimension is the time and the others identify sequences."""
     data = data if hasattr(data, "data_vars") else data.to_dataset(name=data.name or "x")
     frame, dims = data.to_dataframe().reset_index(), [str(name) for name in data.dims]
-    if isinstance(columns, Told) and dims:
+    if isinstance(columns, ColumnHints) and dims:
         dated = [name for name in dims if frame[name].dtype.kind in "mM" or TIMES.search(name.lower())]
         time = columns.time or (dated or dims)[-1]
         columns = replace(columns, time=time, id=columns.id or tuple(name for name in dims if name != time))

@@ -46,7 +46,7 @@ _OFFSET = re.compile(r"[T :]\d\d[\d:.]*\s?(z|utc|gmt|[-+]\d[\d:]{1,4})$", re.IGN
 _DURATION = re.compile(r"[-+]?(?:\d{1,6} days?,? ?)?[-+]?\d{1,6}:\d\d:\d\d(?:\.\d{1,9})?|[-+]?\d{1,6} days?", re.ASCII)
 
 
-class Unread(ValueError):
+class UnparsedDates(ValueError):
     """Some texts of a column are not dates like the others.
 
     Args:
@@ -62,7 +62,7 @@ class Unread(ValueError):
         )
 
 
-class Undecided(ValueError):
+class AmbiguousDates(ValueError):
     """Dates are ambiguous, such as between day first and month first."""
 
 
@@ -147,11 +147,11 @@ def dates(column: Any) -> Any:
         said = _as_iso(pd.Series(held, dtype=object))
         when = pd.to_datetime(said, utc=True, format="ISO8601", errors="coerce")
         if (wrong := when.isna()).any():
-            raise Unread(cells, np.append(wrong, False)[codes]) from None
+            raise UnparsedDates(cells, np.append(wrong, False)[codes]) from None
     offsets = _offsets(said)
     known = offsets.dropna().unique()
     if len(known) and (naive := offsets.isna()).any():
-        raise Undecided(
+        raise AmbiguousDates(
             f"dates with an offset from UTC and others, such as {brief(str(held[naive.argmax()]))}, without one; write "
             "it for all, or for none"
         )
@@ -224,7 +224,7 @@ def _order(parts: Any, example: str) -> dict[str, str]:
     if first and second:
         raise ValueError(f"some begin with the day and others with the month; write dates as {WANTED}")
     if not (first or second) or (parts.year.str.len() == 2).any():
-        raise Undecided(
+        raise AmbiguousDates(
             f"dates such as {example!r}, of which nothing tells the day from the month, or the year; "
             f"write them as {WANTED}"
         )
@@ -258,7 +258,7 @@ def times(
     else:
         try:
             when = dates(column)
-        except Undecided as error:
+        except AmbiguousDates as error:
             raise ValueError(f"column {column.name!r} holds {error}") from error
         except (TypeError, ValueError) as error:
             raise ValueError(

@@ -34,11 +34,11 @@ import numpy as np
 from .. import files
 from ..data.npy import mapped
 from ..options import nearest
+from .column_inference import ColumnHints
 from .columns import MOST, Columns, layout, parsed
 from .domains import DOMAINS, domain
 from .numerals import decimal_sign
 from .panel import SPLITS, Panel, Series, plain_columns
-from .proposing import Told
 from .protocol import Cut
 
 SEPARATORS = {".csv": ",;\t|", ".tsv": "\t"}
@@ -258,7 +258,7 @@ def _of_arrays(place: Path, content: bytes) -> Any:
     return frame.assign(sequence=sequence, step=step)
 
 
-def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = None) -> Panel:
+def read_panel(path: str | os.PathLike[str], columns: Columns | ColumnHints | None = None) -> Panel:
     """Return the sequences of a file, or of a data set of `dvae.tables.domains`.
 
     Args:
@@ -272,7 +272,7 @@ def read_panel(path: str | os.PathLike[str], columns: Columns | Told | None = No
     name = os.fspath(path)
     if is_domain(name):
         panel = domain(name)
-        if columns not in (None, Told(), panel.columns):
+        if columns not in (None, ColumnHints(), panel.columns):
             raise ValueError(f"{name} has columns of its own: {', '.join(panel.columns.names[:10])}, …")
         return panel
     if is_of_arrays(path):
@@ -285,7 +285,7 @@ def is_of_arrays(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() == ".npy" or Path(path).is_dir()
 
 
-def _of_mapped(place: Path, columns: Columns | Told | None) -> Panel:
+def _of_mapped(place: Path, columns: Columns | ColumnHints | None) -> Panel:
     """Return the sequences of npy files with shape (steps, columns) or (sequences, steps, columns).
 
     Sequences of a folder have the names of their files. The file train.npy and files in the subfolder train belong to
@@ -359,7 +359,7 @@ def _check_header(name: str, member: Any) -> None:
         raise ValueError(f"{name} is {shape}; at most {LARGEST // 8} numbers are read")
 
 
-def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | Told | None, Cut | None]:
+def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | ColumnHints | None, Cut | None]:
     """Return the content of the schema file next to a file, or None for each missing part.
 
     Raises:
@@ -376,8 +376,8 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | Told | None, 
     return None, None
 
 
-def read_schema(text: str) -> tuple[Columns | Told | None, Cut | None]:
-    """Return columns and cut of a schema, None for a missing part. Without a list of columns, they are a `Told`."""
+def read_schema(text: str) -> tuple[Columns | ColumnHints | None, Cut | None]:
+    """Return columns (`ColumnHints` if the schema does not list them all) and cut; None for a missing part."""
     told = parsed(text)
     cut = told.pop("cut", None)
     if cut is not None:
@@ -387,7 +387,7 @@ def read_schema(text: str) -> tuple[Columns | Told | None, Cut | None]:
         for name in cut:
             if name not in known:
                 raise ValueError(f"[cut] has an entry {name!r}{nearest(name, known)}; known are {', '.join(known)}")
-    columns = Columns.from_config(told) if "columns" in told else Told(**layout(told)) if told else None
+    columns = Columns.from_config(told) if "columns" in told else ColumnHints(**layout(told)) if told else None
     return columns, None if cut is None else Cut(**cut)
 
 

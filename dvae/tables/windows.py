@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from ..data.batch import Batch
-from ..data.blocks import cut, hash_list, row_blocks
+from ..data.blocks import cut_windows, hash_list, row_blocks
 from ..data.sequences import Sequences, columns_of
-from ..inference.evaluation.held import on_device_of, reproducibly
+from ..inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from ..options import Count, require
 from ..program.model import DynamicalVAE
 from .calendar import Calendar
-from .encoding import COVARIATES, GAPS, STATICS, PanelSchema, whole
+from .encoding import COVARIATES, GAPS, STATICS, PanelSchema, is_whole
 from .forecasts import PanelForecasts, PanelImputed
 from .panel import Panel
 from .protocol import Cut
@@ -112,8 +112,8 @@ class PanelWindows:
     def left_out(self) -> str:
         """Description of omitted sequences and windows; empty if none are omitted."""
         parts = [self.too_short] if self.skipped else []
-        if self.untold:
-            parts.append(f"{self.untold} windows, in whose past or future no target was observed")
+        if self.n_unobserved:
+            parts.append(f"{self.n_unobserved} windows, in whose past or future no target was observed")
         return " and ".join(parts)
 
     @property
@@ -125,7 +125,7 @@ class PanelWindows:
         return f"{said} ({', '.join(named)}{more})" if named else ""
 
     @property
-    def untold(self) -> int:
+    def n_unobserved(self) -> int:
         """Number of windows that are not listed, since no target was observed in their past or future."""
         return int(self._counts.sum()) - len(self._listed()[0])
 
@@ -253,7 +253,7 @@ class PanelWindows:
             warnings.warn(f"forecasts leave out {self.too_short}", stacklevel=2)
         batch = self.all()
         past, known = batch.past(observed), batch.mask_to_nan().numpy()
-        with reproducibly(model, seed):
+        with seeded_evaluation(model, seed):
             parts = [
                 model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
                 for part in Sequences(past).batches(AT_ONCE)
@@ -279,7 +279,7 @@ class PanelWindows:
         batch = self.all()
         if (mask := batch.mask()) is None:
             raise ValueError(f"nothing is missing in {self.panel.name}")
-        with reproducibly(model, seed):
+        with seeded_evaluation(model, seed):
             parts = [
                 model.impute(on_device_of(model, part), samples, draw=True, particles=particles)["x"].cpu().numpy()
                 for part in Sequences(batch).batches(AT_ONCE)
@@ -329,7 +329,7 @@ class PanelWindows:
         if not self._missing or self.length is None or self.split in ("all", "last"):
             return which, starts
         seen = (~np.isnan(self.schema.encoded(block)) for block in row_blocks(self._values))
-        some = np.concatenate([each.all(1) if whole(self.schema.columns) else each.any(1) for each in seen])
+        some = np.concatenate([each.all(1) if is_whole(self.schema.columns) else each.any(1) for each in seen])
         known = torch.cat([torch.zeros(1).long(), torch.from_numpy(some).cumsum(0)])
         first = self._first[which] + starts
         start, now, end = known[first], known[first + (self.schema.cut.observed or 0)], known[first + self.length]
@@ -339,18 +339,20 @@ class PanelWindows:
     def _cut(self, which: Tensor, starts: Tensor) -> Batch:
         """Return the windows that start at these steps of their ranges."""
         lengths = self._lengths[which] if self.length is None else self.length
-        x = torch.from_numpy(self.schema.encoded(cut(self._values, which, starts, lengths).numpy())).double()
+        x = torch.from_numpy(self.schema.encoded(cut_windows(self._values, which, starts, lengths).numpy())).double()
         batch = Batch(x=x)
         if isinstance(lengths, Tensor) and (lengths != lengths[0]).any():
             batch["lengths"] = lengths
         if self._missing:
             seen = x.isfinite()
-            batch["mask"] = seen.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if whole(self.schema.columns) else seen
+            batch["mask"] = (
+                seen.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if is_whole(self.schema.columns) else seen
+            )
             x.nan_to_num_(0.0)
         for name, values in self._context.items():
-            batch[name] = cut(values, which, starts, lengths)
+            batch[name] = cut_windows(values, which, starts, lengths)
         if COVARIATES in batch and (observed := self.schema.cut.observed) is not None:
-            batch[COVARIATES] = held(batch[COVARIATES], observed, self.schema)
+            batch[COVARIATES] = carry_forward(batch[COVARIATES], observed, self.schema)
         if self.schema.columns.group:
             batch["group"] = torch.tensor(self._grouped(which.tolist(), starts.tolist()))
         if self._static is not None:
@@ -374,7 +376,7 @@ class PanelWindows:
         return found
 
 
-def held(context: Tensor, observed: int, schema: PanelSchema) -> Tensor:
+def carry_forward(context: Tensor, observed: int, schema: PanelSchema) -> Tensor:
     """Return covariates (B, T, C) as known at the present: those of role "past" repeat their last value."""
     values, indicators = schema.ending
     if values:

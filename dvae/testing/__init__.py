@@ -1,4 +1,4 @@
-"""Tests for models of one's own; needs pytest. `strategies` draws random factorizations, with hypothesis."""
+"""Tests for your own models, with pytest. `strategies` draws random factorizations, with hypothesis."""
 
 from .contract import FactorizationContract
 from .regression import ElboRegression

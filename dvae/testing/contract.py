@@ -1,11 +1,11 @@
-"""FactorizationContract: what every model of two factorizations keeps, as tests to subclass.
+"""FactorizationContract: properties of every model of two factorizations, as tests to subclass.
 
     class TestMine(dvae.testing.FactorizationContract):
         def build(self, size):
             return dvae.DynamicalVAE(generative, inference, sizes={"z": size, "x": size}, network=MyNetwork())
 
-pytest collects the subclass and runs every law below on the model: in double precision and on random data, but for the
-last, which trains it.
+pytest collects the subclass and runs every test below on the model, in double precision and on random data. The test
+that trains the model uses single precision and the data of `FactorizationContract.data`.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from ..inference.training.fit import fit
 from ..program.batch import AnyBatch, repeat
 from ..program.conditional import Conditional
 from ..program.model import DynamicalVAE
-from ..program.oracle import Oracle, twin
+from ..program.oracle import Oracle, linear_gaussian_surrogate
 from ..program.reference import reference
 from .device import SameNoise, move, on_device
 
 
 class FactorizationContract:
-    """Laws of a `DynamicalVAE`: subclass it, with a name that pytest collects, and say what to `build`.
+    """Properties of a `DynamicalVAE`: subclass it, with a name that pytest collects, and implement `build`.
 
     Attributes:
-        batch: B, sequences in a test.
-        steps: T, time steps in a test.
-        tolerance: of log densities that two ways of running the program must agree on, in nats.
-        still: parameters that need not learn from every batch, by name.
-        missing: what the guide should read and does not, as it is published, {} for nothing; not checked if None.
-        training_steps: of the optimiser, for the test that trains.
-        waits: how often a bound and its gradient may wait for a GPU: 1 where that is for a verdict on the batch alone;
-            not checked if None.
+        batch: number B of sequences in a test.
+        steps: number T of time steps in a test.
+        tolerance: maximum difference of log densities between two ways of running the program, in nats.
+        still: names of parameters that need not have a gradient from every batch.
+        missing: dependencies of the posterior that the published guide ignores, {} for none; not checked if None.
+        training_steps: number of optimiser steps in the test that trains.
+        waits: maximum number of synchronisations of a bound and its gradient with a GPU; 1 if only the check of the
+            batch synchronises. Not checked if None.
     """
 
     batch = 3
@@ -59,18 +59,20 @@ class FactorizationContract:
     waits: int | None = None
 
     def build(self, size: int) -> DynamicalVAE:
-        """The model under test, small.
+        """Return the model under test, which should be small.
 
         Args:
-            size: D of the data and, where they are free, of the other variables.
+            size: dimension D of the data and, where free, of the other variables.
         """
-        raise NotImplementedError("a FactorizationContract is subclassed: def build(self, size) returns the model")
+        raise NotImplementedError("subclass FactorizationContract and implement build(self, size) to return the model")
 
     def data(self, size: int) -> AnyBatch:
-        """Sequences to train on: those that the model is made for, if not sine waves, or draws of the model.
+        """Return sequences to train on, by default sine waves; override it for a model of other data.
+
+        If the distribution of the data has a restricted support, the test uses draws of the model instead.
 
         Args:
-            size: D. Of wider data, take the first coordinates.
+            size: dimension D; for wider data, return the first coordinates.
 
         Returns:
             x (N, T, D), or a batch.
@@ -85,7 +87,7 @@ class FactorizationContract:
             yield
 
     def test_networks_read_the_declared_parents_and_nothing_else(self) -> None:
-        """Parameters at t have a Jacobian of exactly zero to a parent at s wherever the mask is False."""
+        """The Jacobian of the parameters at t by a parent at s is exactly zero where the mask is False."""
         model = self._model()
         values = self._data(model, 1, names=model.sizes)
         for conditional in (*model.generator.values(), *model.encoder.values()):
@@ -97,7 +99,7 @@ class FactorizationContract:
                 assert (read | ~shown).all(), f"{conditional.factor} does not read {name} where it may:\n{read}"
 
     def test_scoring_agrees_with_drawing(self) -> None:
-        """A free run's log joint, step by step, is that of the same values teacher-forced; the guide's too."""
+        """Free-running and teacher-forced log densities of the same values are equal, for model and guide."""
         model = self._model()
         data = self._data(model)
         context = {name: data[name] for name in model.context}
@@ -108,13 +110,13 @@ class FactorizationContract:
         self._close(drawn, _run(poutine.condition(model.guide, data=latents), data)[1])
 
     def test_the_log_joint_is_that_of_the_per_step_program(self) -> None:
-        """One site per variable scores as a loop over time with one site per step."""
+        """One site per variable has the log density of a loop over time with one site per step."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)
-        courses = {} if model.sums is None else model.sums.courses(self.steps)
+        courses = {} if model.sums is None else model.sums.state_sequences(self.steps)
         found = []
-        for place in range(max(map(len, courses.values()), default=1)):  # of discrete latents, one after the other
+        for place in range(max(map(len, courses.values()), default=1)):  # every state sequence of discrete latents
             told = {name: value[place].expand(self.batch, *value[place].shape) for name, value in courses.items()}
             sites: dict[str, Tensor] = {}
             for name, value in (latents | told).items():
@@ -128,7 +130,7 @@ class FactorizationContract:
         self._close({"joint": torch.stack(found).logsumexp(0)}, {"joint": vectorised})
 
     def test_a_sequence_scores_the_same_whatever_is_beside_it(self) -> None:
-        """Of a model in training too, which scoring leaves as it is."""
+        """The other sequences of a batch do not matter, in training mode too, and scoring changes no buffer or mode."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)
@@ -141,7 +143,7 @@ class FactorizationContract:
         assert all(torch.equal(value, buffers[name]) for name, value in model.named_buffers())
 
     def test_every_size_may_be_one(self) -> None:
-        """One sequence, one step, one dimension."""
+        """The bound and a forecast are finite for one sequence, one step and one dimension."""
         model = self._model(1)
         data = self._data(model, 1, 2)
         observed = {name: v[:, :1] if name in model.observed else v for name, v in data.items()}
@@ -152,7 +154,7 @@ class FactorizationContract:
         assert all(torch.isfinite(value).all() for value in model.forecast(observed, 1).values())
 
     def test_padding_changes_nothing(self) -> None:
-        """Every sequence of a ragged batch scores as it does alone, whatever stands at the padded steps."""
+        """Every sequence of a ragged batch scores as it does alone, for any values at the padded steps."""
         model = self._model()
         lengths = torch.arange(self.batch) % self.steps + 1
         data = self._data(model)
@@ -171,7 +173,7 @@ class FactorizationContract:
             self._close({name: log[i : i + 1] for name, log in guide_logs.items()}, guided)
 
     def test_missing_entries_leave_the_likelihood(self) -> None:
-        """A mask that hides nothing changes nothing; hidden data, whatever stands there, have likelihood 1."""
+        """A mask that hides nothing changes nothing; hidden data have likelihood 1 for any values."""
         model = self._model()
         data = self._data(model)
         latents, guided = _run(model.guide, data)
@@ -186,7 +188,7 @@ class FactorizationContract:
         assert all((terms.log_likelihood[name] == 0).all() for name in names)
 
     def test_the_gradient_is_that_of_the_bound(self) -> None:
-        """With the same noise, the bound moves as its gradient says, where entries are missing too."""
+        """With the same noise, the gradient matches a finite difference of the bound, with missing entries too."""
         model = self._model()
         data: Any = self._data(model)
         names = [name for name in model.observed if self._local(model, name)]
@@ -215,7 +217,7 @@ class FactorizationContract:
         assert not flat - self.still, f"no gradient reaches {', '.join(sorted(flat - self.still))}"
 
     def test_a_loaded_model_gives_the_same_seeded_draws(self, tmp_path: Path) -> None:
-        """The weights on the disk are all there is to a model."""
+        """Saved weights determine the model."""
         model, other = self._model(), self._model()
         save_weights(model, tmp_path / "weights.safetensors")
         load_weights(other, tmp_path / "weights.safetensors")
@@ -227,7 +229,7 @@ class FactorizationContract:
             assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
 
     def test_a_bound_stays_on_its_device(self) -> None:
-        """On a GPU that is only said to be one it is the processor's, and nothing is brought there anew."""
+        """On a simulated GPU the bound equals the CPU's, and a second evaluation copies nothing to the device."""
         model = self._model()
         data = self._data(model)
         torch.manual_seed(1)
@@ -235,7 +237,7 @@ class FactorizationContract:
         with on_device() as traffic:
             move(model)
             there = {name: value.to("cuda") for name, value in data.items()}
-            for _ in range(2):  # what does not change is brought there in the first
+            for _ in range(2):  # the first pass copies constants to the device
                 traffic.clear()
                 torch.manual_seed(1)
                 bound = SequenceELBO().terms(model, there).bound
@@ -249,7 +251,7 @@ class FactorizationContract:
 
     @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU is here")
     def test_a_bound_on_a_gpu_is_the_processors(self) -> None:
-        """With the same noise, and so is its gradient."""
+        """With the same noise, a bound and its gradient are equal on GPU and CPU."""
         model = self._model()
         data = self._data(model)
         found: list[dict[str, Tensor]] = []
@@ -264,21 +266,21 @@ class FactorizationContract:
         self._close(found[1], found[0])
 
     def test_the_audit_says_what_is_published(self) -> None:
-        """The guide misses `missing` of the exact posterior's dependencies, and nothing else."""
+        """The guide ignores exactly the dependencies of the exact posterior in `missing`."""
         if self.missing is None:
             pytest.skip("nothing is published on the guide (missing = None)")
         model = self.build(1)
         found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing
         assert found == dict(self.missing), f"the guide misses {found}, published is {dict(self.missing)}"
 
-    def test_its_linear_gaussian_twin_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so(self) -> None:
-        """The same equations with known evidence: the best guide's gap is zero if and only if it is exact."""
+    def test_its_linear_gaussian_surrogate_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so(self) -> None:
+        """On a surrogate with known evidence, the best guide's gap is zero if and only if the guide is exact."""
         model = self._model()
         if model.context:
             pytest.skip("the evidence given context is not known")
-        # where a diagonal covariance is no restriction
+        # size 1, for which a diagonal covariance is no restriction
         sizes = {name: size if name in model.summed else 1 for name, size in model.sizes.items()}
-        pair = twin(model.generative, model.inference, sizes, self.steps, observed=model.observed)
+        pair = linear_gaussian_surrogate(model.generative, model.inference, sizes, self.steps, observed=model.observed)
         oracle = Oracle(pair, self.steps)
         data = {name: pair.sample(self.batch, self.steps)[name] for name in model.observed}
         if pair.summed:
@@ -290,7 +292,7 @@ class FactorizationContract:
         assert (gap < 1e-6) == exact, f"the audit says exact: {exact}, but the best guide's gap is {gap:.2g} nats"
 
     def test_the_evidence_lies_between_its_annealed_bounds(self) -> None:
-        """Of draws of the model, on average: below from the guide, above from the latents that they were made with."""
+        """On draws of the model, the average bound from the guide is below the bound from the true latents."""
         model, count = self._model(), 8
         if not model.latents or not model.likelihood:
             pytest.skip("no latents are drawn, or the data are functions of them")
@@ -304,7 +306,7 @@ class FactorizationContract:
         assert gap.mean() > -4 * gap.std() / math.sqrt(count) - self.tolerance
 
     def test_training_stays_finite(self) -> None:
-        """A run of `fit` on `data`, in single precision, and forecasts after it, have no NaN."""
+        """Weights after `fit` on `data`, in single precision, and forecasts from them are finite."""
         size = 4
         model, data = self.build(size), self.data(size)
         if not isinstance(data, Mapping):
@@ -319,22 +321,26 @@ class FactorizationContract:
         }
         assert all(torch.isfinite(value).all() for value in model.forecast(past, 2).values())
 
-    # ---------------------------------------------------------------------------------------------- what they use
+    # -------------------------------------------------------------------------------------------------- helpers
 
     def _sums_to_the_evidence(
         self, pair: DynamicalVAE, oracle: Oracle, data: dict[str, Tensor], draws: int = 500
     ) -> None:
-        """With states summed out, weights of latents from about the posterior average to the evidence."""
+        """With states summed out, importance weights from a widened posterior average to the evidence."""
         mean, covariance = oracle.posterior(data)
-        law = torch.distributions.MultivariateNormal(mean, 1.5 * covariance) if pair.latents else None
-        drawn = torch.zeros(draws, self.batch, 0, dtype=torch.float64) if law is None else law.sample((draws,))
+        distribution = torch.distributions.MultivariateNormal(mean, 1.5 * covariance) if pair.latents else None
+        drawn = (
+            torch.zeros(draws, self.batch, 0, dtype=torch.float64)
+            if distribution is None
+            else distribution.sample((draws,))
+        )
         widths = [pair.sizes[name] * (self.steps if self._local(pair, name) else 1) for name in pair.latents]
         latents = {
             name: value.flatten(0, 1).unflatten(1, (self.steps, -1)) if self._local(pair, name) else value.flatten(0, 1)
             for name, value in zip(pair.latents, drawn.split(widths, -1) if widths else (), strict=True)
         }
         joint = torch.stack(list(pair.log_joint(repeat(data, draws), latents).values())).sum(0)
-        weights = joint.unflatten(0, (draws, -1)) - (0 if law is None else law.log_prob(drawn))
+        weights = joint.unflatten(0, (draws, -1)) - (0 if distribution is None else distribution.log_prob(drawn))
         ratio = (weights - oracle.evidence(data)).exp()
         error = ratio.std(0) / math.sqrt(draws)
         assert ((ratio.mean(0) - 1).abs() <= 5 * error + 1e-9).all(), f"the sum is {ratio.mean(0)} of the evidence"
@@ -343,7 +349,7 @@ class FactorizationContract:
         return self.build(size).double().eval()
 
     def _data(self, model: DynamicalVAE, batch: int = 0, steps: int = 0, names: Any = ()) -> dict[str, Tensor]:
-        """Values of the data and the context, or of other variables; where they have to be, draws of the model."""
+        """Return random values of data and context, or of `names`; data with a support are drawn from the model."""
         batch, steps = batch or self.batch, steps or self.steps
         found = {
             name: torch.randn(batch, *([steps] * self._local(model, name)), model.sizes[name], dtype=torch.float64)
@@ -356,7 +362,7 @@ class FactorizationContract:
         return found
 
     def _mask(self, model: DynamicalVAE, name: str, values: Tensor) -> Tensor:
-        """Some entries of the data, of what is one event all or none."""
+        """Return a random mask of the data, with all or none of the coordinates of one event."""
         seen = torch.rand_like(values) < 0.6
         for event in map(list, model.generator[name].events):
             seen[..., event] = seen[..., event[:1]]
@@ -367,11 +373,11 @@ class FactorizationContract:
         return (model.generative if generative else model.inference).local(name)
 
     def _reads(self, conditional: Conditional, values: Mapping[str, Tensor], name: str) -> Tensor:
-        """(T or 1, S or 1) True where the parameters depend on the parent."""
+        """Return where the parameters depend on the parent, (T or 1, S or 1)."""
 
         def parameters(value: Tensor) -> Tensor:
             out = torch.cat(conditional({**values, name: value}, 1, self.steps), dim=-1)
-            mixed = out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)  # one number a step is enough
+            mixed = out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)  # one number per step suffices
             return mixed.flatten()
 
         jacobian = torch.autograd.functional.jacobian(parameters, values[name])  # (T, 1, S, D) or (T, 1, D)
@@ -386,7 +392,7 @@ class FactorizationContract:
 
 @torch.no_grad()
 def _run(program: Callable[..., Any], *args: Any, **kwargs: Any) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Values and log densities (B,) of a program's sites."""
+    """Return the values and log densities (B,) of a program's sites."""
     trace = poutine.trace(program).get_trace(*args, **kwargs)
     trace.compute_log_prob()
     sites: dict[str, Any] = {n: s for n, s in trace.nodes.items() if s["type"] == "sample" and n != "sequences"}

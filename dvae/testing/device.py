@@ -1,11 +1,12 @@
-"""A GPU that is only said to be one: what a program puts there, brings there and waits for, told without one.
+"""A simulated GPU, which lists the transfers and synchronisations of a program on a machine without a GPU.
 
-Torch's own fakes (`FakeTensorMode`) have no values, so that a program that looks at one goes no further, and a build
-without CUDA has no gradients of them. Here a tensor of the device is one of the processor under another name: its
-operations run and give what they do there, one that mixes the two is refused as CUDA refuses it, and each copy between
-the two is listed, with each value that a program waits for.
+Torch's own fakes (`FakeTensorMode`) have no values, so a program that reads a value fails. Without a CUDA build they
+also have no gradients. Here a tensor on the device wraps a tensor on the CPU, and its operations run there. An
+operation that mixes the two devices raises an error, as in CUDA. Each copy between the devices is listed, and so is
+each value on which the program synchronises.
 
-A real GPU draws other random numbers than the processor; under `SameNoise` it has the processor's, and gives the same.
+A real GPU draws other random numbers than the CPU. Under `SameNoise` it uses the random numbers of the CPU, so results
+agree.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from typing_extensions import override
 
 aten: Any = torch.ops.aten
-READS = {  # CUDA waits for their values, for the shapes that these have, or for the errors that they tell
+READS = {  # CUDA synchronises to read the values, shapes or error codes of these operations
     aten._local_scalar_dense,
     aten.is_nonzero,
     aten.equal,
@@ -43,9 +44,9 @@ BENEATH = {"torch", "pyro", "zuko", "roma"}
 
 
 class OnDevice(Tensor):
-    """A tensor of the processor that says that it is on the device."""
+    """A CPU tensor that reports that it is on the device."""
 
-    # of a number that no machine has, so that nothing is mistaken for what a real one keeps
+    # a device number that no machine has, so no cache of a real device is used by mistake
     device: ClassVar[torch.device] = torch.device("cuda", 127)  # type: ignore[misc]
     own: Tensor
 
@@ -66,15 +67,15 @@ class OnDevice(Tensor):
     @classmethod
     @override
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        raise RuntimeError(f"{func} of a tensor on {cls.device}, a device only within on_device()")
+        raise RuntimeError(f"{func} of a tensor on {cls.device}, which exists only in a block of on_device()")
 
 
 class Traffic(TorchDispatchMode):
-    """What goes between processor and device, as "file:line operation" of where it comes from.
+    """Transfers between CPU and device, each as "file:line operation" of its origin.
 
     Attributes:
-        reads: what is brought to the processor, or waited for: values, and shapes and errors that depend on them.
-        uploads: what is brought to the device.
+        reads: copies to the CPU, and synchronisations: values, and shapes and errors that depend on values.
+        uploads: copies to the device.
     """
 
     def __init__(self) -> None:
@@ -84,7 +85,7 @@ class Traffic(TorchDispatchMode):
         self.within = False
 
     def clear(self) -> None:
-        """Forgets what it has listed."""
+        """Clear both lists."""
         self.reads.clear()
         self.uploads.clear()
 
@@ -108,7 +109,7 @@ class Traffic(TorchDispatchMode):
             here = []
         elif there and packet in INDEXED:
             places = [place for place in args[1] if place is not None]
-            fill = len(args) > 2 and args[2].numel() == 1  # under a mask, which needs no places
+            fill = len(args) > 2 and args[2].numel() == 1  # filling under a mask needs no indices
             if any(place.dtype == torch.bool for place in places) and not fill:
                 self.reads.append(_place(packet))
             if brought := [place for place in places if not isinstance(place, OnDevice)]:
@@ -116,23 +117,25 @@ class Traffic(TorchDispatchMode):
                 here = [value for value in here if all(value is not place for place in brought)]
         elif there and packet in READS:
             self.reads.append(_place(packet))
-        # what torch makes within a function of the device's tensors is there too
+        # tensors that torch creates in a function of device tensors are on the device too
         within = self.within and not tensors and device is not None
         if not (there or asked or within):
             return func(*args, **kwargs)
         if here:
             shapes = ", ".join(str(tuple(value.shape)) for value in here)
-            raise RuntimeError(f"{packet} of tensors on {OnDevice.device} and others on the processor, {shapes}")
+            raise RuntimeError(
+                f"{packet} of tensors on {OnDevice.device} and on the CPU {shapes}; move them to one device"
+            )
         own = [_mapped(value, OnDevice, lambda v: v.own) for value in (*args, *kwargs.values())]
         found = func(*own[: len(args)], **dict(zip(kwargs, own[len(args) :], strict=True)))
-        if torch.Tag.inplace_view in func.tags:  # the name has a shape of its own
+        if torch.Tag.inplace_view in func.tags:  # the wrapper stores its own shape
             with no_dispatch():
                 func(*args, **kwargs)
         return _mapped(found, Tensor, lambda value: there[id(value)] if id(value) in there else OnDevice(value))
 
 
 class _Moves(TorchFunctionMode):
-    """Moves that torch leaves out where both ends are on the processor."""
+    """Mode for moves between devices, which torch skips because both tensors are on the CPU."""
 
     def __init__(self, traffic: Traffic) -> None:
         super().__init__()
@@ -145,7 +148,7 @@ class _Moves(TorchFunctionMode):
             return self._moved(func, args[0], [*args[1:], *kwargs.values()])
         if func in (Tensor.numpy, Tensor.__array__, Tensor.tolist) and isinstance(args[0], OnDevice):
             if func is not Tensor.tolist:
-                raise TypeError(f"a tensor on {OnDevice.device} has no array; bring it to the processor first")
+                raise TypeError(f"a tensor on {OnDevice.device} has no array; move it to the CPU first")
             self.traffic.reads.append(_place("tolist"))
             return args[0].own.tolist()
         before, self.traffic.within = self.traffic.within, any(isinstance(value, OnDevice) for value in _tensors(args))
@@ -182,14 +185,14 @@ def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
 
 
 def _mapped(value: Any, kind: type[Tensor], to: Callable[[Any], Tensor]) -> Any:
-    """The value with tensors of a kind replaced in it; torch's own, for trees of any kind, takes most of a step."""
+    """Return the value with its tensors of a kind replaced; torch's own tree map would take most of a step's time."""
     if isinstance(value, kind):
         return to(value)
     return type(value)([_mapped(each, kind, to) for each in value]) if isinstance(value, list | tuple) else value
 
 
 def _place(what: Any) -> str:
-    """Where an operation of a program comes from: the last line that is none of these libraries' or of this file."""
+    """Return the origin of an operation: the innermost line outside this file and the libraries in `BENEATH`."""
     frame: Any = sys._getframe(1)
     while frame.f_back and (
         (name := frame.f_globals.get("__name__", "")) == __name__ or name.partition(".")[0] in BENEATH
@@ -200,7 +203,7 @@ def _place(what: Any) -> str:
 
 @contextmanager
 def on_device() -> Iterator[Traffic]:
-    """Within it, "cuda" is a device, and what goes there and back is listed.
+    """Simulate the device "cuda" in the block, and list the transfers to and from it.
 
     Example:
         >>> import torch
@@ -213,9 +216,9 @@ def on_device() -> Iterator[Traffic]:
     """
     lifting = torch._C._only_lift_cpu_tensors()
     with ExitStack() as stack:
-        for name in ("_lazy_init", "get_rng_state", "set_rng_state"):  # all draws are those of the processor
+        for name in ("_lazy_init", "get_rng_state", "set_rng_state"):  # all draws use the random state of the CPU
             stack.enter_context(mock.patch.object(torch.cuda, name, return_value=torch.empty(0)))
-        torch._C._set_only_lift_cpu_tensors(True)  # so that torch.tensor(..., device=...) brings them there by `to`
+        torch._C._set_only_lift_cpu_tensors(True)  # so that torch.tensor(..., device=...) moves them with `to`
         stack.callback(torch._C._set_only_lift_cpu_tensors, lifting)
         traffic = stack.enter_context(Traffic())
         stack.enter_context(_Moves(traffic))
@@ -223,9 +226,9 @@ def on_device() -> Iterator[Traffic]:
 
 
 class SameNoise(TorchDispatchMode):
-    """Within it, random numbers of a GPU are drawn on the processor, by its seed, and brought there.
+    """Mode that draws the random numbers of a GPU on the CPU, from the CPU's seed, and copies them to the GPU.
 
-    A generator of the GPU is refused, and what is drawn into `out=` is not brought.
+    It does not support generators of the GPU, and does not copy draws into `out=`.
     """
 
     @override
@@ -233,7 +236,7 @@ class SameNoise(TorchDispatchMode):
         kwargs = dict(kwargs or {})
         device = next((value.device for value in _tensors((*args, *kwargs.values()))), None)
         device = torch.device(kwargs.get("device") or device or "cpu")
-        # cuDNN's networks and fused attention have the tag for their dropout, and no kernel here
+        # cuDNN networks and fused attention have this tag because of dropout, but no CPU kernel
         here = torch._C._dispatch_has_computed_kernel_for_dispatch_key(func.name(), "CPU")
         if torch.Tag.nondeterministic_seeded not in func.tags or device.type == "cpu" or not here:
             return func(*args, **kwargs)
@@ -247,7 +250,7 @@ class SameNoise(TorchDispatchMode):
 
 
 def move(module: nn.Module) -> nn.Module:
-    """Moves the parameters and buffers of a module to the device, as `to` does, and nothing else."""
+    """Move the parameters and buffers of a module to the device, as `to` does, and nothing else."""
     moved: dict[int, Any] = {}
     for part in module.modules():
         for name, value in part._parameters.items():

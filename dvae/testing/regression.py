@@ -1,27 +1,27 @@
 """Regression tests of evidence bounds: has a change of the code made a model worse, beyond Monte Carlo error?
 
-The data are fixed, so what is compared is the mean bound of these very sequences, before and after: the spread between
-sequences is no source of error, the draws of the guide are the only one. The record keeps the mean over sequences of
-each of its K draws, b_k. New draws b'_k are taken from the same seeds, one for each k, and the differences
+The data are fixed, and the test compares the mean bound of these sequences before and after a change. The draws of the
+guide are therefore the only source of error; the spread between sequences is not one. The record keeps the mean over
+sequences of each of its K draws, b_k. New draws b'_k use the same seeds, one for each k. The differences
 d_k = b'_k - b_k are K independent numbers with mean
 
-    E d_k = mean over sequences of (new bound - old bound),
+    E d_k = mean over sequences of (new bound - old bound).
 
-so that t = mean(d) sqrt(K) / sd(d) follows Student's t with K - 1 degrees of freedom when nothing has changed and d_k,
-a mean over sequences, is normal. Failing where t is below the alpha quantile then fails with probability alpha,
-whatever draw k before and draw k after have to do with each other: equal seeds may couple them (an unchanged model
-gives d = 0), decouple them (another network takes its random numbers in another order) or oppose them (a latent
-changed its sign). Standard errors added in squares would be right in the second case only. Had all draws one stream of
-random numbers, one number more would couple draw k to draw k - 1, and the d_k to each other.
+If nothing has changed and d_k, a mean over sequences, is normal, then t = mean(d) sqrt(K) / sd(d) follows Student's t
+with K - 1 degrees of freedom. The test fails if t is below the alpha quantile, hence with probability alpha. This holds
+for any dependence of the new draw k on the old draw k. Equal seeds may couple them (an unchanged model gives d = 0),
+decouple them (another network uses its random numbers in another order), or oppose them (a latent changed its sign).
+Adding squared standard errors would be correct only in the second case. With a single stream of random numbers, one
+additional number would couple draw k to draw k - 1, and the d_k to each other.
 
-Where d is skewed upwards, K draws often miss its tail, and t is low too often: for instance where a sampled KL, whose
-draws have a long lower tail, becomes analytic. t is then compared with that of K log-normal draws as well. Their
-log-scale is the least one at which a sample skewness as low as that of d has probability .05, and at most 1.5. So the
-assumption is that d is not more skewed than such log-normal draws. Simulated rates of false alarms at alpha = .001 are
-at most .003 from 20 draws on, where Student's t alone has .12.
+If d is skewed upwards, K draws often miss its tail, and t is too often low. An example is a sampled KL, whose draws
+have a long lower tail, that becomes analytic. t is then also compared with the t of K log-normal draws. Their log-scale
+is the smallest one, up to 1.5, at which a sample skewness as low as the skewness of d has probability .05. The test
+thus assumes that d is not more skewed than these log-normal draws. Simulated rates of false alarms at alpha = .001 are
+at most .003 from 20 draws on; with Student's t alone, the rate is .12.
 
-A fall of delta nats is found with probability 1 - beta where delta = (t_{1-alpha} + t_{1-beta}) sd(d) / sqrt(K): four
-times the draws halve it. 20 draws hardly show whether d is skewed: delta is twice as large there.
+A loss of delta nats is found with probability 1 - beta if delta = (t_{1-alpha} + t_{1-beta}) sd(d) / sqrt(K). Four
+times as many draws halve delta. With 20 draws the skewness of d is uncertain, and delta is twice as large.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ from ..program.conditional import evaluating
 
 Floats = NDArray[np.float64]
 
-# Relative error that arithmetic alone may leave in a bound, on another machine or in another order of sums (float32).
+# Relative rounding error of a bound in float32, on another machine or with another order of summation.
 ROUNDING = 1e-6
-# Relative difference up to which data are the same: made on another machine, they may differ in their last digits.
+# Relative difference up to which data are equal: generated on another machine, they may differ in their last digits.
 SAME_DATA = 1e-5
 
 
 @dataclass(frozen=True)
 class Record:
-    """Bounds of B sequences from K draws, in nats, as a file keeps them.
+    """Stored bounds of B sequences from K draws, in nats.
 
     Args:
-        bound: (B,) means over draws.
-        error: (B,) their Monte Carlo standard errors.
-        draws: (K,) means over sequences.
-        data: name to shape, root mean squares and checksums of the data (see `checksums`).
+        bound: means over draws, (B,).
+        error: Monte Carlo standard errors of `bound`, (B,).
+        draws: means over sequences, (K,).
+        data: {name: shape, root mean squares and checksums of the data}, as in `checksums`.
     """
 
     bound: Floats
@@ -74,24 +74,24 @@ class Record:
 
     @classmethod
     def of(cls, bounds: Floats, data: dict[str, Any]) -> Record:
-        """The record of bounds (K, B)."""
+        """Return the record of bounds (K, B)."""
         return cls(bounds.mean(0), bounds.std(0, ddof=1) / math.sqrt(len(bounds)), bounds.mean(1), data)
 
     @property
     def mean(self) -> float:
-        """The mean bound."""
+        """Mean bound."""
         return float(self.draws.mean())
 
     @property
     def mean_error(self) -> float:
-        """Its Monte Carlo standard error."""
+        """Monte Carlo standard error of the mean bound."""
         return _standard_error(self.draws)
 
     def __str__(self) -> str:
         return f"{self.mean:.6g} ± {self.mean_error:.2g} nats a sequence"
 
     def dumps(self) -> str:
-        """As JSON, a line for each sequence."""
+        """Return the record as JSON, with a line for each sequence."""
         rows = [[_rounded(b, 8), _rounded(e, 3)] for b, e in zip(self.bound, self.error, strict=True)]
         table = ",\n".join(f"    {json.dumps(row)}" for row in rows)
         head = {
@@ -105,10 +105,10 @@ class Record:
 
     @classmethod
     def loads(cls, text: str) -> Record:
-        """What `dumps` wrote.
+        """Return the record in a text written by `dumps`.
 
         Raises:
-            ValueError: anything else.
+            ValueError: the text is not a record.
         """
         try:
             stored = json.loads(text)
@@ -117,19 +117,19 @@ class Record:
             keys = ("shape", "rms", "checksums")
             data = {name: {key: entry[key] for key in keys} for name, entry in stored["data"].items()}
         except (KeyError, TypeError, AttributeError, ValueError) as problem:
-            raise ValueError(f"no record of bounds: {problem!r}") from problem
+            raise ValueError(f"not a record of bounds: {problem!r}") from problem
         if len(draws) != stored.get("particles") or len(draws) < 2:
-            raise ValueError(f"no record of bounds: {len(draws)} draws of {stored.get('particles')} particles")
+            raise ValueError(f"not a record of bounds: {len(draws)} draws of {stored.get('particles')} particles")
         return cls(bound, error, draws, data)
 
 
 @dataclass(frozen=True)
 class Change:
-    """New bounds against old ones of the same sequences, paired by draw.
+    """Comparison of new and old bounds of the same sequences, paired by draw.
 
     Args:
-        old, new: what is compared.
-        alpha: probability of calling a model worse (or better) that is not.
+        old, new: records to compare.
+        alpha: probability of calling an unchanged model worse (or better).
     """
 
     old: Record
@@ -138,7 +138,7 @@ class Change:
 
     @property
     def difference(self) -> float:
-        """New minus old mean bound."""
+        """Difference of the mean bounds, new minus old."""
         return self.new.mean - self.old.mean
 
     @property
@@ -148,7 +148,7 @@ class Change:
 
     @property
     def p_worse(self) -> float:
-        """Probability of so low a difference when the bound has not fallen."""
+        """Probability of a difference this low if the bound has not fallen."""
         return self._p(1)
 
     @property
@@ -191,15 +191,15 @@ class Change:
 
 @dataclass
 class ElboRegression:
-    """The fixture `elbo_regression`.
+    """Fixture `elbo_regression`.
 
     Args:
-        folder: where the test's records lie.
-        test: name of the test, that of its record unless `check` gives one.
-        update: renew records.
-        strict: a record that is missing is a failure.
-        note: takes a line for the terminal's summary.
-        owners: the tests whose records have been read or written, by file.
+        folder: folder of the test's records.
+        test: name of the test, and of its record unless `check` gives another.
+        update: whether to renew records.
+        strict: whether a missing record is a failure.
+        note: function that adds a line to the terminal summary.
+        owners: {file: test whose record it contains}, for the records read or written so far.
     """
 
     folder: Path
@@ -221,38 +221,37 @@ class ElboRegression:
         alpha: float = 0.001,
         bound: Callable[[Any, int], Tensor] | None = None,
     ) -> None:
-        """Passes unless the mean bound of the data's sequences is significantly below the one on record.
+        """Check that the mean bound of the sequences is not significantly below the recorded one.
 
-        The first use writes the record, which is to be committed. A bound that is significantly better passes, and the
-        terminal's summary says so. Draws are taken in evaluation mode and from seeds that belong to the name; torch's
-        random state is left as it was.
+        The first use writes the record, which must be committed. A significantly better bound passes, and the terminal
+        summary reports it. Draws use evaluation mode and seeds derived from the name of the record. torch's random
+        state is restored.
 
         Args:
             model, guide: `DynamicalVAE.model` and `.guide`, or any pair of Pyro callables with sequences in their
                 rightmost plate.
-            data: what they are called with, such as x (B, T, D), a batch, or `Windows.all()`.
-            name: of the record; the test's own if not given.
-            particles: K, draws of every sequence. The error falls with its square root.
-            alpha: probability of failing when the bound has not fallen.
-            bound: another one than the evidence lower bound of model and guide: a function of the data and of the seed
-                of a draw that gives (B,), such as
-                `lambda x, seed: dvae.annealed_bound(model, x, 10, seed=seed).bound`.
+            data: argument of model and guide, such as x (B, T, D), a batch, or `Windows.all()`.
+            name: name of the record; by default the name of the test.
+            particles: number K of draws of every sequence. The error falls with its square root.
+            alpha: probability of failing if the bound has not fallen.
+            bound: function that replaces the evidence lower bound of model and guide. It takes the data and the seed of
+                a draw and returns (B,), such as `lambda x, seed: dvae.annealed_bound(model, x, 10, seed=seed).bound`.
 
         Raises:
             AssertionError: the bound fell; old, new, difference, error and the worst sequences are printed.
-            ValueError: the record is of other data or of another number of particles, or damaged, or belongs to
-                another test; bounds that are not finite or not one for each sequence; particles below 2; alpha not
-                between 0 and 0.5.
+            ValueError: the record is of other data or another number of particles, is damaged, or belongs to another
+                test; bounds are not finite or not one for each sequence; `particles` is below 2; `alpha` is not between
+                0 and 0.5.
         """
         __tracebackhide__ = True
         if particles < 2:
-            raise ValueError(f"particles is at least 2, for an estimate of the Monte Carlo error; got {particles}")
+            raise ValueError(f"particles must be at least 2 to estimate the Monte Carlo error, got {particles}")
         if not 0 < alpha < 0.5:
-            raise ValueError(f"alpha is a probability of false alarms, between 0 and 0.5; got {alpha}")
+            raise ValueError(f"alpha, the probability of false alarms, must be between 0 and 0.5, got {alpha}")
         stem = re.sub(r"[^\w.=-]+", "_", self.test if name is None else name).strip("_")
         path = self._claim(self.folder / f"{stem}.json")
         if self.strict and not self.update and not path.exists():
-            raise AssertionError(f"there is no record {_shown(path)}; run without --elbo-strict, and commit it")
+            raise AssertionError(f"record {_shown(path)} is missing; run without --elbo-strict, and commit it")
         bounds = measure(model, guide, data, particles, zlib.crc32(stem.encode()), bound)
         new = Record.of(bounds, checksums(data, bounds.shape[1]))
         if not path.exists():
@@ -308,15 +307,15 @@ def measure(
     seed: int,
     bound: Callable[[Any, int], Tensor] | None = None,
 ) -> Floats:
-    """Bounds (K, B) of single draws, in evaluation mode; torch's random state is left as it was.
+    """Return the bounds (K, B) of single draws, in evaluation mode; torch's random state is restored.
 
     Args:
-        model, guide, data, bound: as of `ElboRegression.check`.
-        particles: K.
-        seed: of the draws; each has one of its own, whatever the others took.
+        model, guide, data, bound: as in `ElboRegression.check`.
+        particles: number K of draws.
+        seed: seed from which each draw gets its own seed, independent of the other draws.
 
     Raises:
-        ValueError: bounds that are not finite, or not one for each sequence.
+        ValueError: bounds are not finite, or not one for each sequence.
     """
     with torch.no_grad(), torch.random.fork_rng(range(torch.cuda.device_count())), ExitStack() as stack:
         for program in (model, guide):
@@ -350,12 +349,12 @@ def _one_each(bound: Any, data: Any) -> Floats:
 
 
 def checksums(data: Any, sequences: int) -> dict[str, Any]:
-    """Shape, and root mean square and checksum of every sequence, by variable.
+    """Return the shape, and the root mean square and checksum of every sequence, by variable.
 
     A checksum is a projection of the values onto fixed weights: unlike a hash, it can be compared with a tolerance.
 
     Raises:
-        ValueError: data that are no tensors, arrays or numbers, nor mappings or sequences of these.
+        ValueError: data are not tensors, arrays or numbers, nor mappings or sequences of these.
     """
 
     def table(values: Floats) -> dict[str, Any]:
@@ -387,7 +386,7 @@ def _leaves(data: Any, prefix: str = "") -> Iterator[tuple[str, Floats]]:
 
 
 def _other_data(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """What differs, or nothing."""
+    """Return the first difference of the data in words, or ""."""
     if old.keys() != new.keys():
         return f"it holds {', '.join(old)}, now there are {', '.join(new)}"
     for name, now in new.items():
@@ -400,7 +399,7 @@ def _other_data(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 
 
 def _studentized(draws: Floats) -> tuple[Floats, Floats]:
-    """The t statistic and the skewness of draws (..., K)."""
+    """Return the t statistic and the skewness of draws (..., K)."""
     mean = draws.mean(-1, keepdims=True)
     variance = np.maximum(((draws - mean) ** 2).mean(-1), 1e-200)
     return mean[..., 0] * np.sqrt((draws.shape[-1] - 1) / variance), ((draws - mean) ** 3).mean(-1) / variance**1.5
@@ -408,7 +407,7 @@ def _studentized(draws: Floats) -> tuple[Floats, Floats]:
 
 @cache
 def _skewed(count: int, sets: int = 10_000) -> tuple[Floats, Floats]:
-    """Skewness (S,) that .05 of the sets of log-normal draws are below, and sorted t statistics (S, sets), by scale."""
+    """Return the .05 quantile of skewness (S,) and the sorted t statistics (S, sets) of log-normal draws, by scale."""
     noise = np.random.default_rng(0).normal(size=(sets, count))
     scales = np.linspace(0.1, 1.5, 8)
     t, skewness = zip(*(_studentized(np.exp(s * noise) - math.exp(s**2 / 2)) for s in scales), strict=True)
@@ -432,6 +431,6 @@ def _shown(path: Path) -> Path:
 
 
 def _write(path: Path, text: str) -> None:
-    """Writes whole or not at all: other processes may read and write the same file."""
-    with files.written(path) as file:
+    """Write a file atomically, because other processes may read and write it."""
+    with files.atomic_write(path) as file:
         file.write(text.encode())

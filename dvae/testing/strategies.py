@@ -19,10 +19,10 @@ BACKWARD = {
 
 @st.composite
 def factorizations(draw: st.DrawFn) -> tuple[str, str]:
-    """Pairs (generative, inference) of equations, always valid together.
+    """Draw pairs (generative, inference) of equations that are valid together.
 
-    Variables are the observed x, the local latents z and (with two) u, and perhaps a static latent w. Factors
-    are written in random order, so not always in one in which they can be drawn. Some guides run backward in time.
+    Variables are the observed x, one or two local latents z and u, and possibly a static latent w. Factors are written
+    in random order, not always in their order of sampling. Some guides run backward in time.
 
     Example::
 
@@ -34,7 +34,7 @@ def factorizations(draw: st.DrawFn) -> tuple[str, str]:
     shared = ["w"] if draw(st.booleans()) else []
 
     order = draw(st.permutations([*latents, "x"]))
-    # Either all locals share one loop over time, or each reads the earlier ones at any step and its own past.
+    # Either all local variables share one loop over time, or each reads earlier ones at any step and its own past.
     layered = draw(st.booleans())
     generative = ["p(w)"] if shared else []
     for i, child in enumerate(order):

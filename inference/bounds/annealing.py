@@ -31,7 +31,7 @@ from ...program.batch import AnyBatch, repeat
 from ...program.conditional import like
 from ...program.model import DynamicalVAE
 from ..diagnostics.latents import joined, split
-from ..evaluation.held import reproducibly
+from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.result import progress_bar
 from .elbo import joint_and_guide, require_data, require_latents, require_likelihood
 
@@ -107,7 +107,8 @@ def annealed_bound(
             or latents are missing in the batch.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> x = model.sample(3, 4)["x"]
         >>> found = dvae.annealed_bound(model, x, temperatures=50)
         >>> bool((found.bound - dvae.Oracle(model, 4).evidence(x)).abs().max() < 1.0)
@@ -128,7 +129,7 @@ def annealed_bound(
     given = None if latents is None else _exact(model, data, latents)
     at_once = max(1, chunk // chains)
     found = []
-    with reproducibly(model, seed), progress_bar(progress) as bar:
+    with seeded_evaluation(model, seed), progress_bar(progress) as bar:
         for first in bar.track(range(0, size, at_once), description="annealing"):
             part = slice(first, first + at_once)
             start = None if given is None else {name: value[part] for name, value in given.items()}

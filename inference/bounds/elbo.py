@@ -1,6 +1,6 @@
 """Bounds on the log evidence, as terms per sequence.
 
-`SequenceELBO` is the evidence lower bound, with analytic KL terms wherever they are correct. `importance_bound` is the
+`SequenceELBO` is the evidence lower bound, with analytic KL terms wherever they are correct. `iwae_bound` is the
 IWAE bound (Burda et al., 2016, arXiv 1509.00519) with the Pareto diagnostic of its weights (Vehtari et al., 2024, arXiv
 1507.02646).
 """
@@ -23,13 +23,13 @@ from torch import Tensor
 from torch.distributions import kl_divergence
 
 from ...factorization.graph import analytic_kl
-from ...networks.loop import computing_once
+from ...locking import serialized
+from ...networks.loop import memoizing
 from ...program.batch import AnyBatch, repeat
 from ...program.conditional import like
 from ...program.groups import Groups
 from ...program.model import DynamicalVAE
 from ...program.rollout import Rollout, Sequence
-from ...turns import alone
 
 
 @dataclass
@@ -108,7 +108,7 @@ class SequenceELBO(ELBO):
             model: a `DynamicalVAE`, or a Pyro model that wraps its program.
             batch: batch as in `DynamicalVAE.model`.
             guide: guide; the model's own by default.
-            options: options of the program, such as `self_feeding`.
+            options: options of the program, such as `scheduled_sampling`.
 
         Raises:
             ValueError: when a site is scaled, or missing in guide or model.
@@ -136,8 +136,8 @@ class SequenceELBO(ELBO):
     def _get_trace(self, model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
         return _traces(model, guide, args, kwargs)
 
-    @computing_once()
-    @alone
+    @memoizing()
+    @serialized
     def _terms(self, model: Any, guide: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Terms:
         model_sites, guide_sites = map(sites_of, self._get_trace(model, guide, args, kwargs))
         for name in guide_sites:
@@ -319,7 +319,7 @@ KHAT_PARTICLES = 25
 
 
 @dataclass(frozen=True)
-class ImportanceBound:
+class IWAEBound:
     """IWAE bound of every sequence, with a diagnostic of the guide.
 
     Args:
@@ -336,9 +336,9 @@ class ImportanceBound:
 
 
 @torch.no_grad()
-def importance_bound(
+def iwae_bound(
     model: DynamicalVAE, batch: AnyBatch, particles: int = 100, *, chunk: int = 4096, **options: Any
-) -> ImportanceBound:
+) -> IWAEBound:
     """Return the IWAE bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
 
     Its mean rises with the number of particles, from the evidence lower bound at 1 to the log evidence. With fewer than
@@ -357,7 +357,7 @@ def importance_bound(
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
-        >>> dvae.importance_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
+        >>> dvae.iwae_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
         torch.Size([3])
     """
     if particles < 1:
@@ -368,7 +368,7 @@ def importance_bound(
         size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
         if not model.latents:
             evidence = _log_weights(model, data, options)
-            return ImportanceBound(evidence, torch.zeros_like(evidence), particles)
+            return IWAEBound(evidence, torch.zeros_like(evidence), particles)
         groups = Groups.of(data.group) if model.grouped and data.group is not None else None
         weights = partial(_repeated_weights, model, data, options)
         return importance_mean(weights, size, particles, chunk, groups)
@@ -380,7 +380,7 @@ def importance_mean(
     particles: int,
     chunk: int = 4096,
     groups: Groups | None = None,
-) -> ImportanceBound:
+) -> IWAEBound:
     """Return the log of the mean weight of every sequence, and the tail shape of the weights.
 
     Sequences that share latents have one joint weight, whose logarithm is divided equally among them.
@@ -399,8 +399,8 @@ def importance_mean(
         log_weights = groups.summed(log_weights)
     bound, khat = log_weights.logsumexp(0) - math.log(particles), _khat(log_weights)
     if groups is not None:
-        bound, khat = groups.dealt(bound), khat[groups.place]
-    return ImportanceBound(bound, khat, particles)
+        bound, khat = groups.split_evenly(bound), khat[groups.place]
+    return IWAEBound(bound, khat, particles)
 
 
 def _repeated_weights(model: DynamicalVAE, data: AnyBatch, options: Mapping[str, Any], count: int) -> Tensor:

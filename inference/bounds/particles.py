@@ -22,7 +22,7 @@ from torch import Tensor
 from ...distributions.base import Parameters
 from ...factorization.notation import Factor, Parent
 from ...networks.base import indicator, presence
-from ...networks.loop import Rows, computing_once, pick, select, valid_steps
+from ...networks.loop import Rows, memoizing, pick, select, valid_steps
 from ...program.batch import AnyBatch
 from ...program.conditional import Conditional, like
 from ...program.model import DynamicalVAE
@@ -31,7 +31,7 @@ from .elbo import require_data, require_likelihood
 
 
 @dataclass(frozen=True)
-class ParticleBound:
+class FIVOBound:
     """FIVO bound of every sequence, with statistics of its particles.
 
     Args:
@@ -48,9 +48,9 @@ class ParticleBound:
 
 
 @torch.no_grad()
-def particle_bound(
+def fivo_bound(
     model: DynamicalVAE, batch: AnyBatch, particles: int = 16, *, resample_below: float = 0.5, chunk: int = 4096
-) -> ParticleBound:
+) -> FIVOBound:
     """Return the FIVO bound: the log of a particle filter's estimate of p(x) per sequence, with the guide as proposal.
 
     exp(bound) is unbiased for p(x) with any number of particles, so on average the bound rises with their number to the
@@ -77,7 +77,7 @@ def particle_bound(
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
-        >>> dvae.particle_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
+        >>> dvae.fivo_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape
         torch.Size([3])
     """
     if not isinstance(particles, int) or particles < 1:
@@ -97,7 +97,7 @@ def particle_bound(
             part = Filter(model, some, particles).run(resample_below)
             parts.append((part.bound, part.effective, part.resamplings))
         bound, effective, resamplings = (torch.cat(found, dim=-1) for found in zip(*parts, strict=True))
-        return ParticleBound(bound + (0 if data.log_det is None else data.volume), effective, resamplings, particles)
+        return FIVOBound(bound + (0 if data.log_det is None else data.volume), effective, resamplings, particles)
 
 
 class Filter:
@@ -120,7 +120,7 @@ class Filter:
         self.statics: dict[str, Rows] = {}
         self.paths = {name: Rows([None] * self.known.length) for name in (*self._local(model.latents), *self.hidden)}
 
-    def run(self, resample_below: float) -> ParticleBound:
+    def run(self, resample_below: float) -> FIVOBound:
         """Run all steps. Afterwards `drawn` contains the draws of the surviving particles."""
         model, length, batch = self.model, self.known.length, self.known.batch
         shape = self.particles, batch
@@ -129,13 +129,15 @@ class Filter:
         resamplings = torch.zeros(batch, dtype=torch.long, device=bound.device)
         valid = None if self.known.lengths is None else valid_steps(self.known.lengths, length).t()
         effective: list[Tensor] = []
-        with computing_once():
+        with memoizing():
             guide = {name: self._law(model.encoder[name], self.known.values) for name in self._local(model.latents)}
             order = [name for block in model.generative.blocks for name in block.names]
             prior = {name: self._law(model.generator[name], self.shared) for name in self._local(order)}
         noise = {
-            name: law.conditional.law.noise((len(self.sequence), length, law.conditional.size), bound).unbind(1)
-            for name, law in guide.items()
+            name: distribution.conditional.head.noise(
+                (len(self.sequence), length, distribution.conditional.size), bound
+            ).unbind(1)
+            for name, distribution in guide.items()
         }
         data = {name: self._by_step(self.known.values[name]) for name in self._local(model.observed)}
         counted = {name: None if (m := self.known.mask(name)) is None else self._by_step(m) for name in prior}
@@ -153,7 +155,7 @@ class Filter:
             size = effective_size(log_weights)
             effective.append(size if valid is None else size.masked_fill(~valid[t], math.nan))
         log_weights = log_weights + self._draw_statics(late=True).view(shape)
-        return ParticleBound(bound + _log_mean(log_weights), torch.stack(effective), resamplings, self.particles)
+        return FIVOBound(bound + _log_mean(log_weights), torch.stack(effective), resamplings, self.particles)
 
     @property
     def drawn(self) -> dict[str, Tensor]:
@@ -185,17 +187,17 @@ class Filter:
         """Draw the latents at t, and return the log weights (N,) of the step."""
         total = like(self.model).new_zeros(len(self.sequence))
         history = {**data, **self.paths}
-        for name, law in guide.items():
-            parameters = law.step(t, history)
-            self.paths[name][t] = law.conditional.draw(parameters, noise[name][t])
-            total = total - _log_prob(law.conditional, parameters, self.paths[name][t], _at(counted[name], t))
-        for name, law in prior.items():
-            parameters = law.step(t, history)
+        for name, distribution in guide.items():
+            parameters = distribution.step(t, history)
+            self.paths[name][t] = distribution.conditional.draw(parameters, noise[name][t])
+            total = total - _log_prob(distribution.conditional, parameters, self.paths[name][t], _at(counted[name], t))
+        for name, distribution in prior.items():
+            parameters = distribution.step(t, history)
             value = data[name][t] if name in data else self.paths[name][t]
-            total = total + _log_prob(law.conditional, parameters, value, _at(counted[name], t))
+            total = total + _log_prob(distribution.conditional, parameters, value, _at(counted[name], t))
             if name in self.hidden:  # the model reads its own mean where x is missing
                 seen = self.known.observed[name][:, t].index_select(0, self.sequence)
-                self.paths[name][t] = torch.where(seen, value, law.conditional.mean(parameters))
+                self.paths[name][t] = torch.where(seen, value, distribution.conditional.mean(parameters))
         return total
 
     def _draw_statics(self, late: bool) -> Tensor:
@@ -205,7 +207,7 @@ class Filter:
             if not model.generative.local(name) and (name in self.late) == late:
                 conditional = model.encoder[name]
                 parameters = self._parameters(conditional, self.known.values)
-                noise = conditional.law.noise((len(self.sequence), conditional.size), total)
+                noise = conditional.head.noise((len(self.sequence), conditional.size), total)
                 self.statics[name] = Rows([conditional.draw(parameters, noise)])
                 total = total - _log_prob(conditional, parameters, self.statics[name][0])
         known = {**self.shared, **self.drawn}
@@ -230,7 +232,7 @@ class Filter:
             everywhere = conditional(given, size, self.known.length, lengths)
             return Stepwise(conditional, select([p.unbind(1) for p in everywhere], rows), [])
         state = conditional.start(given, size, self.known.length, lengths)
-        reads = [*live, conditional.factor.child] if conditional.law.residual else live
+        reads = [*live, conditional.factor.child] if conditional.head.residual else live
         return Stepwise(conditional, conditional.select(state, rows), reads)
 
     def _given(
@@ -344,7 +346,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
         ValueError: when the batch cannot be read.
     """
     run = model.rollout(batch)
-    instead = "use importance_bound"
+    instead = "use iwae_bound"
     if model.summed:
         return f"{', '.join(model.summed)} is summed out, exactly, and not followed by particles; {instead}"
     if run.groups is not None:
@@ -360,7 +362,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
             )
     hidden, late = _hidden(run), _late(model)
     if static := [name for name in hidden if not model.generative.local(name)]:
-        return f"a static variable has no missing entries in a particle bound, but {', '.join(static)} has"
+        return f"a static variable has no missing entries in a FIVO bound, but {', '.join(static)} has"
     latents = [name for name in model.latents if model.generative.local(name)]
     for equations, drawn in ((model.inference, latents), (model.generative, [*latents, *hidden])):
         for factor in equations.factors:

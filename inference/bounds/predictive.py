@@ -28,13 +28,13 @@ from torch import Tensor
 
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
-from .elbo import ImportanceBound, importance_mean, log_densities, require_likelihood, sites_of, total
+from .elbo import IWAEBound, importance_mean, log_densities, require_likelihood, sites_of, total
 
 
 @torch.no_grad()
 def predictive_bound(
     model: DynamicalVAE, batch: AnyBatch, observed: int, particles: int = 100, *, chunk: int = 4096
-) -> ImportanceBound:
+) -> IWAEBound:
     """Return a bound on the log density of the future under the model's forecast; see the module.
 
     Args:

@@ -25,13 +25,13 @@ from ...program.batch import AnyBatch
 from ...program.conditional import like
 
 
-class Redrawn(nn.Module):
+class RedrawnModel(nn.Module):
     """Model whose forecasts draw some latents from other distributions, for use with `evaluate`.
 
     Args:
         model: a `DynamicalVAE`.
-        laws: distribution of each coordinate of a latent, by name; it broadcasts to the latent. Every draw of the
-            latent is from it, even where the guide would infer it from the past.
+        distributions: distribution of each coordinate of a latent, by name; it broadcasts to the latent. Every draw of
+            the latent is from it, even where the guide would infer it from the past.
 
     Raises:
         ValueError: when a name is no latent of the model, or the latent depends on others.
@@ -39,23 +39,27 @@ class Redrawn(nn.Module):
 
     likelihood = False  # the scores are not those of the model itself
 
-    def __init__(self, model: Any, laws: Mapping[str, Distribution]) -> None:
+    def __init__(self, model: Any, distributions: Mapping[str, Distribution]) -> None:
         super().__init__()
-        for name, law in laws.items():
-            if not isinstance(law, Distribution) or law.event_shape:
-                raise ValueError(f"the law of {name} is {law!r}; expected that of one number, such as Normal(50., 7.)")
-        if not laws or not laws.keys() <= {*model.latents}:
+        for name, distribution in distributions.items():
+            if not isinstance(distribution, Distribution) or distribution.event_shape:
+                raise ValueError(
+                    f"the distribution of {name} is {distribution!r}; expected that of one number, such as Normal(50., "
+                    "7.)"
+                )
+        if not distributions or not distributions.keys() <= {*model.latents}:
             raise ValueError(
                 f"latents to draw from elsewhere are some of {', '.join(model.latents)}; got "
-                f"{', '.join(laws) or 'none'}"
+                f"{', '.join(distributions) or 'none'}"
             )
-        for name in laws:
+        for name in distributions:
             if parents := model.generative.factor(name).parents:
                 raise ValueError(
-                    f"{name} follows from {', '.join(parent.name for parent in parents)}, so that there is no one law "
+                    f"{name} follows from {', '.join(parent.name for parent in parents)}, so that there is no one "
+                    "distribution "
                     "to replace; this is for latents that are drawn by themselves, as in p(z)"
                 )
-        self.model, self.laws = model, dict(laws)
+        self.model, self.distributions = model, dict(distributions)
         self.generative, self.inference = model.generative, model.inference
 
     def is_drawn(self, means: bool = False) -> bool:
@@ -64,7 +68,7 @@ class Redrawn(nn.Module):
 
     def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> Mapping[str, Tensor]:
         """Return the model's forecast, with latents from the other distributions."""
-        with self.model.running(), _Redrawing(self.laws, like(self.model)):
+        with self.model.running(), _Redrawing(self.distributions, like(self.model)):
             found: Mapping[str, Tensor] = self.model.forecast(batch, horizon, samples, **options)
             return found
 
@@ -72,11 +76,11 @@ class Redrawn(nn.Module):
 class _Redrawing(Messenger):
     """Handler that draws the named sites from the given distributions, in the dtype and on the device of `kind`."""
 
-    def __init__(self, laws: Mapping[str, Distribution], kind: Tensor) -> None:
+    def __init__(self, distributions: Mapping[str, Distribution], kind: Tensor) -> None:
         super().__init__()
-        self.laws, self.kind = laws, kind
+        self.distributions, self.kind = distributions, kind
 
     def _pyro_sample(self, msg: Any) -> None:
-        if msg["name"] in self.laws and msg["value"] is None:
+        if msg["name"] in self.distributions and msg["value"] is None:
             shape = msg["fn"].batch_shape + msg["fn"].event_shape
-            msg["value"] = self.laws[msg["name"]].expand(shape).sample().to(self.kind)
+            msg["value"] = self.distributions[msg["name"]].expand(shape).sample().to(self.kind)

@@ -18,9 +18,9 @@ from ...networks.loop import valid_steps
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence as SequenceLaw
-from ..evaluation.held import on_device_of, refuse_non_finite
-from .elbo import SequenceELBO, importance_bound, site_log_prob, sites_of
-from .particles import particle_bound
+from ..evaluation.evaluation_windows import on_device_of, refuse_non_finite
+from .elbo import SequenceELBO, iwae_bound, site_log_prob, sites_of
+from .particles import fivo_bound
 
 _GUIDE_DRAWS = 8  # draws to average posterior means; the remaining noise is subtracted
 
@@ -40,9 +40,9 @@ def bounds(
     for part in parts:
         piece = on_device_of(model, batch.rows(part))
         terms = SequenceELBO().terms(model, piece)
-        draws = [importance_bound(model, piece, particles=particles) for _ in range(estimates)]
+        draws = [iwae_bound(model, piece, particles=particles) for _ in range(estimates)]
         values = torch.stack([draw.bound for draw in draws])
-        scores = {"ELBO": terms.bound, "importance bound": values.mean(0)}
+        scores = {"ELBO": terms.bound, "IWAE bound": values.mean(0)}
         for bound in scores.values():
             refuse_non_finite(name, "bound", bound.isfinite(), keys[part])
         scores["k-hat"] = torch.stack([draw.khat for draw in draws]).mean(0)
@@ -74,10 +74,10 @@ def filtered(
     """Return the FIVO bound in nats per sequence (N,)."""
     found = []
     for part in parts:
-        bound = particle_bound(model, on_device_of(model, batch.rows(part)), particles).bound
-        refuse_non_finite(name, "particle bound", bound.isfinite(), keys[part])
+        bound = fivo_bound(model, on_device_of(model, batch.rows(part)), particles).bound
+        refuse_non_finite(name, "FIVO bound", bound.isfinite(), keys[part])
         found.append(bound.double().cpu())
-    return {"particle bound": torch.cat(found).numpy()}
+    return {"FIVO bound": torch.cat(found).numpy()}
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:

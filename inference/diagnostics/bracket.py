@@ -4,10 +4,10 @@
                     + (the same with all edges - ELBO of the best semi-amortized guide)      missing edges
                     + (evidence - ELBO of the best semi-amortized guide with all edges)      family
 
-A semi-amortized guide is the model's own guide with free parameters for every sequence (`local_guide`). Amortisation is
-the cost of everything that the network fails to infer from the data, or cannot read. With all edges, the guide also
-reads the latents that the posterior depends on and its equations omit. The remaining gap is the cost of normals whose
-locations depend linearly on the added latents.
+A semi-amortized guide is the model's own guide with free parameters for every sequence (`semi_amortized_guide`).
+Amortisation is the cost of everything that the network fails to infer from the data, or cannot read. With all edges,
+the guide also reads the latents that the posterior depends on and its equations omit. The remaining gap is the cost of
+normals whose locations depend linearly on the added latents.
 
 The decomposition follows Cremer, Li and Duvenaud (2018, arXiv 1801.03558), whose approximation gap is the sum of the
 last two parts. Each part is at least 0, except for noise and an incomplete search, whose error counts in a later part.
@@ -31,29 +31,28 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, Listed, called, clusters, sequences, take_split
+from ...data.sequences import HeldOutWindows, Listed, axis_names, clusters, sequences, take_split
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
 from ..bounds.annealing import annealed_bound
 from ..bounds.elbo import joint_and_guide, require_latents, require_likelihood
-from ..bounds.local import local_guide, missing_latents, require_local
-from ..bounds.particles import obstacle, particle_bound
+from ..bounds.particles import fivo_bound, obstacle
+from ..bounds.semi_amortized import missing_latents, require_local, semi_amortized_guide
 from ..bounds.teacher_forced import length_of
-from ..evaluation.estimates import Crossed, Estimate, number
-from ..evaluation.held import clip_places, on_device_of, refuse_non_finite, reproducibly
+from ..evaluation.estimates import Estimate, TwoWayErrors, decimals, number
+from ..evaluation.evaluation_windows import clip_index, on_device_of, refuse_non_finite, seeded_evaluation
 from ..evaluation.record import Dims
-from ..evaluation.result import Result, Table, canvas, progress_bar
-from ..evaluation.uncertainty import decimals
+from ..evaluation.result import Result, Table, new_figure, progress_bar
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OWN, ALL = "local ELBO", "local ELBO, all arrows"
+OWN, ALL = "local ELBO", "local ELBO, all edges"
 BOUNDS = ("ELBO", "IWAE", "FIVO", OWN, ALL, "AIS", "upper")
 """Names of the bounds, from the loosest to the upper one."""
 PARTS = {
     "amortisation": ("ELBO", OWN),
-    "missing arrows": (OWN, ALL),
+    "missing edges": (OWN, ALL),
     "family": (ALL, "AIS"),
     "unknown": ("AIS", "upper"),
 }
@@ -88,10 +87,11 @@ class Bracket(Result):
         notes: bounds that are not available, with reasons, and warnings.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> found = dvae.bracket(model, model.sample(4, 4)["x"], temperatures=5, fitting=100, progress=False)
         >>> gap = found.gap("simulated")
-        >>> gap["amortisation"].mean > gap["missing arrows"].mean
+        >>> gap["amortisation"].mean > gap["missing edges"].mean
         True
     """
 
@@ -124,8 +124,8 @@ class Bracket(Result):
             raise KeyError(f"there is no {lacking[0]!r} of {data} data; there are {', '.join(known)}")
         values = known[bound] - (known[above] if above else 0.0)
         weights = self.frames if frame else np.ones(len(values))
-        places = clip_places(self.keys).numpy() if data == "real" else np.arange(len(values))
-        return Crossed.by_clip(values[None], weights, places).estimate()
+        places = clip_index(self.keys).numpy() if data == "real" else np.arange(len(values))
+        return TwoWayErrors.by_clip(values[None], weights, places).estimate()
 
     def gap(self, data: str = "real", *, frame: bool = False) -> dict[str, Estimate]:
         """Return the known parts of the gap between ELBO and evidence; see the module.
@@ -142,8 +142,8 @@ class Bracket(Result):
         return Group(*(self._bounds(data) for data in DATA), self._gap())
 
     def _bounds(self, data: str) -> Table:
-        clip, frame = called(self.data)
-        said = f"{len(self.keys)} sequences of {len({*clip_places(self.keys).tolist()})} {clip}s"
+        clip, frame = axis_names(self.data)
+        said = f"{len(self.keys)} sequences of {len({*clip_index(self.keys).tolist()})} {clip}s"
         title = f"{self.equations['generative']}\n{self.equations['inference']}\n{said}" if data == "real" else ""
         caption = f"mean ± standard error over sequences{f', clustered by {clip}' if data == 'real' else ''}"
         table = Table(title=title, caption="\n".join([caption, *(self.notes if data == "real" else ())]))
@@ -151,8 +151,8 @@ class Bracket(Result):
         for column in ("nats a sequence", "above the ELBO", f"nats a {frame}"):
             table.add_column(column, justify="right")
         for name in self.bounds[data]:
-            above = "–" if name == "ELBO" else told(self.estimate(name, "ELBO", data))
-            whole, each = (told(self.estimate(name, data=data, frame=frame)) for frame in (False, True))
+            above = "–" if name == "ELBO" else format_estimate(self.estimate(name, "ELBO", data))
+            whole, each = (format_estimate(self.estimate(name, data=data, frame=frame)) for frame in (False, True))
             table.add_row(self._called(name), whole, above, each)
         return table
 
@@ -164,7 +164,7 @@ class Bracket(Result):
     def _gap(self) -> Table:
         added = "; ".join(f"{name}: {', '.join(terms)}" for name, terms in self.added.items()) or "none"
         table = Table(
-            title="evidence above the ELBO, nats a sequence", caption=f"missing arrows between latents: {added}"
+            title="evidence above the ELBO, nats a sequence", caption=f"missing edges between latents: {added}"
         )
         table.add_column("")
         for data in DATA:
@@ -172,14 +172,14 @@ class Bracket(Result):
         found = {data: self.gap(data) for data in DATA}
         for name, (low, high) in PARTS.items():
             if name in found["simulated"]:
-                cells = (told(found[data][name]) if name in found[data] else "–" for data in DATA)
+                cells = (format_estimate(found[data][name]) if name in found[data] else "–" for data in DATA)
                 at_least = ", at least" if name == "family" else ""
                 table.add_row(f"{name}{at_least} ({low} to {high})", *cells)
         return table
 
     def plot(self) -> Figure:
         """Draw all bounds above the ELBO for real and simulated data, the parts of the gap, and the bracket shaded."""
-        figure = canvas(9, 6)
+        figure = new_figure(9, 6)
         panels = figure.subplots(2, 1)  # separate axes: a guide may be far worse on data it was not fitted to
         unknown = self.estimate("upper", "AIS", "simulated").mean
         for panel, data in zip(panels, DATA, strict=True):
@@ -225,11 +225,11 @@ class Bracket(Result):
             raise ValueError("bounds and numbers of frames are finite")
         if self.equations.keys() != {"generative", "inference"}:
             raise ValueError("equations has not the keys generative and inference")
-        if not all(isinstance(word, str) for word in called(self.data)):
+        if not all(isinstance(word, str) for word in axis_names(self.data)):
             raise ValueError("what sequences and frames are called is no text")
 
 
-def told(estimate: Estimate) -> str:
+def format_estimate(estimate: Estimate) -> str:
     """Return a mean ± its standard error over sequences as text."""
     places = decimals(estimate.mean, estimate.sequences)
     return f"{number(estimate.mean, places)} ± {number(estimate.sequences, places)}"
@@ -269,9 +269,9 @@ def bracket(
         count: number of sequences, drawn at random; None for all.
         particles: K, number of draws of ELBOs and IWAE, and of particles of FIVO.
         temperatures, chains: L and K of annealed importance sampling, as in `annealed_bound`.
-        fitting: number of steps of the semi-amortized guides (`local_guide`); 0 omits them and the parts of the gap,
-            and chains start at the model's own guide.
-        reach: largest distance in steps of edges in the semi-amortized guides (`local_guide`).
+        fitting: number of steps of the semi-amortized guides (`semi_amortized_guide`); 0 omits them and the parts of
+            the gap, and chains start at the model's own guide.
+        reach: largest distance in steps of edges in the semi-amortized guides (`semi_amortized_guide`).
         seed: seed of all draws.
         batch_size: number of sequences in a batch.
         progress: whether to show a progress bar.
@@ -283,7 +283,8 @@ def bracket(
         FloatingPointError: when a bound is not finite.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> found = dvae.bracket(model, torch.randn(4, 4, 2), temperatures=5, fitting=0, progress=False)
         >>> list(found.bounds["simulated"])
         ['ELBO', 'IWAE', 'FIVO', 'AIS', 'upper']
@@ -316,7 +317,7 @@ def bracket(
     refused = next(filter(None, (obstacle(model, part) for part in read)), "")
     if refused:
         notes.append(f"no FIVO: {refused}")
-    with reproducibly(model, _seeds(chance, 1)[0]):
+    with seeded_evaluation(model, _seeds(chance, 1)[0]):
         drawn = [_simulated(model, part) for part in read]
     added = missing_latents(model) if fitting else {}
     work = _Work(model, particles, temperatures, chains, fitting, reach, bool(refused), bool(added))
@@ -357,8 +358,8 @@ def bracket(
     unknown = result.estimate("upper", "AIS", "simulated")
     if unknown.mean > max(WIDE, 2 * unknown.sequences):
         notes.append(
-            f"on simulated data the upper bound lies {told(unknown)} nats above AIS: AIS and family may be that much "
-            "too low, as where all chains stay in one mode, whatever the spread of the chains is"
+            f"on simulated data the upper bound lies {format_estimate(unknown)} nats above AIS: AIS and family may be "
+            "that much too low, as where all chains stay in one mode, whatever the spread of the chains is"
         )
     return result
 
@@ -369,7 +370,7 @@ def _seeds(chance: torch.Generator, count: int) -> list[int]:
 
 
 def _called(windows: HeldOutWindows) -> dict[str, Any]:
-    return {"called": list(called(windows.description))} if "called" in windows.description else {}
+    return {"called": list(axis_names(windows.description))} if "called" in windows.description else {}
 
 
 def _frames(model: DynamicalVAE, data: Batch) -> Tensor:
@@ -384,7 +385,7 @@ def _simulated(model: DynamicalVAE, real: Batch) -> tuple[Batch, dict[str, Tenso
     drawn = model.model(kept, length=x.shape[1] if x.dim() == 3 else None, size=len(x))
     latents = {name: drawn[name] for name in model.latents}
     seen = kept | {name: drawn[name] for name in model.observed}
-    return (seen if model.view.keeps_volume else model.read(model.shown(seen, kept))), latents
+    return (seen if model.view.keeps_volume else model.read(model.to_data_space(seen, kept))), latents
 
 
 @dataclass(frozen=True)
@@ -409,16 +410,16 @@ class _Work:
         """
         model, found = self.model, {}
         judging, fitting, annealing = seeds
-        with reproducibly(model, judging):
+        with seeded_evaluation(model, judging):
             weights = self._weights(model, data)
             found["ELBO"], found["IWAE"] = weights.mean(0), weights.logsumexp(0) - math.log(self.particles)
             if not self.blocked:
-                found["FIVO"] = particle_bound(model, data, self.particles, chunk=CHUNK).bound
+                found["FIVO"] = fivo_bound(model, data, self.particles, chunk=CHUNK).bound
         for name, missing in ((OWN, False), (ALL, True)) if self.fitting else ():
             if not missing or self.lacking:  # otherwise there is nothing to add
                 how: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": fitting}
-                model = local_guide(self.model, data, **how, progress=advance)
-            with reproducibly(model, judging):
+                model = semi_amortized_guide(self.model, data, **how, progress=advance)
+            with seeded_evaluation(model, judging):
                 found[name] = self._weights(model, data).mean(0)
         how = {"temperatures": self.temperatures, "chains": self.chains, "seed": annealing}
         how["chunk"] = self.chains * len(found["ELBO"])  # a semi-amortized guide needs all sequences of the batch

@@ -24,9 +24,9 @@ from typing_extensions import override
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
-from ..evaluation.held import on_device_of, reproducibly
+from ..evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from ..evaluation.record import Dims
-from ..evaluation.result import Result, Table, canvas, progress_bar
+from ..evaluation.result import Result, Table, new_figure, progress_bar
 from .latents import quantities
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ class Calibration(Result):
         order = np.argsort(self.p_values, kind="stable")[:worst]
         columns = min(4, len(order))
         rows = math.ceil(len(order) / columns)
-        figure = canvas(0.8 + 2.4 * columns, 0.6 + 3.1 * rows)
+        figure = new_figure(0.8 + 2.4 * columns, 0.6 + 3.1 * rows)
         panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, sharey="row")
         points, low, high = self.envelope(0.05 / len(self.names))
         levels, count = self.draws + 1, len(self.ranks)
@@ -247,7 +247,8 @@ def calibrate(
         FloatingPointError: when a simulation is not finite.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> found = dvae.calibrate(model, 4, simulations=20, draws=19, steps=(2, 4), progress=False)
     """
     if min(length, simulations, draws, chunk) < 1:
@@ -272,9 +273,9 @@ def calibrate(
     def given(turn: Tensor) -> dict[str, Any]:
         return on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
 
-    with reproducibly(model, seed + 1):  # independent of the ranked simulations
+    with seeded_evaluation(model, seed + 1):  # independent of the ranked simulations
         points = _Points.of(model, given(torch.arange(draws)), draws, length, places)
-    with reproducibly(model, seed), progress_bar(progress) as bar:
+    with seeded_evaluation(model, seed), progress_bar(progress) as bar:
         for start in bar.track(range(0, simulations, at_once), description="simulations"):
             turn = torch.arange(start, min(start + at_once, simulations))
             ranks.append(_ranks(model, infer, given(turn), len(turn), length, draws, places, points))

@@ -1,8 +1,8 @@
 """Predictive checks: do replicated sequences look like real ones?
 
 `predictive_checks` compares statistics of real windows, forecasts and draws from the posterior predictive distribution
-(Gelman, Meng and Stern, 1996). `STATISTICS` lists statistics for any sequences, and `usual` returns them in the unit of
-the data.
+(Gelman, Meng and Stern, 1996). `STATISTICS` lists statistics for any sequences, and `default_statistics` returns them
+in the unit of the data.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, called, columns_of, mean_of_known, scales_of
+from ...data.sequences import HeldOutWindows, axis_names, columns_of, mean_of_known, scales_of
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
-from ..evaluation.held import hold, on_device_of, reproducibly
+from ..evaluation.evaluation_windows import on_device_of, prepare_windows, seeded_evaluation
 from ..evaluation.record import MODELS, Dims, plain
-from ..evaluation.result import Result, Table, as_they_are, canvas, progress_bar
+from ..evaluation.result import Result, Table, literal_text, new_figure, progress_bar
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,7 +109,7 @@ _OF_DATA = ("mean", "scale", "roughness", "smallest", "largest")
 """Names of statistics in the unit of the data."""
 
 
-def usual(windows: HeldOutWindows) -> dict[str, Statistic]:
+def default_statistics(windows: HeldOutWindows) -> dict[str, Statistic]:
     """Return `STATISTICS` of all columns together, with units as for the scores of `scores.proper`.
 
     If the windows name columns that share a unit, statistics are in this unit. If the windows define the scales of
@@ -252,7 +252,7 @@ class PredictiveChecks(Result):
         """Draw the density of each statistic: real windows in grey, replicates as one line per model."""
         models, programs, names = self._keys
         size = (0.6 + 2.3 * len(names), 0.8 + 2.0 * len(programs))
-        figure = canvas(*size)
+        figure = new_figure(*size)
         panels = figure.subplots(len(programs), len(names), squeeze=False, sharex="col")
         for column, name in enumerate(names):
             checks = [self.checks[model, program, name] for program in programs for model in models[program]]
@@ -278,7 +278,7 @@ class PredictiveChecks(Result):
         handles, labels = panels[0, 0].get_legend_handles_labels()
         below: dict[str, Any] = {"loc": "outside lower center", "ncols": len(labels), "frameon": False}
         legend = figure.legend(handles, labels, fontsize=8, **below)
-        as_they_are(legend.get_texts())
+        literal_text(legend.get_texts())
         figure.suptitle(self._title, fontsize=9, parse_math=False)
         return figure
 
@@ -341,7 +341,7 @@ def predictive_checks(
     Args:
         model: a model, or `{name: model}`.
         windows: `ArrayWindows`, or any `HeldOutWindows`.
-        statistics: `Statistic` by name, for example from an application; `usual` by default.
+        statistics: `Statistic` by name, for example from an application; `default_statistics` by default.
         samples: S, number of replicates of each window; at least 19, so that tail areas below .05 have a probability of
             a tenth at most.
         draw_emission: whether replicates are draws of x. Its means have no emission noise: with them, the check is of
@@ -366,15 +366,15 @@ def predictive_checks(
             "expected a model, at least 19 samples, for tail areas below .05 to be no more than a tenth, and a "
             f"batch_size of at least 1; got {len(models)}, {samples} and {batch_size}"
         )
-    held = hold(windows)
+    held = prepare_windows(windows)
     windows = held.windows
-    statistics = usual(windows) if statistics is None else statistics
+    statistics = default_statistics(windows) if statistics is None else statistics
     if not statistics:
         raise ValueError("there is no statistic to check")
     for each in models.values():
         require_likelihood(each)
     truth = held.batch.mask_to_nan()
-    _, frame = called(windows.description)
+    _, frame = axis_names(windows.description)
     firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
     checks: dict[str, dict[str, dict[str, Check]]] = {label: {} for label in models}
     with progress_bar(progress) as bar:
@@ -385,7 +385,7 @@ def predictive_checks(
                 if program == "posterior" and not each.latents:
                     continue  # nothing is inferred
                 parts: list[dict[str, Tensor]] = []
-                with reproducibly(each, seed):
+                with seeded_evaluation(each, seed):
                     starts = range(0, len(held.x), batch_size)
                     for start in bar.track(starts, description=f"{label}, {program}"):
                         some = slice(start, start + batch_size)
@@ -459,7 +459,7 @@ def decode(
     known = {name: value for name, value in data.items() if name in model.context}
     length, size = data.get("x", batch["x"]).shape[1], len(batch["x"])
     made = model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)
-    x = model.shown({name: made[name] for name in model.observed}, data)["x"]
+    x = model.to_data_space({name: made[name] for name in model.observed}, data)["x"]
     before = batch["x"].shape[1] - length
     return torch.cat([batch["x"][:, :before], x], 1) if before else x
 

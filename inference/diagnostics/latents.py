@@ -64,9 +64,10 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
     require_latents(model)
     for name in model.latents:
         conditional = model.generator[name]
-        if conditional.support is not None or conditional.law.deterministic:
+        if conditional.support is not None or conditional.head.deterministic:
             raise ValueError(
-                f"the latent {name} cannot be any real number by the law of {conditional.factor}; gradients lead "
+                f"the latent {name} cannot be any real number by the distribution of {conditional.factor}; gradients "
+                "lead "
                 "through posteriors on the whole line alone, such as those of distributions.Normal()"
             )
     data = model.read(batch)

@@ -25,10 +25,10 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from ...locking import seeded, serialized
 from ...options import Count, Delay, Positive, Size, check
 from ...program.batch import repeat, rows
-from ...turns import alone, seeded
-from ..bounds.elbo import ImportanceBound, importance_mean
+from ..bounds.elbo import IWAEBound, importance_mean
 from ..evaluation.result import progress_bar
 from .latents import Values, joined, split
 
@@ -84,7 +84,7 @@ class Posterior:
             (B, P, P).
 
     Example:
-        >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
+        >>> model = dvae.linear_gaussian_surrogate("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
         >>> found = dvae.posterior(model.model, {"x": model.sample(5, 4)["x"]}, descent=dvae.Descent(steps=20))
         >>> bool((found.left < 1e-6).all())  # nats: it has converged
         True
@@ -120,15 +120,15 @@ class Posterior:
     def guide(self, batch: Any = None) -> dict[str, Tensor]:
         """Sample the normal as a Pyro guide of the program, on the same batch."""
         with pyro.plate("sequences", len(self.factor)):
-            law = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
-            flat = pyro.sample("_latents", law, infer={"is_auxiliary": True})
+            distribution = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
+            flat = pyro.sample("_latents", distribution, infer={"is_auxiliary": True})
             values = split(flat, self.mode).items()
             return {name: pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 1)) for name, value in values}
 
     @torch.no_grad()
     def evidence(
         self, program: _Program, batch: Any, particles: int = 200, *, seed: int = 0, chunk: int = 4096
-    ) -> ImportanceBound:
+    ) -> IWAEBound:
         """Return the log evidence of the observations by importance sampling from the normal, with its k-hat.
 
         A k-hat above 0.7 means that the posterior differs from the normal: its intervals are then rough.
@@ -140,12 +140,12 @@ class Posterior:
             chunk: largest number of sequences times particles in memory.
         """
         generator = torch.Generator().manual_seed(seed)
-        law = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)
+        distribution = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)
 
         def log_weights(count: int) -> Tensor:
             away = self._away(count, generator)
             drawn = split((joined(self.mode) + away).flatten(0, 1), self.mode)
-            return -_energy(program, repeat(batch, count), drawn) - law.log_prob(away).flatten()
+            return -_energy(program, repeat(batch, count), drawn) - distribution.log_prob(away).flatten()
 
         return importance_mean(log_weights, len(self.factor), particles, chunk)
 
@@ -188,7 +188,7 @@ def posterior(
         FloatingPointError: when no start of a sequence has a finite energy.
 
     Example:
-        >>> model = dvae.twin("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
+        >>> model = dvae.linear_gaussian_surrogate("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
         >>> seen = model.sample(5, 4)["x"]
         >>> batch = {"x": seen, "mask": torch.rand(seen.shape) < 0.5}
         >>> found = dvae.posterior(model.model, batch, descent=dvae.Descent(steps=20))
@@ -340,7 +340,7 @@ class _Search:
 
 def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str] | None = None) -> Tensor:
     """Return -log p (B,) of a program's sites, or of some of them, at these values of its latents."""
-    with alone:
+    with serialized:
         trace = poutine.trace(poutine.condition(program, data=dict(values))).get_trace(batch)
     trace.compute_log_prob(site_filter=lambda name, _: sites is None or name in sites)
     logs = {name: site["log_prob"] for name, site in trace.nodes.items() if "log_prob" in site}

@@ -26,9 +26,9 @@ from typing_extensions import override
 
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
-from ..evaluation.held import reproducibly
+from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.record import Dims
-from ..evaluation.result import Result, Table, canvas, progress_bar
+from ..evaluation.result import Result, Table, new_figure, progress_bar
 from .latents import Inferred, some_of
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class SteinDiscrepancy(Result):
 
     def plot(self) -> Figure:
         """Draw KSD^2 of every sequence relative to its 5 % critical value."""
-        figure = canvas(2.5 + 0.3 * len(self.sequences), 3.2)
+        figure = new_figure(2.5 + 0.3 * len(self.sequences), 3.2)
         panel = figure.subplots()
         panel.plot([str(sequence) for sequence in self.sequences], self.squared / self.critical, "o")
         panel.axhline(1, color="0.4", linewidth=0.8)
@@ -145,7 +145,8 @@ def stein_discrepancy(
         FloatingPointError: when a gradient is not finite.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 4)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> found = dvae.stein_discrepancy(model, model.sample(3, 4)["x"])
         >>> found.p_values.shape, found.p_value < 0.05  # a guide that was not fitted
         ((3,), True)
@@ -153,7 +154,7 @@ def stein_discrepancy(
     if draws < 2 or bootstrap < 1:
         raise ValueError(f"draws are at least 2 and bootstrap at least 1, got {draws} and {bootstrap}")
     found, together = [], torch.zeros(bootstrap + 1, dtype=torch.float64)
-    with reproducibly(model, seed), progress_bar(progress) as bar:
+    with seeded_evaluation(model, seed), progress_bar(progress) as bar:
         some = some_of(model, batch, sequences)
         for data in bar.track(some, description="scores of draws"):
             inferred = Inferred(model, data, guide, SCALED)

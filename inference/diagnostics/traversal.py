@@ -11,13 +11,13 @@ from torch import Tensor
 
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
-from ..evaluation.held import on_device_of, reproducibly
+from ..evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from .checks import decode
 
 
 @dataclass(frozen=True, eq=False)
 class Traversal:
-    """Motions decoded at several values of one coordinate of a latent.
+    """Sequences decoded at several values of one coordinate of a latent.
 
     Attributes:
         latent: name of the latent.
@@ -105,7 +105,7 @@ def traverse(
     data = on_device_of(model, model.read(batch))
     if partial := {"lengths", "mask"} & data.keys():
         raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
-    with reproducibly(model, seed):
+    with seeded_evaluation(model, seed):
         scale = _scale(model, data, latent, unit, draws)[list(chosen)]
         torch.manual_seed(seed)
         inferred = model.guide(data)

@@ -16,14 +16,14 @@ import torch
 from torch import Tensor, nn
 
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, Listed, called, clusters, sequences, take_split
+from ...data.sequences import HeldOutWindows, Listed, axis_names, clusters, sequences, take_split
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..bounds.particles import obstacle
 from ..bounds.teacher_forced import bounds, filtered, information, length_of, variances
-from .comparison import Comparison, Contender
+from .comparison import Comparison, ModelResult
 from .evaluate import evaluate
-from .held import on_device_of, reproducibly
+from .evaluation_windows import on_device_of, seeded_evaluation
 from .record import plain
 from .result import progress_bar
 from .scores import Measure, Scores, proper
@@ -82,7 +82,7 @@ def compare(
         particles: K of the IWAE bound. k-hat needs 25, and 100 or more to be meaningful for single sequences.
         estimates: number of independent IWAE estimates of every sequence, each with K particles. The bound is their
             mean. `Comparison.to_arviz` needs 25 or more.
-        filter_particles: K of the FIVO bound (`particle_bound`); 0 omits it. For a model without a FIVO bound, such as
+        filter_particles: K of the FIVO bound (`fivo_bound`); 0 omits it. For a model without a FIVO bound, such as
             one with a backward guide, a note gives the reason.
         contrasts: M, number of randomly drawn sequences among which information is measured; all if there are fewer, 0
             omits it.
@@ -104,10 +104,11 @@ def compare(
         FloatingPointError: when a bound is not finite, naming model and sequence.
 
     Example:
-        >>> model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 4)
-        >>> found = dvae.compare({"twin": model}, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
+        >>> found = dvae.compare({"surrogate": model}, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
         >>> found.ranking
-        ['twin']
+        ['surrogate']
     """
     if min(particles, estimates, batch_size) < 1 or min(filter_particles, contrasts, samples) < 0:
         raise ValueError(
@@ -161,7 +162,9 @@ def compare(
             "sequences": len(keys),
             "frames": x.shape[1],
             "coordinates": x.shape[2],
-            **({"called": list(called(windows.description))} if windows and "called" in windows.description else {}),
+            **(
+                {"called": list(axis_names(windows.description))} if windows and "called" in windows.description else {}
+            ),
         },
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
@@ -199,29 +202,31 @@ def _measured(
             for start in bar.track(range(0, count, size), description=f"{label}, {what}"):
                 yield slice(start, start + size)
 
-        with reproducibly(model, seed):
+        with seeded_evaluation(model, seed):
             found = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
         found["notes"] = []
         if filter_particles and (refused := obstacle(model, model.read(on_device_of(model, batch)))):
-            found["notes"].append(f"no particle bound: {refused}")
+            found["notes"].append(f"no FIVO bound: {refused}")
         elif filter_particles:
-            with reproducibly(model, seed):
-                pieces = parts("particle bound", len(keys), batch_size)
+            with seeded_evaluation(model, seed):
+                pieces = parts("FIVO bound", len(keys), batch_size)
                 found["bounds"] |= filtered(label, model, batch, keys, filter_particles, pieces)
-        with reproducibly(model, seed):
+        with seeded_evaluation(model, seed):
             found["variances"] = variances(model, batch, parts("active units", len(keys), batch_size))
-        with reproducibly(model, seed):
+        with seeded_evaluation(model, seed):
             pieces = parts("information", len(chosen), max(1, _PAIRS // max(1, len(chosen))))
             found["information"] = information(model, batch.rows(chosen), pieces)
     return found
 
 
-def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> Contender:
+def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> ModelResult:
     """Return a row from the scores of the models of its seeds; `model` is one of them."""
     said = {"frames", "notes"}
     scores = _stack([{key: value for key, value in seed.items() if key not in said} for seed in seeds])
     equations = {"generative": model.generative.text, "inference": model.inference.text}
-    return Contender(equations, config, **{**scores, "estimates": scores["estimates"].mean(0)}, notes=seeds[0]["notes"])
+    return ModelResult(
+        equations, config, **{**scores, "estimates": scores["estimates"].mean(0)}, notes=seeds[0]["notes"]
+    )
 
 
 def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:

@@ -1,4 +1,4 @@
-"""Comparisons: several models on the same sequences, with the uncertainty of their order (`.estimates`, `.many`)."""
+"""Comparisons: several models on the same sequences, with errors over sequences and seeds (`.estimates`)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import numpy as np
 from rich.console import Group
 from typing_extensions import override
 
-from ...data.sequences import called
+from ...data.sequences import axis_names
 from ...options import nearest
 from ..bounds.elbo import KHAT_PARTICLES
-from ..training.many import ConfidenceSet, Pairs, Requirement, confidence_set, pairs, required
-from .estimates import Crossed, Estimate, number
+from .estimates import Estimate, TwoWayErrors, number
 from .evaluation import ARROWS
-from .held import clip_places
+from .evaluation_windows import clip_index
+from .multiple_comparisons import ConfidenceSet, Pairs, Requirement, confidence_set, pairs, required
 from .record import MODELS, Dims
-from .result import Result, Table, as_they_are, canvas
+from .result import Result, Table, literal_text, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,13 +41,13 @@ _LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and n
 
 
 @dataclass(frozen=True, eq=False)
-class Contender:
+class ModelResult:
     """Scores of one model, for S seeds, N sequences in C clips, T steps.
 
     Args:
         equations: "generative" and "inference".
         config: configuration given by the caller.
-        bounds: (S, N) each: "ELBO", "importance bound", "k-hat", "KL z" for every latent z, and "particle bound" if
+        bounds: (S, N) each: "ELBO", "IWAE bound", "k-hat", "KL z" for every latent z, and "FIVO bound" if
             computed; bounds in nats per sequence.
         kl_steps: mean KL over sequences by step, in nats, (S, T), of each local latent.
         variances: variance over the data of each coordinate's posterior mean, (S, D), of each latent.
@@ -96,10 +96,10 @@ class Contender:
 class Comparison(Result):
     """Scores of several models on the same sequences, with the settings of the measurement.
 
-    Indexing returns the estimates of a model: `comparison["srnn"]["importance bound"].mean`, in nats per frame.
+    Indexing returns the estimates of a model: `comparison["srnn"]["IWAE bound"].mean`, in nats per frame.
 
     Attributes:
-        rows: `{name: Contender}`.
+        rows: `{name: ModelResult}`.
         keys: (split, clip, first frame) of every sequence.
         frames: number of frames of every sequence, (N,).
         data: fingerprint (of windows), sequences, frames and coordinates.
@@ -116,13 +116,14 @@ class Comparison(Result):
 
     Example:
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
-        >>> models = {n: dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", q, {"z": 1, "x": 2}, 4) for n, q in pairs.items()}
+        >>> p, sizes = "p(z_t | z_{t-1}) p(x_t | z_t)", {"z": 1, "x": 2}
+        >>> models = {name: dvae.linear_gaussian_surrogate(p, q, sizes, 4) for name, q in pairs.items()}
         >>> found = dvae.compare(models, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
         >>> found.difference("smooths", "filters").mean, found.ranking  # doctest: +ELLIPSIS
         (..., [...])
     """
 
-    rows: Annotated[dict[str, Contender], MODELS]
+    rows: Annotated[dict[str, ModelResult], MODELS]
     keys: list[tuple[str, str, int]]
     frames: Annotated[np.ndarray, Dims("sequence")]
     data: dict[str, Any]
@@ -145,9 +146,9 @@ class Comparison(Result):
     @property
     def ranking(self) -> list[str]:
         """Names in the order of the IWAE bound per frame, the best first."""
-        return sorted(self.rows, key=lambda name: -self[name]["importance bound"].mean)
+        return sorted(self.rows, key=lambda name: -self[name]["IWAE bound"].mean)
 
-    def difference(self, first: str, second: str, metric: str = "importance bound") -> Estimate:
+    def difference(self, first: str, second: str, metric: str = "IWAE bound") -> Estimate:
         """Return the paired difference of two models, first minus second; `estimates` describes its errors.
 
         Raises:
@@ -158,7 +159,7 @@ class Comparison(Result):
             return Estimate(0.0, 0.0, 0.0, 0.0)
         return parts[0].estimate(parts[1])
 
-    def pairs(self, metric: str = "importance bound") -> Pairs:
+    def pairs(self, metric: str = "IWAE bound") -> Pairs:
         """Return all paired differences in a metric, with p-values adjusted for their number (`many.pairs`).
 
         Raises:
@@ -167,7 +168,7 @@ class Comparison(Result):
         return pairs(self._all(metric))
 
     def confidence_set(
-        self, metric: str = "importance bound", level: float = 0.9, *, over_seeds: bool = True
+        self, metric: str = "IWAE bound", level: float = 0.9, *, over_seeds: bool = True
     ) -> ConfidenceSet:
         """Return the models that may be the best in a metric (`many.confidence_set`).
 
@@ -183,7 +184,7 @@ class Comparison(Result):
         better = self.better.get(metric, "lower") if metric in self.shown else "higher"
         return confidence_set(self._all(metric), better, level, over_seeds=over_seeds)
 
-    def required(self, first: str, second: str, metric: str = "importance bound", **options: Any) -> Requirement:
+    def required(self, first: str, second: str, metric: str = "IWAE bound", **options: Any) -> Requirement:
         """Return how many training seeds and clips would distinguish two models (options as in `many.required`).
 
         Raises:
@@ -192,7 +193,7 @@ class Comparison(Result):
         """
         return required(self._parts(first, metric), self._parts(second, metric), **options)
 
-    def _all(self, metric: str) -> dict[str, Crossed]:
+    def _all(self, metric: str) -> dict[str, TwoWayErrors]:
         return {name: self._parts(name, metric) for name in self.rows}
 
     def join(self, other: Comparison) -> Comparison:
@@ -223,9 +224,9 @@ class Comparison(Result):
         widest = min(30, max(map(len, ranking)))
         lines = sum(label.count("\n") + 1 for label in labels.values())
         heights = [1.4 + 0.25 * lines] + [3.0] * (rows - 1)
-        figure = canvas(10, sum(heights) + 0.3)
+        figure = new_figure(10, sum(heights) + 0.3)
         panels = list(figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": heights}).flat)
-        bounds = {name: self[name]["importance bound"] for name in ranking}
+        bounds = {name: self[name]["IWAE bound"] for name in ranking}
         differences = {name: self.difference(name, ranking[0]) for name in ranking}
         for panel, estimates in zip(panels, (bounds, differences), strict=False):
             for place, (name, estimate) in enumerate(estimates.items()):
@@ -244,8 +245,8 @@ class Comparison(Result):
             panel.set_xlabel(f"nats a {frame} (95 %, thick: over {each}s, thin: over seeds too)", fontsize=9)
             panel.grid(axis="x", alpha=0.3)
         for place, name in enumerate(ranking):
-            if "particle bound" in self.rows[name].bounds:
-                mean = self[name]["particle bound"].mean
+            if "FIVO bound" in self.rows[name].bounds:
+                mean = self[name]["FIVO bound"].mean
                 panels[0].plot(mean, place, "D", markersize=6, color="black", fillstyle="none")
         title = f"importance-weighted bound ↑ (K = {self.particles})"
         panels[0].set_title(title + (f", ◇ FIVO (K = {self.filter_particles})" if self.filter_particles else ""))
@@ -268,7 +269,7 @@ class Comparison(Result):
         columns = min(5, 100 // (widest + 5))
         handles = panels[0].get_legend_handles_labels()
         legend = figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=9)
-        as_they_are(legend.get_texts())
+        literal_text(legend.get_texts())
         return figure
 
     def _khat_panel(self, panel: Axes, colours: Mapping[str, str]) -> None:
@@ -320,7 +321,7 @@ class Comparison(Result):
                     "estimates=200 (and fewer particles, as each estimate costs as much as the bound)"
                 )
             likelihood = row.estimates[None]
-            by_seed = {"elbo": "ELBO", "importance_bound": "importance bound", "khat": "k-hat"}
+            by_seed = {"elbo": "ELBO", "iwae_bound": "IWAE bound", "khat": "k-hat"}
             constant = {key: row.bounds[metric] for key, metric in by_seed.items()}
             trees[name] = from_dict(
                 {
@@ -362,7 +363,7 @@ class Comparison(Result):
         if self.extents["sequence"] != {len(self.keys)}:
             raise ValueError(f"expected numbers of {len(self.keys)} sequences")
         for name, row in self.rows.items():
-            if not {"ELBO", "importance bound", "k-hat"} <= row.bounds.keys():
+            if not {"ELBO", "IWAE bound", "k-hat"} <= row.bounds.keys():
                 raise ValueError(f"{name} has no bounds")
             parts = (row.bounds, row.kl_steps, row.variances, row.information, row.free_running)
             if {row.seeds} != {len(each) for part in parts for each in part.values()}:
@@ -370,7 +371,7 @@ class Comparison(Result):
 
     # Estimates
 
-    def _row(self, name: str) -> Contender:
+    def _row(self, name: str) -> ModelResult:
         if name not in self.rows:
             raise KeyError(
                 f"no model {name!r} in this comparison{nearest(name, self.rows)}; it has {', '.join(self.rows)}"
@@ -381,22 +382,22 @@ class Comparison(Result):
     def _clips(self) -> list[str]:
         return [f"{split}/{clip}" for split, clip, _ in self.keys]
 
-    def _parts(self, name: str, metric: str) -> Crossed:
+    def _parts(self, name: str, metric: str) -> TwoWayErrors:
         row = self._row(name)
         if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
             known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
             raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, known)}; it has {', '.join(known)}")
-        places = clip_places(self.keys).numpy()
+        places = clip_index(self.keys).numpy()
         if metric in row.free_running:
-            return Crossed.of(row.free_running[metric], np.bincount(places, weights=self.frames))
-        return Crossed.by_clip(row.bounds[metric], self.frames, places)
+            return TwoWayErrors.of(row.free_running[metric], np.bincount(places, weights=self.frames))
+        return TwoWayErrors.by_clip(row.bounds[metric], self.frames, places)
 
     # Tables
 
     @property
     def _words(self) -> tuple[str, str, str]:
         """Words for the scored unit, for the unit of clustering, and for a frame."""
-        clip, frame = called(self.data)
+        clip, frame = axis_names(self.data)
         if self.protocol.get("observed", 0) is None:
             return "whole sequence", clip, frame
         return "window" if "called" in self.data else "sequence", clip, frame
@@ -411,8 +412,8 @@ class Comparison(Result):
 
     def _bound_table(self) -> Table:
         each, clip, frame = self._words
-        bounds = (f"importance bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
-        filters = [f"particle bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
+        bounds = (f"IWAE bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
+        filters = [f"FIVO bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
         table = _table(
             f"{self._title()}\nteacher-forced, nats a {frame}",
             "\n".join(
@@ -431,8 +432,8 @@ class Comparison(Result):
             difference = self.difference(name, ranking[0])
             behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
             share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
-            means = (str(scores["importance bound"]), *behind, str(scores["ELBO"]))
-            filtered = [str(scores.get("particle bound", "–")) for _ in filters]
+            means = (str(scores["IWAE bound"]), *behind, str(scores["ELBO"]))
+            filtered = [str(scores.get("FIVO bound", "–")) for _ in filters]
             table.add_row(name, str(row.seeds), *means, *filtered, share)
         return table
 
@@ -457,7 +458,7 @@ class Comparison(Result):
                 )
         return table
 
-    def _told(self, row: Contender, latent: str) -> str:
+    def _told(self, row: ModelResult, latent: str) -> str:
         if latent not in row.information:
             return "–"
         steps = row.information[latent].mean(0)

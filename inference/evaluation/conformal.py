@@ -30,14 +30,14 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ...data.sequences import HeldOutWindows, called, clusters, columns_of, mean_of_known, scales_of
+from ...data.sequences import HeldOutWindows, axis_names, clusters, columns_of, mean_of_known, scales_of
 from ...options import nearest
 from .evaluate import evaluate, forecaster_of, forecasts_of
 from .evaluation import Evaluation
-from .held import Held, clip_places, hold, reproducibly
+from .evaluation_windows import EvaluationWindows, clip_index, prepare_windows, seeded_evaluation
 from .record import Dims
 from .references import References
-from .result import Result, Table, canvas, progress_bar
+from .result import Result, Table, new_figure, progress_bar
 from .scores import Measure, clip_means
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ REGIONS: Mapping[str, tuple[int, ...]] = {"number": (), "frame": (-1,), "future"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tubes(Result):
+class PredictionBands(Result):
     """Prediction bands: factors on the spread of forecasts that give the bands their nominal coverage.
 
     Attributes:
@@ -65,9 +65,9 @@ class Tubes(Result):
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
         >>> kept, new = (dvae.ArrayWindows(torch.randn(40, 8, 2), observed=4) for _ in range(2))
-        >>> tubes = dvae.conformal(model, kept, level=0.9, samples=20, progress=False)
-        >>> lower, upper = tubes.tube(model.forecast(new.all()["x"][:, :4], 4, 20, draw_emission=True)["x"])
-        >>> lower.shape, tubes.coverage(model, new)["model"]["held 90 %, future"].mean > 0.7
+        >>> bands = dvae.conformal_bands(model, kept, level=0.9, samples=20, progress=False)
+        >>> lower, upper = bands.apply(model.forecast(new.all()["x"][:, :4], 4, 20, draw_emission=True)["x"])
+        >>> lower.shape, bands.coverage(model, new)["model"]["held 90 %, future"].mean > 0.7
         (torch.Size([40, 4, 2]), True)
     """
 
@@ -80,7 +80,7 @@ class Tubes(Result):
     clips: int
     data: Mapping[str, Any]
 
-    def tube(self, forecasts: Tensor, region: str = "future") -> tuple[Tensor, Tensor]:
+    def apply(self, forecasts: Tensor, region: str = "future") -> tuple[Tensor, Tensor]:
         """Return the bands of forecasts, which must be made as in the calibration.
 
         Args:
@@ -95,11 +95,13 @@ class Tubes(Result):
             ValueError: when the region is unknown, or forecasts have another shape.
         """
         if region not in REGIONS:
-            raise ValueError(f"no tubes of a {region!r}{nearest(region, REGIONS)}; there are {', '.join(REGIONS)}")
+            raise ValueError(
+                f"no prediction bands of a {region!r}{nearest(region, REGIONS)}; there are {', '.join(REGIONS)}"
+            )
         shape = self.factors["number"].shape
         if forecasts.ndim != 4 or forecasts.shape[2:] != shape or len(forecasts) != self.samples:
             expected = f"(K, B, H, D) = ({self.samples}, B, {shape[0]}, {shape[1]})"
-            raise ValueError(f"these tubes are of forecasts {expected}, not {tuple(forecasts.shape)}")
+            raise ValueError(f"these prediction bands are of forecasts {expected}, not {tuple(forecasts.shape)}")
         reach = self._factor(region, forecasts) * self._spread(forecasts.movedim(1, 0))
         return forecasts.mean(0) - reach, forecasts.mean(0) + reach
 
@@ -124,9 +126,9 @@ class Tubes(Result):
                 )
             found = {}
             for region in REGIONS:
-                far, factors = worst(away, region), {"held": self._factor(region, forecasts)}
+                far, factors = largest_by_region(away, region), {"held": self._factor(region, forecasts)}
                 if own is not None:
-                    factors["said"] = _smallest(worst(own, region), self.level)
+                    factors["said"] = _smallest(largest_by_region(own, region), self.level)
                 for how, factor in factors.items():
                     inside = (far <= factor).double().masked_fill(far.isnan(), torch.nan)
                     width = (2 * factor * spread / scales).masked_fill(gaps, torch.nan)
@@ -143,7 +145,7 @@ class Tubes(Result):
                 pool=clips_alike,
                 least=least[how],
                 of_draws=True,
-                note="said: tubes as wide as forecasts say; held: recalibrated. Of a window of a clip drawn at random",
+                note="said: bands as wide as forecasts say; held: recalibrated. Of a window of a clip drawn at random",
             )
 
         return [measure(how, region, place) for place in (0, 1) for region in REGIONS for how in least]
@@ -185,9 +187,11 @@ class Tubes(Result):
 
     def table(self) -> Table:
         """Return a table of factors: mean over frames and coordinates, smallest and largest."""
-        clip, frame = called(self.data)
-        title = f"tubes of {100 * self.level:g} % · {self.data['windows']} windows of {self.clips} {clip}s"
-        table = Table(title=title, caption=f"half the width of a tube over the forecasts’ spread, K = {self.samples}")
+        clip, frame = axis_names(self.data)
+        title = f"bands of {100 * self.level:g} % · {self.data['windows']} windows of {self.clips} {clip}s"
+        table = Table(
+            title=title, caption=f"half the width of a prediction band over the forecasts’ spread, K = {self.samples}"
+        )
         for column in ("holds", "factor", "least", "largest"):
             table.add_column(column, justify="left" if column == "holds" else "right")
         shown = {"number": "each number", "frame": f"each {frame}", "future": "the whole future"}
@@ -197,7 +201,7 @@ class Tubes(Result):
 
     def plot(self) -> Figure:
         """Draw factors over the horizon; for single numbers their mean and range over coordinates."""
-        figure = canvas(4.5, 3)
+        figure = new_figure(4.5, 3)
         axes = figure.subplots()
         numbers = self.factors["number"]
         frames = np.arange(1, len(numbers) + 1)
@@ -205,7 +209,7 @@ class Tubes(Result):
         for place, (region, factor) in enumerate(self.factors.items()):
             axes.plot(frames, np.broadcast_to(factor, numbers.shape).mean(1), color=f"C{place}", label=region)
         axes.set_ylim(bottom=0)
-        axes.set_xlabel(f"{called(self.data)[1]} of the future", fontsize=8)
+        axes.set_xlabel(f"{axis_names(self.data)[1]} of the future", fontsize=8)
         axes.set_ylabel("half width over spread", fontsize=8)
         axes.legend(fontsize=8)
         return figure
@@ -228,7 +232,7 @@ class Tubes(Result):
         return torch.as_tensor(self.factors[region]).to(like)
 
 
-def conformal(
+def conformal_bands(
     model: nn.Module | str,
     windows: HeldOutWindows,
     level: float = 0.9,
@@ -241,7 +245,7 @@ def conformal(
     batch_size: int = 32,
     options: Mapping[str, Any] | None = None,
     progress: bool = True,
-) -> Tubes:
+) -> PredictionBands:
     """Calibrate prediction bands around forecasts on windows that the model was not fitted to.
 
     The bands contain the future of new windows with probability `level` if their clips are exchangeable with the
@@ -272,12 +276,12 @@ def conformal(
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
         >>> windows = dvae.ArrayWindows(torch.randn(40, 8, 2), observed=4)
-        >>> tubes = dvae.conformal(model, windows, level=0.9, samples=20, progress=False)
-        >>> {region: factor.shape for region, factor in tubes.factors.items()}
+        >>> bands = dvae.conformal_bands(model, windows, level=0.9, samples=20, progress=False)
+        >>> {region: factor.shape for region, factor in bands.factors.items()}
         {'number': (4, 2), 'frame': (4, 1), 'future': (1, 1)}
     """
-    held = hold(windows)
-    windows, (clip, _) = held.windows, called(held.windows.description)
+    held = prepare_windows(windows)
+    windows, (clip, _) = held.windows, axis_names(held.windows.description)
     parts = {split for split, _, _ in held.keys} - {"all", "last"}
     if parts and getattr(windows.protocol, "split", None) == "time":
         raise ValueError(
@@ -289,17 +293,18 @@ def conformal(
     keys = clusters(windows) if groups is None else [("", group, 0) for group in groups]
     if len(keys) != len(held.keys):
         raise ValueError(f"{len(held.keys)} windows need as many groups, not {len(keys)}")
-    places, needed = clip_places(keys), _fewest(_checked(level))
+    places, needed = clip_index(keys), _fewest(_checked(level))
     clips = int(places.max()) + 1
     if clips < needed:
         what, most = f"{clip}s" if groups is None else "groups", math.floor(100 * clips / (clips + 1))
         raise ValueError(
-            f"tubes of {100 * level:g} % need {needed} {what} of calibration windows, given are {clips}: of fewer, the "
+            f"prediction bands of {100 * level:g} % need {needed} {what} of calibration windows, given are {clips}: of "
+            "fewer, the "
             f"next one lies beyond all of them too often; take more, or {most} % at most"
         )
     with progress_bar(progress) as bar:
 
-        def futures(of: Held, label: str) -> Iterator[tuple[Tensor, Tensor]]:
+        def futures(of: EvaluationWindows, label: str) -> Iterator[tuple[Tensor, Tensor]]:
             """Yield forecasts (B, K, H, D) and true futures by batch."""
             if isinstance(model, str):
                 name = model
@@ -307,27 +312,30 @@ def conformal(
             else:
                 name, drawn = type(model).__name__, samples
                 forecaster = forecaster_of(model, of, samples, {"draw_emission": True, **(options or {})})
-            with nullcontext() if isinstance(model, str) else reproducibly(model, seed):
+            with nullcontext() if isinstance(model, str) else seeded_evaluation(model, seed):
                 for start in bar.track(range(0, len(of.keys), batch_size), description=label):
                     part = slice(start, start + batch_size)
                     yield forecasts_of(name, forecaster, drawn, of, part), of.futures[part]
 
         spread = None
         if residuals is not None:
-            errors = [truth - forecasts.mean(1) for forecasts, truth in futures(hold(residuals), "residuals")]
+            errors = [
+                truth - forecasts.mean(1) for forecasts, truth in futures(prepare_windows(residuals), "residuals")
+            ]
             spread = mean_of_known(torch.cat(errors).square(), 0).sqrt()
         found, count = [], 0
         for forecasts, truth in futures(held, "calibration"):
             count = forecasts.shape[1]
             found.append(standardised(forecasts, truth, _deviations(forecasts) if spread is None else spread))
     far = torch.cat(found)
-    factors = {region: quantile(worst(far, region), places, level) for region in REGIONS}
+    factors = {region: quantile(largest_by_region(far, region), places, level) for region in REGIONS}
     if not all(factor.isfinite().all() for factor in factors.values()):
         raise ValueError(
-            "these tubes would be of no end: forecasts have no spread where they miss the future, as points have none "
+            "these prediction bands would be of no end: forecasts have no spread where they miss the future, as points "
+            "have none "
             f"(residuals= takes windows on which one is measured), or too few {clip}s were observed at some place"
         )
-    return Tubes(
+    return PredictionBands(
         level=level,
         factors={region: factor.numpy() for region, factor in factors.items()},
         spread=None if spread is None else spread.numpy(),
@@ -378,7 +386,7 @@ def _over(distance: Tensor, spread: Tensor) -> Tensor:
     return torch.where(distance == 0, 0.0, distance / spread)
 
 
-def worst(distances: Tensor, region: str) -> Tensor:
+def largest_by_region(distances: Tensor, region: str) -> Tensor:
     """Return the largest of known distances (..., H, D) in each region; NaN if none is known."""
     if not REGIONS[region]:
         return distances
@@ -418,5 +426,5 @@ def _fewest(level: float) -> int:
 
 def _checked(level: float) -> float:
     if not 0 < level < 1:
-        raise ValueError(f"the level of a tube is between 0 and 1, got {level}")
+        raise ValueError(f"the level of a prediction band is between 0 and 1, got {level}")
     return level

@@ -19,6 +19,8 @@ f_i), as in the tests of Satterthwaite (1946) and Welch (1947). V_seeds of a dif
 2 (S - 1), and
 
     f_total = V_total^2 / (V_sequences^2 / (C - 1) + sum over rows V_seeds^2 / (S - 1))
+
+Windows of one clip overlap, so errors over windows are clustered by clip.
 """
 
 from __future__ import annotations
@@ -29,9 +31,66 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from .uncertainty import clustered_variance, decimals, linearised, student_interval
-
 _ERRORS = ("sequences", "seeds", "total")
+
+
+def linearised(clip_means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted mean of clip means (..., C), a ratio of sums, and each clip's contribution to the error."""
+    shares = weights / weights.sum()
+    mean = (shares * clip_means).sum(-1)
+    return mean, shares * (clip_means - mean[..., None])
+
+
+def clustered_variance(deviations: np.ndarray) -> float:
+    """Return the variance of a mean over windows from each clip's share of its error (C,); NaN for one clip."""
+    clips = len(deviations)
+    return clips / (clips - 1) * float((deviations**2).sum()) if clips > 1 else math.nan
+
+
+def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) -> int:
+    """Return how many independent draws give histograms as uncertain as draws that are dependent within clips.
+
+    The number is one over the root mean square of v / (p (1 - p)) over shares p, with v the clustered variance of the
+    observed share. For N independent draws this ratio is 1 / N. With the mean instead of the root mean square, this is
+    the correction of Rao and Scott (1981) for design effects. The root mean square is larger if the effects differ, as
+    in their second-order correction (1984). With few clips the variances are uncertain, so the number is reduced by the
+    squared ratio of Student's interval to the normal one.
+
+    Args:
+        shares: expected shares `(G,)`, between 0 and 1.
+        deviations: contribution of each of C > 1 clips to the error of the observed share, `(G, C)` (`linearised`).
+        most: total number of draws.
+    """
+    clips = deviations.shape[-1]
+    if most <= clips:  # one draw per clip, and clips are independent
+        return int(most)
+    effects = clips / (clips - 1) * (deviations**2).sum(-1) / (shares * (1 - shares))
+    wider = (scipy.special.stdtrit(clips - 1, 0.975) / scipy.special.ndtri(0.975)) ** 2
+    size = wider * math.sqrt((effects**2).mean())
+    return int(max(1.0, min(most, 1 / size if size else math.inf)))
+
+
+def decimals(mean: float, *errors: float) -> int:
+    """Return the number of decimals for printing a mean and its errors.
+
+    It is three as in the papers, and four if an error is below 0.001. From a mean of 1000 or an error of 10 on, it is
+    one less for each further digit before the point.
+    """
+    known = [error for error in errors if 0 < error < math.inf]
+    largest = max([abs(mean) / 100, *known, 1.0] if math.isfinite(mean) else [1.0])
+    return max((4 if known and min(known) < 0.001 else 3) - math.floor(math.log10(largest)), 0)
+
+
+def student_interval(mean: float, error: float, freedom: float, level: float = 0.95) -> tuple[float, float]:
+    """Return the two-sided Student's t interval of a mean, for a standard error with `freedom` degrees of freedom.
+
+    Raises:
+        ValueError: when the level is not between 0 and 1.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+    reach = error * float(scipy.special.stdtrit(freedom, (1 + level) / 2)) if error else 0.0
+    return mean - reach, mean + reach
 
 
 @dataclass(frozen=True)
@@ -95,7 +154,7 @@ def _freedom(total: float, *parts: tuple[float, float]) -> float:
 
 
 @dataclass(frozen=True)
-class Crossed:
+class TwoWayErrors:
     """Mean of a model, error contributions of clips (C,), variances of seeds and of the rest, and number of seeds S."""
 
     mean: float
@@ -105,7 +164,7 @@ class Crossed:
     count: int
 
     @classmethod
-    def of(cls, means: np.ndarray, weights: np.ndarray) -> Crossed:
+    def of(cls, means: np.ndarray, weights: np.ndarray) -> TwoWayErrors:
         """Return the statistics of means by seed and clip (S, C) with the clips' weights (C,)."""
         by_seed, deviations = linearised(means, weights)
         common = deviations.mean(0)
@@ -117,7 +176,7 @@ class Crossed:
         return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
 
     @classmethod
-    def by_clip(cls, values: np.ndarray, weights: np.ndarray, places: np.ndarray) -> Crossed:
+    def by_clip(cls, values: np.ndarray, weights: np.ndarray, places: np.ndarray) -> TwoWayErrors:
         """Return the statistics of values by seed and sequence (S, N) with weights (N,) and the clip (N,) of each
         sequence.
 
@@ -126,7 +185,7 @@ class Crossed:
         whole = np.bincount(places, weights=weights)
         return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / whole, whole)
 
-    def estimate(self, other: Crossed | None = None) -> Estimate:
+    def estimate(self, other: TwoWayErrors | None = None) -> Estimate:
         """Return the mean, or its paired difference to another model's, with errors as in the module docstring."""
         mean, deviations, between, rest = self.mean, self.deviations, self.seeds, self.rest
         of_seeds = [(self.seeds, self.count - 1)]

@@ -22,14 +22,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...data.sequences import HeldOutWindows, called
+from ...data.sequences import HeldOutWindows, axis_names
 from ...options import Count, Delay, require
 from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting, Forecasting
-from ..bounds.elbo import SequenceELBO, importance_bound
+from ..bounds.elbo import SequenceELBO, iwae_bound
 from ..bounds.predictive import predictive_bound
 from .evaluation import Evaluation, Row
-from .held import Held, hold, on_device_of, refuse_non_finite, reproducibly
+from .evaluation_windows import EvaluationWindows, on_device_of, prepare_windows, refuse_non_finite, seeded_evaluation
 from .record import plain
 from .references import Forecaster, References
 from .result import progress_bar
@@ -100,12 +100,12 @@ def evaluate(
     """
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
     _check(models, samples, batch_size, bound_particles, log_score_particles)
-    held = hold(windows)
+    held = prepare_windows(windows)
     windows = held.windows
     measures = _measures(scores, windows)
     means = any(measure.of_means for measure in measures)
     drawn = {name: _is_drawn(each, draw_emission, means) for name, each in models.items()}
-    judge = _Judge(held, measures, bound_particles, log_score_particles)
+    metric_model = _Evaluator(held, measures, bound_particles, log_score_particles)
     known = References(held, samples, seed, training_windows, season)
     baselines = _references(references, known, measures)
     if clash := models.keys() & baselines.keys():
@@ -119,24 +119,24 @@ def evaluate(
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
-            scored, histograms = judge.forecasts(name, forecaster, count, parts(name))
+            scored, histograms = metric_model.forecasts(name, forecaster, count, parts(name))
             rows[name] = Row(count, scored, histograms=histograms)
         for name, each in models.items():
-            with reproducibly(each, seed):
+            with seeded_evaluation(each, seed):
                 forecaster = forecaster_of(each, held, samples, {"draw_emission": drawn[name], **(options or {})})
-                scored, histograms = judge.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
+                scored, histograms = metric_model.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
-                with reproducibly(each, seed):
-                    scored |= judge.bounds(name, each, parts(f"{name}, bound"))
-                with reproducibly(each, seed):
-                    scored |= judge.log_score(name, each, parts(f"{name}, log score"))
+                with seeded_evaluation(each, seed):
+                    scored |= metric_model.bounds(name, each, parts(f"{name}, bound"))
+                with seeded_evaluation(each, seed):
+                    scored |= metric_model.log_score(name, each, parts(f"{name}, log score"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
             rows[name] = Row(samples, scored, equations, dict((configs or {}).get(name, {})), histograms)
 
     kinds = {"drawn" if each else "mean" for each in drawn.values() or [_is_drawn(None, draw_emission, means)]}
     return Evaluation(
         rows=rows,
-        metrics=judge.metrics(rows),
+        metrics=metric_model.metrics(rows),
         clips=held.clips,
         data=held.description(),
         protocol=plain(dataclasses.asdict(windows.protocol)),
@@ -212,10 +212,10 @@ def _reservations(measures: Sequence[Measure], samples: int, of_means: Sequence[
 
 
 @dataclass(frozen=True)
-class _Judge:
+class _Evaluator:
     """Scores of the rows of one evaluation; values are by clip."""
 
-    held: Held
+    held: EvaluationWindows
     measures: Sequence[Measure]
     bound_particles: int
     log_score_particles: int
@@ -246,8 +246,8 @@ class _Judge:
             scores = {"ELBO": terms.per_frame}
             scores |= {f"KL {latent}": kl / terms.frames for latent, kl in terms.kl.items()}
             if self.bound_particles:
-                weighted = importance_bound(model, batch, particles=self.bound_particles)
-                scores |= {"importance bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
+                weighted = iwae_bound(model, batch, particles=self.bound_particles)
+                scores |= {"IWAE bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
             refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.held.keys[part])
             found.append({metric: values.cpu() for metric, values in scores.items()})
         return self._means(_concatenate(found))
@@ -268,7 +268,7 @@ class _Judge:
         """Return the metrics of all scores in the rows, in the order of the table."""
         found = {name for row in rows.values() for name in row.clip_means}
         latents = sorted(name for name in found if name.startswith("KL "))
-        _, frame = called(self.held.windows.description)
+        _, frame = axis_names(self.held.windows.description)
         bounds = {"log score": LOG_SCORE, **TEACHER_FORCED, **dict.fromkeys(latents, KL)}
         order = {measure.name: measure.metric for measure in self.measures}
         order |= {
@@ -294,13 +294,13 @@ def _references(
     return truths | {name: known[name] for name in asked}
 
 
-def forecaster_of(model: Any, held: Held, samples: int, options: Mapping[str, Any]) -> Forecaster:
+def forecaster_of(model: Any, held: EvaluationWindows, samples: int, options: Mapping[str, Any]) -> Forecaster:
     """Return the function from a slice of windows to a model's K futures, with these options of its `forecast`."""
     horizon = held.futures.shape[1]
     return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
 
 
-def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: Held, part: slice) -> Tensor:
+def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: EvaluationWindows, part: slice) -> Tensor:
     """Return futures `(B, K, H, D)` of some windows, on the CPU.
 
     Raises:

@@ -12,20 +12,20 @@ import numpy as np
 from rich.text import Text
 from typing_extensions import override
 
-from ...data.sequences import called
+from ...data.sequences import axis_names
 from ...options import nearest
 from ..diagnostics.calibration import envelope
+from .estimates import clustered_variance, decimals, effective_number, linearised, student_interval
 from .record import MODELS, Dims
-from .result import Result, Table, canvas
+from .result import Result, Table, new_figure
 from .scores import Metric
-from .uncertainty import clustered_variance, decimals, effective_number, linearised, student_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
-"""Arrow for each direction that is better."""
+"""Edge for each direction that is better."""
 _MOST_RANKS = 10_000  # the envelope of this many takes a second
 
 
@@ -175,7 +175,7 @@ class Evaluation(Result):
         columns = min(4, len(names))
         rows = math.ceil(len(names) / columns)
         height = 0.7 + 0.22 * len(self.rows)
-        figure = canvas(2 + 2.2 * columns, height * rows)
+        figure = new_figure(2 + 2.2 * columns, height * rows)
         panels = list(figure.subplots(rows, columns, sharey=True, squeeze=False).flat)
         scores = {method: self[method] for method in self.rows}
         for panel, name in zip(panels, names, strict=False):
@@ -235,7 +235,7 @@ class Evaluation(Result):
         methods = [method for method, row in self.rows.items() if histogram in row.histograms]
         if not methods:
             raise KeyError(f"no method has a histogram {histogram!r}; evaluate with scores=calibrated")
-        figure = canvas(0.8 + 2.4 * len(methods), 3.7)
+        figure = new_figure(0.8 + 2.4 * len(methods), 3.7)
         panels = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey="row")
         for (top, bottom), method in zip(panels.T, methods, strict=True):
             self._draw(top, method, histogram)
@@ -261,7 +261,7 @@ class Evaluation(Result):
         Raises:
             KeyError: when no method has a histogram of a frame.
         """
-        _, frame = called(self.data)
+        _, frame = axis_names(self.data)
 
         def at(score: str, names: Iterable[str]) -> dict[int, str]:
             """Return the names of a score by frame."""
@@ -272,7 +272,7 @@ class Evaluation(Result):
         if not shown:
             raise KeyError("no method has a histogram of a frame; evaluate with scores=over_horizon")
         columns = max(map(len, shown.values())) + 1
-        figure = canvas(1 + 1.5 * columns, 0.9 + 1.7 * len(shown))
+        figure = new_figure(1 + 1.5 * columns, 0.9 + 1.7 * len(shown))
         panels = figure.subplots(len(shown), columns, squeeze=False)
         for (*alone, last), (method, histograms) in zip(panels, shown.items(), strict=True):
             for panel, (place, name) in zip(alone, histograms.items(), strict=True):
@@ -348,12 +348,12 @@ class Evaluation(Result):
 
     def _caption(self) -> str:
         freedom = f"{len(self.clips) - 1} degrees of freedom"
-        clip, _ = called(self.data)
+        clip, _ = axis_names(self.data)
         return "\n".join([f"mean ± standard error over windows, clustered by {clip} ({freedom})", *self.notes])
 
     def _title(self) -> str:
         name = str(self.protocol.get("name", ""))
-        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} {called(self.data)[0]}s"]
+        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} {axis_names(self.data)[0]}s"]
         parts += self.data.get("title", [])
         parts += [f"{name} {value}" for name, value in self.options.items()]
         parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]

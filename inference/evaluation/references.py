@@ -10,14 +10,14 @@ from torch import Tensor
 from ...data.batch import Batch
 from ...data.sequences import (
     HeldOutWindows,
-    bridged,
     columns_of,
+    interpolate_missing,
     mean_of_known,
     sequences,
     take_split,
 )
 from ...options import nearest
-from .held import Held
+from .evaluation_windows import EvaluationWindows
 
 Forecaster = Callable[[slice], Tensor]
 """Function from a slice of windows to forecasts (K, B, H, D)."""
@@ -42,7 +42,7 @@ def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
     if mask is None:
         return x[:, -1], None
     mask = mask[:, :observed]
-    return bridged(x, mask)[:, -1], mask.any(1)
+    return interpolate_missing(x, mask)[:, -1], mask.any(1)
 
 
 def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: Tensor | None = None) -> Tensor:
@@ -82,7 +82,7 @@ def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Te
     Returns:
         One forecast, `(1, B, H, D)`, laid out like forecasts of a model.
     """
-    return bridged(observed, mask)[None, :, -1:].expand(-1, -1, horizon, -1)
+    return interpolate_missing(observed, mask)[None, :, -1:].expand(-1, -1, horizon, -1)
 
 
 def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = None) -> Tensor:
@@ -104,11 +104,11 @@ def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = 
     frames = observed.shape[1]
     if not 1 <= season <= frames:
         raise ValueError(f"a season is from 1 to the {frames} observed frames, not {season}")
-    last = bridged(observed, mask)[:, -season:]
+    last = interpolate_missing(observed, mask)[:, -season:]
     if mask is not None:
         periods = frames // season * season
         x, seen = (each[:, -periods:].unflatten(1, (-1, season)).movedim(1, 2) for each in (observed, mask))
-        last = torch.where(seen.any(2), bridged(x, seen)[:, :, -1], last)
+        last = torch.where(seen.any(2), interpolate_missing(x, seen)[:, :, -1], last)
     return last[None, :, torch.arange(horizon) % season]
 
 
@@ -161,7 +161,7 @@ def nearest_neighbours(
     here = last_places(Batch(x=observed) | ({} if mask is None else {"mask": mask}), frames)
     there = last_places(Batch(x=training) | ({} if training_mask is None else {"mask": training_mask}), frames)
     nearest = distances(here[0], there[0], here[1], there[1]).topk(samples, largest=False).indices
-    return bridged(training, training_mask)[nearest.T, frames:]
+    return interpolate_missing(training, training_mask)[nearest.T, frames:]
 
 
 @dataclass(frozen=True)
@@ -192,13 +192,13 @@ class References:
         ValueError: on indexing, when the reference does not exist or is not available.
     """
 
-    held: Held
+    held: EvaluationWindows
     samples: int
     seed: int = 0
     training: HeldOutWindows | None = None
     season: int | None = None
 
-    def lacking(self, name: str) -> str:
+    def missing_requirement(self, name: str) -> str:
         """Return the missing requirement of a reference; empty if the reference is available.
 
         Raises:
@@ -218,7 +218,7 @@ class References:
         return ""
 
     def __getitem__(self, name: str) -> tuple[int, Forecaster]:
-        if needed := self.lacking(name):
+        if needed := self.missing_requirement(name):
             raise ValueError(f"the reference row {name!r} needs {needed}")
         return self._makers[self._names.get(name, name)]()
 
@@ -226,7 +226,7 @@ class References:
     def usual(self) -> list[str]:
         """Default rows of an evaluation: defined by the windows, or else by their kind, if available."""
         names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
-        return [name for name in names if not self.lacking(name)]
+        return [name for name in names if not self.missing_requirement(name)]
 
     @property
     def _names(self) -> Mapping[str, str]:
@@ -259,7 +259,7 @@ class References:
 
     def _climatology(self) -> tuple[int, Forecaster]:
         training, gaps = self._training
-        futures = bridged(training, gaps)[:, self.held.observed :]
+        futures = interpolate_missing(training, gaps)[:, self.held.observed :]
         return self.samples, climatology(futures, len(self.held.x), self.samples, self.seed)
 
     def _neighbours(self) -> tuple[int, Forecaster]:

@@ -18,7 +18,7 @@ from rich.text import Text
 from typing_extensions import override
 
 from ... import files
-from ...turns import SHAPES
+from ...locking import SHAPES
 from .record import MODELS, Flat, Variable, flatten, plain, unflatten
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Table(rich.table.Table):
         super().add_row(*map(_as_it_is, cells), **options)
 
 
-class Plain(Console):
+class PlainConsole(Console):
     """Console that prints text literally: paths, names and messages contain no markup and no emoji.
 
     It stops printing when the reader closes the pipe, as in `dvae evaluate RUN | head`. The command continues.
@@ -65,7 +65,7 @@ class Plain(Console):
 
     @override
     def on_broken_pipe(self) -> None:
-        Plain.unread = self.quiet = True
+        PlainConsole.unread = self.quiet = True
         self.print()  # a quiet console empties its buffer
         with suppress(OSError), open(os.devnull, "wb") as nowhere:  # the rest of Python's buffer is written there
             os.dup2(nowhere.fileno(), self.file.fileno())
@@ -83,25 +83,25 @@ def _shown(text: str) -> str:
     return text.replace("\x1b", r"\x1b")
 
 
-def reason(error: BaseException) -> str:
+def error_message(error: BaseException) -> str:
     """Return the message of an error, without the table of shapes that Pyro appends."""
     return SHAPES.sub("", str(error))
 
 
-def canvas(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float) -> "Figure":
     """Return an empty figure with a size in inches; matplotlib is imported only on use."""
     from .picture import Picture
 
     return Picture(figsize=(width, height), layout="constrained")
 
 
-def as_they_are(texts: "Iterable[matplotlib.text.Text]") -> None:
+def literal_text(texts: "Iterable[matplotlib.text.Text]") -> None:
     """Make matplotlib draw texts literally: dollar signs in a name enclose no formula."""
     for text in texts:
         text.set_parse_math(False)
 
 
-class Shown:
+class Displayed:
     """Base class that displays its `table` in a terminal and in a notebook."""
 
     def table(self) -> RenderableType:
@@ -128,7 +128,7 @@ class Shown:
         return f'<pre style="line-height:normal; font-family:monospace">{lines}</pre>'
 
 
-class Result(Shown):
+class Result(Displayed):
     """Numbers with named dimensions, and the settings of their measurement.
 
     A subclass is a dataclass. `record.Dims` marks its arrays; `dataset`, JSON and netCDF follow from these marks.
@@ -227,7 +227,7 @@ class Result(Shown):
         Raises:
             OSError, ValueError: when it cannot be written.
         """
-        with files.written(path) as file:
+        with files.atomic_write(path) as file:
             file.write((self.to_json() + "\n").encode())
 
     @classmethod
@@ -247,7 +247,7 @@ class Result(Shown):
         """
         found = self.dataset
         found.attrs = {name: json.dumps(value) for name, value in found.attrs.items()}
-        with files.written(path) as file:
+        with files.atomic_write(path) as file:
             file.write(found.to_netcdf())
 
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, bridged, called, columns_of, scales_of
+from ...data.sequences import HeldOutWindows, axis_names, columns_of, interpolate_missing, scales_of
 from . import metrics
 
 
@@ -47,7 +47,7 @@ class Metric:
 LOG_SCORE = Metric("nats/frame", "free-running", "higher")
 TEACHER_FORCED = {
     "ELBO": Metric("nats/frame", "teacher-forced", "higher"),
-    "importance bound": Metric("nats/frame", "teacher-forced", "higher"),
+    "IWAE bound": Metric("nats/frame", "teacher-forced", "higher"),
     "k-hat": Metric("", "teacher-forced"),
 }
 KL = Metric("nats/frame", "teacher-forced", "")
@@ -192,7 +192,7 @@ _CALIBRATED: dict[str, Any] = {
 def coverage_at(level: float) -> Measure:
     """Return the coverage of the central interval of a level (`metrics.coverage`)."""
     function = paired(partial(metrics.coverage, level=level))
-    return Measure(f"coverage {100 * level:g} %", function, "share", **_CALIBRATED, least=reaching(level))
+    return Measure(f"coverage {100 * level:g} %", function, "share", **_CALIBRATED, least=samples_needed(level))
 
 
 def width_at(level: float) -> Measure:
@@ -201,10 +201,10 @@ def width_at(level: float) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return metrics.interval_width(forecasts.masked_fill(truth[:, None].isnan(), torch.nan), level)
 
-    return Measure(f"width {100 * level:g} %", function, better="", least=reaching(level), of_draws=True)
+    return Measure(f"width {100 * level:g} %", function, better="", least=samples_needed(level), of_draws=True)
 
 
-def reaching(level: float) -> int:
+def samples_needed(level: float) -> int:
     """Return the fewest samples that define a central interval of this level with samples outside."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
@@ -240,7 +240,7 @@ def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
     past = batch.mask_to_nan()[:, :observed].double()
     scale = torch.from_numpy(np.nanstd(past.numpy(), (0, 1)))
     scale = torch.where(scale > 0, scale, 1.0)
-    last = bridged(past, ~past.isnan())[:, -1:]
+    last = interpolate_missing(past, ~past.isnan())[:, -1:]
     steps = torch.randn(
         len(last), batch["x"].shape[1] - observed, len(scale), generator=torch.Generator().manual_seed(seed)
     )
@@ -339,7 +339,7 @@ def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -
     """
     horizon = windows.all()["x"].shape[1] - windows.protocol.observed
     frames = frames or sorted({round(place) for place in np.linspace(1, horizon, 6)})
-    _, frame = called(windows.description)
+    _, frame = axis_names(windows.description)
     alone = [*map(coverage_at, (0.5, 0.8, 0.9)), PIT]
     return [*calibrated(windows), *(each for measure in alone for each in by_frame(measure, frames, frame))]
 

@@ -58,14 +58,14 @@ _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "best_step": (lambda value: value is None or _count(value), f"{_NUMBER} or null"),
     "best_bound": (lambda v: v is None or (isinstance(v, float) and math.isfinite(v)), "a finite number or null"),
     "last_value": (
-        lambda v: v is None or v is ... or (isinstance(v, float) and math.isfinite(v)),
+        lambda v: v is None or (isinstance(v, float) and math.isfinite(v)),
         "a finite number or null",
     ),
     "waited": (lambda value: _count(value), _NUMBER),
     "status": (lambda value: value in STATUSES, "one of the known ones"),
     "optimizer": (lambda value: value in OPTIMISERS, f"one of {', '.join(OPTIMISERS)}"),
     "per": (lambda value: value is ... or (isinstance(value, str) and value.isidentifier()), "a word"),
-    "processor_seconds": (lambda v: v is ... or (isinstance(v, float) and 0 <= v < math.inf), "a number from 0"),
+    "processor_seconds": (lambda v: isinstance(v, float) and 0 <= v < math.inf, "a number from 0"),
 }
 
 
@@ -131,7 +131,7 @@ class Run:
         Raises:
             CheckpointError: when another process has locked it.
         """
-        with files.made(self.path), self._opened_lock() as file:
+        with files.create_folder(self.path), self._opened_lock() as file:
             if fcntl is not None:
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -153,7 +153,7 @@ class Run:
 
     def _write_new(self, name: str, content: bytes) -> None:
         """Write a file under its temporary name."""
-        with files.naming(self.path / name, self.path / f"{name}.new"):
+        with files.with_path(self.path / name, self.path / f"{name}.new"):
             files.write(self.path / f"{name}.new", content)
 
     def write_config(self, config: Mapping[str, Any]) -> None:
@@ -264,7 +264,7 @@ def weights(model: nn.Module) -> dict[str, Tensor]:
 
 def save_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
     """Write a model's weights to a safetensors file, which replaces an older one only when it is complete."""
-    with files.written(path) as file:
+    with files.atomic_write(path) as file:
         file.write(save_tensors(weights(model)))
 
 

@@ -19,20 +19,20 @@ from torch import nn
 
 from ...data.batch import WHOLE
 from ...data.schema import Schema
-from ...data.sequences import Fingerprinted, InBatches, Source, as_source, in_batches, is_divided, take_split
+from ...data.sequences import Batched, Fingerprinted, Source, as_batches, as_source, has_splits, take_split
+from ...locking import seeded
 from ...program.batch import check_scale
 from ...program.conditional import like
 from ...program.model import DynamicalVAE
-from ...program.rollout import SelfFeeding
-from ...turns import seeded
-from ..evaluation.result import as_they_are
+from ...program.rollout import ScheduledSampling
+from ..evaluation.result import literal_text
 from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
 from .last_value import last_value_bound
 from .objectives import Objective
 from .options import Stage, Training, recorded
 from .recipe import Recipe, Trainable, run_config
-from .resuming import marking_failure, restore, store
+from .resuming import mark_failure, restore, store
 from .signals import Signals
 from .svi import SVI, State
 from .trackers import InMemory, JSONLines, Terminal, Tracker
@@ -113,7 +113,7 @@ class Fit:
         if self.model is None or not any(getattr(module, "residual", False) for module in self.model.modules()):
             advice.append("try residual=1, which adds the output to the last value")
         if not self_fed:
-            advice.append("try self_feeding=1, which trains on the model's own output")
+            advice.append("try scheduled_sampling=1, which trains on the model's own output")
         return f"{found}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
 
     def series(self, name: str) -> tuple[list[int], list[float]]:
@@ -142,7 +142,7 @@ class Fit:
         for name in names:
             if name.startswith(start):
                 terms.plot(*self.series(name), label=name.removeprefix(start))
-                as_they_are(terms.legend().get_texts())
+                literal_text(terms.legend().get_texts())
         terms.set(xlabel="step", ylabel="KL (nats per frame)" if likelihood else "energies (per frame)")
         if not likelihood:
             terms.set_yscale("log")  # scales of energies differ by orders of magnitude, which weights compensate
@@ -245,15 +245,15 @@ def fit(
         return _fit(model, data.batches, data.validation, **_prepared(data, model, loop | options))
     if resume:
         raise ValueError(f"dvae.resume({os.fspath(out or 'RUN')!r}) continues the run of a method")
-    if validation is None and is_divided(data):
+    if validation is None and has_splits(data):
         validation = data
     train = as_source(take_split(data, "train"))
-    schema = Schema.of(data if is_divided(data) else train)
+    schema = Schema.of(data if has_splits(data) else train)
     if too_short := getattr(train, "too_short", ""):
         warnings.warn(f"training leaves out {too_short}", stacklevel=4)
     names = Training.__dataclass_fields__.keys() & options
     training = replace(model.training(schema), **{name: options.pop(name) for name in names})
-    method = model.suited(train)
+    method = model.resolve_defaults(train)
     if out is not None and config is None and hasattr(data, "recorded"):
         loop["config"] = run_config(method, schema, data.kind, data.recorded())
     recipe = method.train(train, take_split(validation, "validation"), training.steps)
@@ -269,16 +269,16 @@ def _prepared(recipe: Recipe, model: nn.Module, options: Mapping[str, Any]) -> d
     steps = sum(stage.steps for stage in recipe.stages)
     if options.get("steps", steps) != steps:
         raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
-    if options.get("self_feeding", 0.0) != 0.0:
+    if options.get("scheduled_sampling", 0.0) != 0.0:
         raise ValueError(
-            f"self-feeding is an option of the method, which tells its recipe; instead of self_feeding="
-            f"{options['self_feeding']} here write dvae.method(…, self_feeding=…)"
+            f"scheduled sampling is an option of the method, which tells its recipe; instead of scheduled_sampling="
+            f"{options['scheduled_sampling']} here write dvae.method(…, scheduled_sampling=…)"
         )
     if not options["resume"]:
         run_directory(options["out"], False, {})  # refuses a directory before a preparation that may take long
         with seeded(None):
             recipe.prepare(model)
-    own = {"steps": steps, "self_feeding": recipe.feeding, "stages": recipe.stages, "objective": None}
+    own = {"steps": steps, "scheduled_sampling": recipe.feeding, "stages": recipe.stages, "objective": None}
     return {**options, **own}
 
 
@@ -299,11 +299,11 @@ def _fit(
     """Run the loop for `fit`."""
     svi = SVI(model, objective, stages, **options)
     training = svi.training
-    if validation is None and is_divided(train):
+    if validation is None and has_splits(train):
         validation = train
     train = take_split(train, "train")
     source = as_source(train)
-    held_out = None if validation is None else in_batches(validation)
+    held_out = None if validation is None else as_batches(validation)
     if training.patience is not None and held_out is None:
         raise ValueError("patience counts validations; give validation data, or leave patience out")
     # hashing all data takes time, so only for a run that is stored
@@ -332,7 +332,7 @@ def _fit(
             tracker.start(state.step)
             stack.callback(tracker.close)
         if run is not None:
-            stack.enter_context(marking_failure(svi, run))
+            stack.enter_context(mark_failure(svi, run))
         signals = stack.enter_context(Signals())
         before, state.status = state.status, _status(state, training)
         if run is not None and (not resume or state.status not in ("running", before)):
@@ -386,7 +386,7 @@ def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapp
 def _train(
     svi: SVI,
     source: Source,
-    held_out: InBatches | None,
+    held_out: Batched | None,
     observed: int | None,
     run: Run | None,
     receivers: Sequence[Tracker],
@@ -435,7 +435,7 @@ def _train(
         if due and held_out is not None:
             report(svi.validate(held_out))
             if observed is not None and state.last_value is None and "validation/loss" not in state.row:
-                fed = bool(svi.final_feeding) and isinstance(model.feeding, SelfFeeding)
+                fed = bool(svi.final_feeding) and isinstance(model.feeding, ScheduledSampling)
                 state.last_value = last_value_bound(
                     model, source, held_out, observed, fed=fed, batch_size=training.batch_size
                 )

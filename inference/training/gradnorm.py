@@ -124,7 +124,7 @@ class GradNorm:
 
 
 class Balance:
-    """Weights of a `GradNorm` in a stage of a run, as an `objectives.Adapting`.
+    """Weights of a `GradNorm` in a stage of a run, as an `objectives.StatefulObjective`.
 
     Args:
         objective: objective that the weights belong to.

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from ...data.batch import WHOLE, Batch
-from ...data.sequences import InBatches, Source
+from ...data.sequences import Batched, Source
 from ...networks.loop import valid_steps
 from ...program.model import DynamicalVAE
 
@@ -33,7 +33,7 @@ _ONE_HOT = type(constraints.one_hot)
 
 
 def last_value_bound(
-    model: DynamicalVAE, train: Source, validation: InBatches, observed: int, *, fed: bool, batch_size: int
+    model: DynamicalVAE, train: Source, validation: Batched, observed: int, *, fed: bool, batch_size: int
 ) -> float:
     """Return the log density of validation windows under the last-value forecast, in nats per frame.
 

@@ -4,9 +4,9 @@ An objective is a function of `Terms` and the global step. `Evidence` is the neg
 on each KL term (warm-up; Bowman et al. 2016, arXiv 1511.06349; beta-VAE, Higgins et al. 2017) and free bits (Kingma et
 al. 2016, arXiv 1606.04934). The weights never change the recorded bound: model selection reads `Terms.bound`.
 
-An objective with a state, such as adaptive weights (`gradnorm`), is `Adaptive`: a description without state. Each stage
-of a run turns it into an `Adapting` objective. The state belongs to the run and its checkpoints, so two runs may share
-one description.
+An objective with a state, such as adaptive weights (`gradnorm`), is `AdaptiveObjective`: a description without state.
+Each stage of a run turns it into an `StatefulObjective` objective. The state belongs to the run and its checkpoints, so
+two runs may share one description.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -30,7 +30,7 @@ class Objective(Protocol):
 
 
 @runtime_checkable
-class Asking(Protocol):
+class RequiresDraws(Protocol):
     """Objective that declares the draws it needs and the score that selects the best weights, such as `Evidence`."""
 
     @property
@@ -43,7 +43,7 @@ class Asking(Protocol):
 
 
 @runtime_checkable
-class Adapting(Objective, Protocol):
+class StatefulObjective(Objective, Protocol):
     """Objective with a state within a stage of a run, such as `gradnorm.Balance`.
 
     Each step calls `measure`, the objective itself for the loss, and `adapt`, in this order.
@@ -72,10 +72,10 @@ class Adapting(Objective, Protocol):
 
 
 @runtime_checkable
-class Adaptive(Protocol):
+class AdaptiveObjective(Protocol):
     """Objective whose state starts anew in each stage; a direct call gives the losses that validation compares."""
 
-    def begin(self, model: nn.Module) -> Adapting:
+    def begin(self, model: nn.Module) -> StatefulObjective:
         """Return the objective with its state for a stage; raise ValueError if the model does not fit."""
 
 

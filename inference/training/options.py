@@ -26,8 +26,8 @@ class Training:
         momentum: momentum of "sgd", the share of the last step added to the next one.
         weight_decay: the optimiser's weight decay.
         gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
-        self_feeding: probability that a frame of x's history is replaced by the program's own mean (scheduled sampling,
-            Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. For a model trained on noisy inputs
+        scheduled_sampling: probability that a frame of x's history is replaced by the program's own mean (scheduled
+            sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. For a model trained on noisy inputs
             (`InputNoise`), the share of that noise. The best weights are then selected with this feeding, once the
             schedule has reached its last value.
         particles: number of draws from the guide for each sequence and step.
@@ -56,7 +56,7 @@ class Training:
     momentum: Annotated[float, Range(0, 1, below=True)] = 0.0
     weight_decay: Amount = 0.0
     gradient_clip: Annotated[float, Range(0, above=True)] | None = 10.0
-    self_feeding: Share | Schedule = 0.0
+    scheduled_sampling: Share | Schedule = 0.0
     particles: Annotated[int, Range(1, 4096)] = 1
     validate_every: Count = 100
     patience: Count | None = None
@@ -71,7 +71,7 @@ class Training:
         if self.gradient_clip == math.inf:
             object.__setattr__(self, "gradient_clip", None)
         check(self)
-        for name, allowed in (("learning_rate", Range(0)), ("self_feeding", Range(0, 1))):
+        for name, allowed in (("learning_rate", Range(0)), ("scheduled_sampling", Range(0, 1))):
             for value in levels(getattr(self, name)):
                 if value not in allowed:
                     raise ValueError(f"{name} is {value}; it must be {allowed}")
@@ -99,7 +99,7 @@ class Stage:
         steps: number of steps in the stage.
         objective: objective to minimise.
         learning_rate: learning rate; None for the value in `Training`.
-        self_feeding: probability of scheduled sampling; None for the value in `Training`.
+        scheduled_sampling: probability of scheduled sampling; None for the value in `Training`.
         curriculum: progress, from 0 to 1, of parts that are introduced gradually, such as draws of variables that
             sequences share (`distributions.Subset`); None for 1.
         frozen: prefixes of names of parameters that are not trained.
@@ -112,7 +112,7 @@ class Stage:
     steps: int
     objective: Objective = field(default_factory=Evidence)
     learning_rate: float | Schedule | None = None
-    self_feeding: float | Schedule | None = None
+    scheduled_sampling: float | Schedule | None = None
     curriculum: float | Schedule | None = None
     frozen: tuple[str, ...] = ()
 
@@ -126,7 +126,7 @@ class Stage:
                 raise ValueError(f"the curriculum of a stage is {value}; it goes from 0 to 1")
 
 
-def lay_out(
+def plan_stages(
     options: Mapping[str, Any], objective: Objective | None, stages: Sequence[Stage]
 ) -> tuple[Training, list[Stage]]:
     """Return the training options and the stages, with schedules that end within the run.

@@ -36,7 +36,7 @@ class LostProcess(RuntimeError):
     """Another process of the run has ended, or does not answer."""
 
 
-def launched(training: Training) -> "Fabric":
+def launch(training: Training) -> "Fabric":
     """Start the processes of a run, or join those that torchrun has started.
 
     Raises:
@@ -66,17 +66,17 @@ def launched(training: Training) -> "Fabric":
     return fabric
 
 
-def by_torchrun() -> bool:
+def is_torchrun() -> bool:
     """Return whether torchrun has started this process."""
     return distributed.is_available() and distributed.is_torchelastic_launched()
 
 
-def restartable() -> bool:
+def is_restartable() -> bool:
     """Return whether torchrun restarts the processes when one of them has ended (`--max-restarts`).
 
     torchrun counts restarts, except those that another host has asked for.
     """
-    return by_torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+    return is_torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
 
 
 def seed_of(seed: int, process: int) -> int:
@@ -84,12 +84,12 @@ def seed_of(seed: int, process: int) -> int:
     return int(np.random.SeedSequence([seed % 2**64, process]).generate_state(1)[0]) if process else seed
 
 
-def summed(fabric: "Fabric", value: Tensor) -> Tensor:
+def sum_over_processes(fabric: "Fabric", value: Tensor) -> Tensor:
     """Return the sum over the processes."""
     return _all_reduce(value.to(fabric.device, copy=True)) if fabric.world_size > 1 else value
 
 
-def together(
+def average_gradients(
     fabric: "Fabric", parameters: Sequence[nn.Parameter], loss: Tensor, frames: Tensor
 ) -> tuple[Tensor, Tensor | float]:
     """Average gradients over processes, as for one batch of all their sequences with a loss per frame.
@@ -120,7 +120,7 @@ def together(
     return whole[0], frames / all_frames
 
 
-def agree(fabric: "Fabric", values: Iterable[Tensor]) -> None:
+def broadcast_values(fabric: "Fabric", values: Iterable[Tensor]) -> None:
     """Copy the first process's values to every process, in place."""
     if fabric.world_size > 1:
         with _answered():
@@ -130,11 +130,11 @@ def agree(fabric: "Fabric", values: Iterable[Tensor]) -> None:
                 value.copy_(sent)
 
 
-def gathered(fabric: "Fabric", value: Tensor) -> Tensor:
+def gather(fabric: "Fabric", value: Tensor) -> Tensor:
     """Return the values (N,) of all processes, as (processes, N) on the CPU."""
     rows = value.new_zeros(fabric.world_size, *value.shape)
     rows[fabric.global_rank] = value
-    return summed(fabric, rows).cpu()
+    return sum_over_processes(fabric, rows).cpu()
 
 
 def wait(fabric: "Fabric") -> None:
@@ -158,13 +158,13 @@ def _check(training: Training) -> None:
     if not there.get(accelerator, True):
         found = f"torch {torch.__version__} finds none here"
         raise ValueError(f"accelerator is {accelerator!r}, and {found}; 'auto' takes what there is")
-    if devices > 1 and not by_torchrun() and sys.argv[0] in ("", "-", "-c"):
+    if devices > 1 and not is_torchrun() and sys.argv[0] in ("", "-", "-c"):
         raise ValueError(f"devices={devices} starts the program as often, and this one is in no file; write it to one")
 
 
 def _places(devices: int) -> tuple[int, int]:
     """Return the numbers of processes on this host and of hosts."""
-    if not by_torchrun():
+    if not is_torchrun():
         return devices, 1
     here, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
     if devices not in (1, here):

@@ -52,7 +52,7 @@ class Recipe:
 class Trainable:
     """Base class of methods: builds a model for data and describes its training. Its fields are its options.
 
-    A subclass implements `build` and `train`, and `suited` if an option may be left open.
+    A subclass implements `build` and `train`, and `resolve_defaults` if an option may be left open.
 
     Raises:
         ValueError: when an option is out of range.
@@ -68,7 +68,7 @@ class Trainable:
     def __post_init__(self) -> None:
         check(self)
 
-    def suited(self, data: Any) -> Self:
+    def resolve_defaults(self, data: Any) -> Self:
         """Return a copy whose open options are chosen for these data, or the method itself if none is open."""
         return self
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from . import processes
 from .checkpoints import BEST, LAST, OPTIMISER, CheckpointError, Run, read_weights, state_bytes, weights
-from .objectives import Adapting
+from .objectives import StatefulObjective
 from .options import stage_at
 from .svi import SVI, NonFiniteError
 
@@ -35,14 +35,14 @@ _STORED = ("step", "best_step", "best_bound", "last_value", "waited", "status", 
 def store(svi: SVI, run: Run) -> None:
     """Write a checkpoint of a run; every process calls it, and the first one writes."""
     state = svi.state
-    random = {name: processes.gathered(svi.fabric, value) for name, value in _random(svi).items()}
+    random = {name: processes.gather(svi.fabric, value) for name, value in _random(svi).items()}
     svi.settle()
     if not svi.fabric.is_global_zero:
         return
     content = {f"random/{name}": value for name, value in random.items()}
     for place, kept in svi.optimizer.state_dict()["state"].items():
         content |= {f"optimizer/{place}/{key}": value for key, value in kept.items() if isinstance(value, Tensor)}
-    if isinstance(svi.objective, Adapting):
+    if isinstance(svi.objective, StatefulObjective):
         content |= {f"objective/{name}": value for name, value in svi.objective.state.items()}
     content = {name: value.detach().cpu().clone().contiguous() for name, value in content.items()}
     files = {LAST: save_tensors(weights(svi.model)), OPTIMISER: save_tensors(content)}
@@ -95,15 +95,15 @@ def restore(svi: SVI, run: Run) -> None:
     except (RuntimeError, TypeError, ValueError) as error:
         raise _damaged(run, str(error)) from error
     for name in _STORED:
-        setattr(state, name, stored.get(name, getattr(state, name)))  # earlier versions stored no time
-    if isinstance(svi.objective, Adapting) and state.step > stage_at(svi.plan, state.step)[0]:
+        setattr(state, name, stored[name])
+    if isinstance(svi.objective, StatefulObjective) and state.step > stage_at(svi.plan, state.step)[0]:
         _take_up(svi.objective, run, parts["objective"])
     if BEST in stored["fingerprints"]:
         state.best = read_weights(model, run.read(BEST, state_bytes(model)), run.path / BEST)
 
 
 @contextmanager
-def marking_failure(svi: SVI, run: Run) -> Iterator[None]:
+def mark_failure(svi: SVI, run: Run) -> Iterator[None]:
     """Store the status "failed" with the last checkpoint on a `NonFiniteError`; its files do not change."""
     try:
         yield
@@ -171,7 +171,7 @@ def _check_random(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> None:
         raise _damaged(run, f"random has states of {' and '.join(map(str, rows.values()))} processes")
 
 
-def _take_up(objective: Adapting, run: Run, found: Mapping[str, Tensor]) -> None:
+def _take_up(objective: StatefulObjective, run: Run, found: Mapping[str, Tensor]) -> None:
     """Restore the state of an objective from a checkpoint.
 
     Raises:

@@ -18,18 +18,18 @@ import torch
 from torch import Tensor, nn
 
 from ...data.batch import Batch
-from ...data.sequences import InBatches, in_batches, refuse_table, tensor_of
+from ...data.sequences import Batched, as_batches, refuse_table, tensor_of
+from ...locking import no_fork, seeded, serialized
 from ...options import kind_of
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
 from ...program.protocols import Program
-from ...turns import alone, no_fork, seeded
 from ..bounds.elbo import SequenceELBO, Terms
-from ..evaluation.result import reason
+from ..evaluation.result import error_message
 from . import processes
 from .checkpoints import weights
-from .objectives import Adapting, Adaptive, Asking, Objective
-from .options import Stage, lay_out, stage_at
+from .objectives import AdaptiveObjective, Objective, RequiresDraws, StatefulObjective
+from .options import Stage, plan_stages, stage_at
 from .schedules import schedule
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class SVI:
                 f"the model is {kind_of(model)}; expected a module such as a DynamicalVAE, or `method.build(data)`"
             )
         self.model = model
-        self.training, self.plan = lay_out(options, objective, stages)
+        self.training, self.plan = plan_stages(options, objective, stages)
         trained = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
         if not trained:
             raise ValueError(f"{type(model).__name__} has no parameters that require gradients: nothing to fit")
@@ -115,15 +115,15 @@ class SVI:
                 raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
             if all(name.startswith(stage.frozen) for name in trained):
                 raise ValueError(f"a stage of {stage.steps} steps has every parameter frozen; there is nothing to fit")
-            if stage.curriculum is not None and not getattr(model, "gradual", False):
+            if stage.curriculum is not None and not getattr(model, "has_curriculum", False):
                 raise ValueError(
                     f"a stage of {stage.steps} steps has a curriculum, by which nothing of {type(model).__name__} "
                     "comes; what sequences share does (DynamicalVAE(shared=...))"
                 )
-            if isinstance(stage.objective, Adaptive):
+            if isinstance(stage.objective, AdaptiveObjective):
                 stage.objective.begin(model)  # refuse it now rather than when its stage begins
         self.parameters = list(trained.values())
-        self.final_feeding = self.rates(self.training.steps - 1)["self_feeding"]
+        self.final_feeding = self.rates(self.training.steps - 1)["scheduled_sampling"]
         self._state: State | None = None
         self._begun: dict[int, Objective] = {}
 
@@ -140,7 +140,9 @@ class SVI:
         first, stage = stage_at(self.plan, self.state.step)
         if first not in self._begun:
             described = stage.objective
-            self._begun = {first: described.begin(self.model) if isinstance(described, Adaptive) else described}
+            self._begun = {
+                first: described.begin(self.model) if isinstance(described, AdaptiveObjective) else described
+            }
         return self._begun[first]
 
     @torch.inference_mode(False)
@@ -148,7 +150,7 @@ class SVI:
         """Start at step 0 with a new optimiser and the random numbers of the seed; the weights do not change."""
         training = self.training
         with no_fork:  # imports lightning-fabric, and the first optimiser imports parts of torch
-            self.fabric: Fabric = processes.launched(training)
+            self.fabric: Fabric = processes.launch(training)
             torch.optim.SGD([torch.zeros(1)])
         with seeded(None, self.fabric.device):
             own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
@@ -157,7 +159,7 @@ class SVI:
             )
             bound = _Bound(self.model, SequenceELBO(training.particles))
             self.module, self.optimizer = self.fabric.setup(bound, optimizer)
-            processes.agree(self.fabric, self.model.state_dict().values())
+            processes.broadcast_values(self.fabric, self.model.state_dict().values())
             self.generator = torch.Generator().manual_seed(self._seed)
             # Not the generator's own seed: equal seeds would tie the latent draws to the choice of the batch.
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
@@ -165,7 +167,7 @@ class SVI:
         self._state, self._begun = State(self.model), {}
         return self._state
 
-    @alone
+    @serialized
     @torch.inference_mode(False)
     def step(self, batch: AnyBatch) -> Terms:
         """Take one optimiser step, in training mode, and return the terms of the bound before it.
@@ -184,14 +186,14 @@ class SVI:
             self.module.train()
         where = f"step {state.step + 1}"
         with self.drawing():
-            terms = self._terms(batch, stage.objective, where, rates["self_feeding"], rates.get("curriculum"))
+            terms = self._terms(batch, stage.objective, where, rates["scheduled_sampling"], rates.get("curriculum"))
             loss = objective(terms, state.step)
             self.optimizer.zero_grad()
             self.fabric.backward(loss)
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # the optimiser skips a parameter without a gradient, and keeps its state
-        whole, self._share = processes.together(self.fabric, self.parameters, loss, terms.frames.sum())
+        whole, self._share = processes.average_gradients(self.fabric, self.parameters, loss, terms.frames.sum())
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
         # the only place where a step synchronises with the device; everything up to the optimiser's step is queued
@@ -200,13 +202,13 @@ class SVI:
             impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
             advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
             if impossible and not state.step:
-                advice = "a law that can have these values; where it ends may depend on its parameters"
+                advice = "a distribution that can have these values; where it ends may depend on its parameters"
             raise NonFiniteError(f"{where}: {_culprit(self.model, terms, loss)}; no step was taken. Try {advice}")
         if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
             for gradient in gradients:
                 gradient.mul_(training.gradient_clip / norm)
         self._weights = dict[str, float]()
-        if isinstance(objective, Adapting):
+        if isinstance(objective, StatefulObjective):
             self._weights |= objective.row
             objective.adapt(self.mean)
         self.optimizer.step()
@@ -234,7 +236,7 @@ class SVI:
             data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch or whose `batches(size)`
                 yields batches in order.
         """
-        held_out = in_batches(data)
+        held_out = as_batches(data)
         row = self._score(held_out, 0.0)
         if self.final_feeding:
             what = "loss" if "loss" in row else "bound"
@@ -253,7 +255,7 @@ class SVI:
         state, row = self.state, self.evaluate(data)
         fed = "self_fed/" if self.final_feeding else ""
         score = -row[f"{fed}loss"] if "loss" in row else row[f"{fed}bound"]
-        if not fed or self.rates(state.step - 1)["self_feeding"] == self.final_feeding:
+        if not fed or self.rates(state.step - 1)["scheduled_sampling"] == self.final_feeding:
             state.waited += 1
             if "loss" in row and state.best_step is not None and not self._alike(state.best_step, state.step):
                 state.best_bound = None  # the best loss so far is of another objective
@@ -270,7 +272,7 @@ class SVI:
     def rates(self, step: int) -> dict[str, float]:
         """Return learning rate, probability of scheduled sampling and curriculum, if there is one, at a global step."""
         _, stage = stage_at(self.plan, step)
-        given = {"learning_rate": self.training.rate, "self_feeding": self.training.self_feeding}
+        given = {"learning_rate": self.training.rate, "scheduled_sampling": self.training.scheduled_sampling}
         own = {name: getattr(stage, name) for name in given}
         rates = {name: given[name] if own[name] is None else own[name] for name in given}
         rates |= {} if stage.curriculum is None else {"curriculum": stage.curriculum}
@@ -279,16 +281,12 @@ class SVI:
     @contextmanager
     def drawing(self) -> Iterator[None]:
         """Use the run's random state inside the context, and restore the caller's afterwards."""
-        with seeded(None, self.fabric.device):
-            torch.set_rng_state(self.random["torch"])
-            if "cuda" in self.random:
-                torch.cuda.set_rng_state(self.random["cuda"], self.fabric.device)
+        with self._drawing(self.random):
             yield
-            self.random = self._random_state()
 
     def total(self, value: Tensor) -> Tensor:
         """Return the sum over the processes."""
-        return processes.summed(self.fabric, value)
+        return processes.sum_over_processes(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
         """Return the mean over the processes of a rate per frame of the last step, weighted by their frames."""
@@ -298,18 +296,28 @@ class SVI:
         """Copy buffers that training changes, such as running means, from the first process to all."""
         parameters = dict(self.model.named_parameters())
         moved = [value for name, value in self.model.state_dict().items() if name not in parameters]
-        processes.agree(self.fabric, moved)
+        processes.broadcast_values(self.fabric, moved)
 
     @property
     def _seed(self) -> int:
         return processes.seed_of(self.training.seed, self.fabric.global_rank)
+
+    @contextmanager
+    def _drawing(self, random: dict[str, Tensor]) -> Iterator[None]:
+        """Use a random state inside the context, store what it becomes, and restore the caller's afterwards."""
+        with seeded(None, self.fabric.device):
+            torch.set_rng_state(random["torch"])
+            if "cuda" in random:
+                torch.cuda.set_rng_state(random["cuda"], self.fabric.device)
+            yield
+            random.update(self._random_state())
 
     def _random_state(self) -> dict[str, Tensor]:
         on_cuda = self.fabric.device.type == "cuda"
         cuda = {"cuda": torch.cuda.get_rng_state(self.fabric.device)} if on_cuda else {}
         return {"torch": torch.get_rng_state(), **cuda}
 
-    def _score(self, data: InBatches, feeding: float) -> dict[str, float]:
+    def _score(self, data: Batched, feeding: float) -> dict[str, float]:
         """Return the unweighted terms on held-out data, per frame, with the same draws at each call."""
         objective = stage_at(self.plan, self.state.step)[1].objective
         last = self.training.steps  # the last weights of the schedules, so that losses can be compared
@@ -321,11 +329,15 @@ class SVI:
         first, end = (fabric.global_rank, None) if shares else (0, 1)
         own = islice(data.batches(size), first, end, fabric.world_size)
         self.module.eval()
-        with seeded(self._seed, self.fabric.device), torch.no_grad():
-            for batch in own:
+        with seeded(self._seed, self.fabric.device):
+            random = self._random_state()
+        while True:
+            with self._drawing(random), torch.no_grad():  # other threads may run between two batches
+                if (batch := next(own, None)) is None:
+                    break
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 found = _sums(terms)
-                if not terms.likelihood or (isinstance(objective, Asking) and objective.select == "loss"):
+                if not terms.likelihood or (isinstance(objective, RequiresDraws) and objective.select == "loss"):
                     found["loss"] = objective(terms, last).double() * found["frames"]
                 for name, value in found.items():
                     sums[name] = sums[name] + value if name in sums else value
@@ -341,18 +353,18 @@ class SVI:
         if not isinstance(self.model, DynamicalVAE):  # a DynamicalVAE converts to its own precision
             dtype = self.parameters[0].dtype
             placed = placed.map(lambda v: v.to(dtype) if v.is_floating_point() else v)
-        program: dict[str, Any] = {"self_feeding": feeding} if feeding else {}
+        program: dict[str, Any] = {"scheduled_sampling": feeding} if feeding else {}
         program |= {} if curriculum is None else {"curriculum": curriculum}
-        if isinstance(objective, Asking) and objective.draws:
+        if isinstance(objective, RequiresDraws) and objective.draws:
             program["draws"] = objective.draws
         try:
-            measure = self.objective.measure if isinstance(self.objective, Adapting) else None
+            measure = self.objective.measure if isinstance(self.objective, StatefulObjective) else None
             on_device = self.fabric.to_device(placed)
             return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensor arguments
         except ValueError as error:
             if not _by_distribution(error):
                 raise
-            raise NonFiniteError(f"{where}: {reason(error).partition(chr(10))[0]}") from error
+            raise NonFiniteError(f"{where}: {error_message(error).partition(chr(10))[0]}") from error
 
 
 def _by_distribution(error: ValueError) -> bool:

@@ -1,8 +1,8 @@
 """Trackers: receivers of a run's log, such as a history, a file of JSON lines, TensorBoard or the terminal.
 
 A row maps names to numbers, in nats per frame. `bound`, `log_likelihood/x` and `kl/z` are of a training batch. With the
-prefix `validation/` they are of the validation data. `loss`, `gradient_norm`, `learning_rate` and `self_feeding` are of
-the step, and so is `weight/x` if an objective's weights adapt.
+prefix `validation/` they are of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling`
+are of the step, and so is `weight/x` if an objective's weights adapt.
 """
 
 import io
@@ -18,7 +18,7 @@ from rich.text import Text
 
 from ... import files
 from ...lazy import optional
-from ..evaluation.result import Plain, progress_bar
+from ..evaluation.result import PlainConsole, progress_bar
 from .checkpoints import CheckpointError
 
 LARGEST_LOG = 2**25
@@ -75,14 +75,14 @@ class JSONLines:
     def start(self, step: int) -> None:
         """Drop rows after `step`, and an incomplete last line, then open the file for appending."""
         kept = [json.dumps(row) + "\n" for row in self.read() if row["step"] <= step]
-        with files.written(self.path) as new:  # a new file, which no link can share
+        with files.atomic_write(self.path) as new:  # a new file, which no link can share
             new.write("".join(kept).encode())
         self._file = files.open_plain(self.path, os.O_WRONLY | os.O_APPEND)
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
         """Append a row."""
-        with files.naming(self.path):
-            files.put(self._file, (json.dumps({"step": step, **row}) + "\n").encode())
+        with files.with_path(self.path):
+            files.write_all(self._file, (json.dumps({"step": step, **row}) + "\n").encode())
 
     def close(self) -> None:
         """Close the file."""
@@ -146,18 +146,18 @@ class TensorBoard:
         optional("tensorboard", "tensorboard")
         from torch.utils.tensorboard import SummaryWriter  # slow to import, so imported only on use
 
-        with files.naming(self.directory):
+        with files.with_path(self.directory):
             self._writer = SummaryWriter(self.directory, purge_step=step + 1)
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
         """Write each number of a row as a scalar."""
-        with files.naming(self.directory):
+        with files.with_path(self.directory):
             for name, value in row.items():
                 self._writer.add_scalar(name, value, step)
 
     def close(self) -> None:
         """Close the event file."""
-        with files.naming(self.directory):
+        with files.with_path(self.directory):
             self._writer.close()
 
 
@@ -197,7 +197,7 @@ class Terminal:
 
     def __init__(self, steps: int, console: Console | None = None) -> None:
         self.steps = steps
-        self.console = console or Plain(stderr=True)
+        self.console = console or PlainConsole(stderr=True)
         self._latest: dict[str, float] = {}
         self._bar: Progress | None = None
 

@@ -1,4 +1,4 @@
-"""Methods that the papers on motion compare themselves with."""
+"""Baseline methods of the papers on motion."""
 
 from typing import TYPE_CHECKING
 

@@ -1,13 +1,13 @@
-"""The auto-conditioned LSTM: in training it reads blocks of the data and blocks of its own output in turns.
+"""Auto-conditioned LSTM: in training it alternately reads blocks of the data and blocks of its own output.
 
     p(x_t | x_{<t})        x_t = W LSTMs(x_{t-1}) + b
 
-Of every ten frames it reads five of the data and then five that it made itself, from the first step of training on;
-gradients flow through these. So it learns to come back from where its own output has gone.
+Of every ten frames it reads five of the data and then five of its own output, from the first step of training on.
+Gradients flow through its output. The network therefore learns to recover from its own errors.
 
-Zhou, Li, Xiao, He, Huang and Li, 2018, arXiv 1707.05363. In the public implementation each LSTM reads the state that
-the one below it had a step before; here it reads the present one, and a loss sums squares that are means there. Windows
-are not turned at random as there: see `heading`.
+Zhou, Li, Xiao, He, Huang and Li, 2018, arXiv 1707.05363. There are three differences from the public implementation.
+There, each LSTM reads the previous state of the one below it; here it reads the current state. There, the loss averages
+squares; here it sums them. There, windows are rotated at random; here `heading` replaces this.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from ...inference.training.options import Training
 from ...inference.training.schedules import Schedule
 from ...networks import NetworkSpec, Recurrent
 from ...options import Layers, Share, Size
-from ...program.rollout import SelfFeeding
+from ...program.rollout import ScheduledSampling
 from ..motion.poses import table
 from .deterministic import DeterministicMethod
 
 
 @dataclass(frozen=True)
 class ACLSTM(DeterministicMethod):
-    """See the file.
+    """The auto-conditioned LSTM.
 
     Args:
-        shown: frames of the data in a block.
-        own: frames of its own output in the block that follows.
-        self_feeding: probability with which each frame of such a block is its own output; else it is the data's.
+        shown: number of frames of the data in a block.
+        own: number of frames of its own output in the following block.
+        scheduled_sampling: probability that a frame of the second block is its own output instead of the data.
     """
 
     name = "aclstm"
@@ -50,17 +50,17 @@ class ACLSTM(DeterministicMethod):
     layers: Layers = 3
     shown: Size = 5
     own: Size = 5
-    self_feeding: Share = 1.0
+    scheduled_sampling: Share = 1.0
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """LSTMs alone; the law has the linear layer behind them."""
+        """Return LSTMs alone; the linear layer after them belongs to the distribution."""
         return {"default": Recurrent(self.width or 0, layers=self.layers, hidden=())}
 
     @override
-    def fed(self) -> SelfFeeding:
-        return SelfFeeding(0.0, gradient=True, blocks=(self.shown, self.own))
+    def fed(self) -> ScheduledSampling:
+        return ScheduledSampling(0.0, gradient=True, blocks=(self.shown, self.own))
 
     @override
     def _feeding(self, steps: int) -> Schedule | float:
-        return self.self_feeding
+        return self.scheduled_sampling

@@ -1,10 +1,10 @@
-"""BoM: the CVAE, of which the best of several draws has to be near what happened.
+"""BoM: the CVAE, trained so that the best of several draws is near the true future.
 
     p(w) p(x_t | x_{<t}, h, w)        q(w | x_{1:T}, h)
 
-In place of the mean squared error of draws from the guide stands that of the best of them, for each window, so that
-the others are free to be elsewhere (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). With the networks of the
-CVAE of Yuan and Kitani, 2020, arXiv 2003.08386, as in the tables of motion prediction.
+The loss has the squared error of the best draw from the guide for each window, instead of the mean over all draws. The
+other draws are therefore free to differ (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). It has the networks
+of the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386, as in the tables of motion prediction.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from .cvae import CVAE
 
 @dataclass(frozen=True)
 class BestOfMany(CVAE):
-    """See the file.
+    """The best-of-many CVAE.
 
     Args:
-        samples: draws of w for each window in training.
+        samples: number of draws of w for each window in training.
     """
 
     name = "bom"

@@ -1,14 +1,14 @@
-"""BoM by parts: GSPS's generator, of whose futures the best alone has to be near what happened.
+"""BoM by parts: GSPS's generator, trained only on the error of the best future.
 
     p(a) p(b) p(lower_t | h_{1:O}, a) p(upper_t | h_{1:O}, lower_{1:T}, b)        q(a) q(b)
 
-The parts of the body are made one after the other, as in GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422, eq. 14),
-and can be controlled as there. What is minimised is the squared error of the best of ten futures after the observed
-frames (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772), and no other energy: BoM says nothing of the observed
-frames, of diversity, of further futures, or of bodies. It is the row "BoM with Eq. 14" of GSPS's table of control.
+The parts of the body are predicted one after the other, as in GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422, eq.
+14), and can be controlled in the same way. Training minimises the squared error of the best of ten futures after the
+observed frames (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). There is no energy of the observed frames,
+diversity, further futures or bodies. It is the row "BoM with Eq. 14" of GSPS's table of control.
 
-GSPS does not tell how it was made; ours is that there is no guide but the prior, as GSPS has none, and that the ten
-futures have a latent of each part of their own.
+The paper on GSPS does not describe its implementation. Our choices: the guide is the prior, since GSPS has no other
+guide, and each of the ten futures has its own latent of each part.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from ...options import Amount
 from ..motion.gsps import GSPS
 
 SAMPLES = 10
-"""Futures of a window in training, as BoM's code has them."""
+"""Number of futures of a window in training, as in BoM's code."""
 
 
 @dataclass(frozen=True)
 class BoMParts(GSPS):
-    """See the file; options are those of GSPS, where weights of other energies are 0 and `draws` makes ten futures."""
+    """BoM by parts: the options of GSPS, with 0 for weights of other energies, and `draws` for ten futures."""
 
     name = "bom-parts"
     source = "Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772"
@@ -44,5 +44,5 @@ class BoMParts(GSPS):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Of later parts one draw for each of the first."""
+        """Return the preset, with one draw of later parts for each draw of the first."""
         return {**super().preset(skeleton), "draws": (SAMPLES, *[1] * (len(self.parts) - 1))}

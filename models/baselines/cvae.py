@@ -2,12 +2,13 @@
 
     p(w) p(x_t | x_{<t}, h, w)        q(w | x_{1:T}, h)
 
-One recurrent network sums up the observed poses h, for the guide and the decoder, and another the future x, for the
-guide. The decoder reads the summary of h, w and its own mean at t-1 (the last observed pose at first) in place of
-x_{t-1}; gradients flow through these means. Poses are absolute.
+One recurrent network summarises the observed poses h for guide and decoder, and another the future x for the guide. The
+decoder reads the summary of h, w and its own mean at t-1 (at first the last observed pose) in place of x_{t-1}.
+Gradients flow through these means. Poses are absolute.
 
-Yuan and Kitani, 2020, arXiv 2003.08386: 725,292 numbers for Human3.6M. Its latent of a mixture of normals is that of
-GMVAE (Dilokthanakul et al., 2016, arXiv 1611.02648), in the tables of motion prediction without its further latents.
+Yuan and Kitani, 2020, arXiv 2003.08386, with 725,292 parameters for Human3.6M. With a mixture of normals as the prior,
+it is GMVAE (Dilokthanakul et al., 2016, arXiv 1611.02648) without its further latents, as in the tables of motion
+prediction.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import WHOLE
-from ...distributions import LawSpec, Mixture
+from ...distributions import DistributionSpec, Mixture
 from ...networks import Input, Network, NetworkSpec
 from ...networks.base import perceptron
 from ...options import Count, Size
@@ -29,12 +30,12 @@ from ..motion.futures import HISTORY, FedBackNetwork, FutureMethod, LastState
 
 @dataclass(frozen=True)
 class CVAE(FutureMethod):
-    """See the file.
+    """A CVAE with one static latent and a recurrent decoder.
 
     Args:
         width: units of the recurrent networks.
-        hidden: widths of perceptrons.
-        components: normals of the prior of w; 1 for N(0, I).
+        hidden: widths of the perceptrons.
+        components: number of normals in the prior of w; 1 for N(0, I).
     """
 
     name = "cvae"
@@ -52,8 +53,8 @@ class CVAE(FutureMethod):
         return {"w": self.latent or 0}
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        return {**super().laws(), **({"p(w)": Mixture(self.components)} if self.components > 1 else {})}
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        return {**super().distributions(), **({"p(w)": Mixture(self.components)} if self.components > 1 else {})}
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
@@ -65,7 +66,7 @@ class SummaryEncoder:
     """Features of w from the last states of recurrent networks over past and future.
 
     Args:
-        width: of the states.
+        width: width of the states.
         hidden: widths of the perceptron on both.
     """
 
@@ -73,12 +74,12 @@ class SummaryEncoder:
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummaryEncoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return SummaryEncoderNetwork(self, inputs)
 
 
 class SummaryEncoderNetwork(Network):
-    """What `SummaryEncoder` describes."""
+    """Network of `SummaryEncoder`."""
 
     def __init__(self, spec: SummaryEncoder, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, False, (2 * spec.width, *spec.hidden)[-1])
@@ -88,7 +89,7 @@ class SummaryEncoderNetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """Padding at the end is not read."""
+        """Return the features; padding at the end is not read."""
         made: Tensor = self.join(torch.cat([self.past(parents[HISTORY]), self.future(parents[WHOLE], lengths)], -1))
         return made
 
@@ -97,23 +98,23 @@ class SummaryEncoderNetwork(Network):
 class SummaryDecoder:
     """Features of x_t: states of a recurrent network over [summary of h, w, x_{t-1}], and a perceptron.
 
-    A latent of each step is read by the perceptron, beside the state.
+    The perceptron reads a local latent together with the state.
 
     Args:
-        width: of the states.
-        hidden: widths of the perceptrons, on the summary to the first state and behind the states.
+        width: width of the states.
+        hidden: widths of the perceptrons from the summary to the first state and after the states.
     """
 
     width: int
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummaryDecoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return SummaryDecoderNetwork(self, inputs, size)
 
 
 class SummaryDecoderNetwork(FedBackNetwork):
-    """What `SummaryDecoder` describes."""
+    """Network of `SummaryDecoder`."""
 
     def __init__(self, spec: SummaryDecoder, inputs: Sequence[Input], size: int) -> None:
         (latent,) = (parent for parent in inputs if parent.name not in (WHOLE, HISTORY))

@@ -2,14 +2,15 @@
 
     p(w) p(x_t | x_{<t}, y_{1:T}, w, s)        q(w | r_{1:T}, y_{1:T}, s)
 
-The stochastic baseline of TrajeVAE, in the same frame: y are the given trajectories, r what they leave out, s the first
-pose. Each is summed up by a recurrent network in both directions, whose states are averaged over time. The decoder
-reads the summary of y, w, y_t and its own mean at t-1 (s at first) in place of x_{t-1}, in training too, and gradients
-flow through these means. Poses are absolute.
+The stochastic baseline of TrajeVAE, with the same variables: y are the given trajectories, r the remaining joints, s
+the first pose. Bidirectional recurrent networks summarise y and r; their states are averaged over time. The decoder
+reads the summary of y, w, y_t and its own mean at t-1 (at first s) in place of x_{t-1}, in training too. Gradients flow
+through these means. Poses are absolute.
 
-Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, after the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. Where
-perceptrons stand is ours, so that sizes and number of parameters (913,883 for Human3.6M) are the paper's: one on the
-summary of y before the decoder reads it, one to the decoder's first state, one behind its states.
+Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, after the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. The
+positions of the perceptrons are our choice, which reproduces the paper's sizes and number of parameters (913,883 for
+Human3.6M). One perceptron is on the summary of y before the decoder reads it, one leads to the decoder's first state,
+and one follows its states.
 """
 
 from __future__ import annotations
@@ -29,22 +30,22 @@ from ...motion import Windows
 from ...networks import Input, Network, NetworkSpec
 from ...networks.base import perceptron, share_modules
 from ...networks.cells import GRU
-from ...networks.loop import once
+from ...networks.loop import memoize
 from ...options import Size
-from ...program.rollout import SelfFeeding
+from ...program.rollout import ScheduledSampling
 from ..motion.futures import FedBackNetwork
 from ..motion.trajectories import FIRST, GIVEN, REST, LatentTrajectoryMethod
 
 
 @dataclass(frozen=True)
 class CVAERNN(LatentTrajectoryMethod):
-    """See the file.
+    """A CVAE with recurrent summaries and a recurrent decoder.
 
     Args:
         latent: size of w.
         summary: units of the recurrent summaries, for each direction.
         width: units of the decoder's state.
-        hidden: widths of perceptrons; the last is that of a summary in the decoder.
+        hidden: widths of the perceptrons; the last is the width of a summary in the decoder.
     """
 
     name = "cvae-rnn"
@@ -55,7 +56,7 @@ class CVAERNN(LatentTrajectoryMethod):
         skeleton: {**preset, "beta": 0.1 if skeleton else 1e-4}
         for skeleton, preset in LatentTrajectoryMethod.presets.items()
     }
-    """The weight of the KL is the paper's on a paper's skeleton, else the tuning split's (docs/results/tuning.md)."""
+    """The KL weight is the paper's for its skeletons, otherwise tuned on the tuning split (docs/results/tuning.md)."""
     trainings: ClassVar[Mapping[str, Training]] = {
         **LatentTrajectoryMethod.trainings,
         "": Training(12_000, 16, 1e-3, 0.5),
@@ -77,19 +78,19 @@ class CVAERNN(LatentTrajectoryMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Summaries, and the decoder; guide and decoder share that of y."""
+        """Return the summaries and the decoder; guide and decoder share the summary of y."""
         return {"q(w)": Summaries(self.summary, self.hidden), "p(x)": Decoder(self.summary, self.hidden, self.width)}
 
     @override
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._built(kind, size, *arguments)
         share_modules([model.encoder["w"].network.summaries, model.generator["x"].network.summaries], GIVEN)
-        model.feeding = SelfFeeding(1.0, gradient=True)
+        model.feeding = ScheduledSampling(1.0, gradient=True)
         return model
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """As others, with self-feeding at 1: the model never reads what it has not made."""
+        """Return the recipe with scheduled sampling at 1: the model only reads its own output."""
         return replace(super().train(train, validation, steps), feeding=1.0)
 
 
@@ -106,12 +107,12 @@ class Summaries:
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummariesNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return SummariesNetwork(self, inputs)
 
 
 class SummariesNetwork(Network):
-    """What `Summaries` describes."""
+    """Network of `Summaries`."""
 
     def __init__(self, spec: Summaries, inputs: Sequence[Input]):
         super().__init__(inputs, False, spec.hidden[-1])
@@ -121,21 +122,23 @@ class SummariesNetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """No sequence is padded."""
+        """Return the features; sequences must not be padded."""
         self.refuse_ragged(lengths)
         return self.join(torch.cat([each(parents[FIRST], parents[n]) for n, each in self.summaries.items()], dim=-1))
 
 
 class Summary(nn.Module):
-    """Mean over time (B, 2 W) of the states of a recurrent network over s and a sequence, in both directions."""
+    """Mean over time (B, 2 W) of the states of a bidirectional recurrent network over s and a sequence."""
 
     def __init__(self, size: int, width: int):
         super().__init__()
         self.network = GRU(size, width, batch_first=True, bidirectional=True)
 
     def forward(self, first: Tensor, sequence: Tensor) -> Tensor:
-        """The summary of s (B, D) and a sequence (B, T, D)."""
-        return once(self, [first, sequence], lambda: self.network(torch.cat([first[:, None], sequence], 1))[0].mean(1))
+        """Return the summary of s (B, D) and a sequence (B, T, D)."""
+        return memoize(
+            self, [first, sequence], lambda: self.network(torch.cat([first[:, None], sequence], 1))[0].mean(1)
+        )
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,7 @@ class Decoder:
 
     Args:
         summary: units of the summary, for each direction.
-        hidden: widths of perceptrons; behind the states, without the last.
+        hidden: widths of the perceptrons; the one after the states omits the last.
         width: units of the state.
     """
 
@@ -153,12 +156,12 @@ class Decoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DecoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return DecoderNetwork(self, inputs, size)
 
 
 class DecoderNetwork(FedBackNetwork):
-    """What `Decoder` describes."""
+    """Network of `Decoder`."""
 
     def __init__(self, spec: Decoder, inputs: Sequence[Input], size: int):
         sizes = {parent.name: parent.size for parent in inputs}

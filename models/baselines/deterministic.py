@@ -1,11 +1,12 @@
-"""What deterministic predictors share: LSTMs of the past, squared errors, and one future.
+"""Base of the deterministic predictors: LSTMs of the past, squared errors, and one future.
 
-    p(x_t | x_{<t})        no guide, as nothing is latent
+    p(x_t | x_{<t})        no guide, because there are no latents
 
-A forecast goes on from its own means, so that all of K futures are one and their diversity is 0.
+A forecast continues from its own means, so that all K futures are equal and their diversity is 0.
 
-Ours: networks read and make poses without unit, by the mean pose and one spread; windows may be turned so that the last
-observed pose faces one way, which helps on small sets. Off the skeletons of the papers' data, networks are small.
+Our additions: networks read and predict standardised poses, by the mean pose and one scale. Windows may be rotated so
+that the last observed pose faces one way, which helps on small data sets. For skeletons that the papers do not use,
+networks are small.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from typing_extensions import override
 
 from ...data.batch import WHOLE
 from ...data.schema import Schema
-from ...distributions import FixedNormal, LawSpec
+from ...distributions import DistributionSpec, FixedNormal
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...motion import Heading, Skeleton
 from ...motion.data.protocols import Poses
 from ...options import Layers, Size
 from ...program.model import DynamicalVAE
-from ...program.rollout import InputNoise, SelfFeeding
+from ...program.rollout import InputNoise, ScheduledSampling
 from ..method import LikelihoodMethod, fit_units
 from ..motion.poses import PoseMethod
 
@@ -37,15 +38,15 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
     """A method without latents whose forecasts have no noise.
 
     Args:
-        latent: there is none.
-        emission: as everywhere; where it is left open, what the columns of a table say, or else variance 1/2, minus
-            whose log-density is the squared error. Any other is the density of a model whose forecasts are draws.
-        width: of the LSTMs' states; None for the paper's with the skeletons of Human3.6M and HumanEva, 256 with others.
-        layers: LSTMs, each on the states of the one before.
-        standardise: networks read and make x without unit, by its mean and one spread (`dvae.data.units`).
-        heading: turn every window so that its last observed pose faces one way, and the futures back: bounds compare
-            with those of models that turn windows too. None for not with the skeletons of Human3.6M and HumanEva, nor
-            with data that are no positions of joints, and for so with others whose left and right are known.
+        latent: always None; the method has no latents.
+        emission: distribution of x. By default the distributions of a table's columns, or a normal with variance 1/2,
+            whose negative log-density is the squared error. With any other emission, forecasts are draws.
+        width: width of the LSTMs' states; by default the paper's for Human3.6M and HumanEva, and 256 for others.
+        layers: number of LSTMs, each on the states of the previous one.
+        standardise: whether networks read and predict standardised x, by its mean and one scale (`dvae.data.units`).
+        heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures
+            back. Bounds are comparable only among models that rotate windows. By default off for Human3.6M, HumanEva
+            and data other than joint positions, and on for other skeletons with known left and right.
     """
 
     generative = "p(x_t | x_{<t})"
@@ -64,47 +65,47 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
 
     @override
     def sizes(self) -> dict[str, int]:
-        """No latents."""
+        """Return no sizes: the method has no latents."""
         return {}
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """The squared error, where no other law is asked for."""
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return the distribution of `emission`, by default the one of the squared error."""
         if self.emission is not None:
-            return super().laws()
+            return super().distributions()
         return {"p(x)": FixedNormal(scale=sqrt(0.5), residual=self.residual, error_weight=True)}
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Where left and right are unknown, so are headings."""
+        """Return the preset, without headings if left and right of the skeleton are unknown."""
         found = super().preset(skeleton)
         return found if skeleton.left and skeleton.right else {**found, "heading": False}
 
     @override
-    def suited(self, data: Any) -> Self:
-        """With the options that are left open chosen for the skeleton, or for data that are no positions of joints."""
+    def resolve_defaults(self, data: Any) -> Self:
+        """Return the method with unset options chosen for the skeleton, or for data other than joint positions."""
         schema = Schema.of(data)
         if isinstance(schema, Poses) and schema.protocol.representation == self.representation:
-            return super().suited(schema)
-        return self.filled({**self.presets[""], "heading": False})
+            return super().resolve_defaults(schema)
+        return self.with_presets({**self.presets[""], "heading": False})
 
-    def fed(self) -> SelfFeeding | InputNoise:
-        """What stands in for the data's history in training, of which a schedule tells the level."""
+    def fed(self) -> ScheduledSampling | InputNoise:
+        """Return what replaces the data's history in training; a schedule sets its level."""
         raise NotImplementedError
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model, whose networks read the covariates of the data too.
+        """Return the model, whose networks also read the covariates of the data.
 
         Raises:
-            SchemaError: data to be turned that are no positions of joints.
+            SchemaError: if `heading` is set and the data are not joint positions.
         """
-        schema, method = Schema.of(data), self.suited(data)
+        schema, method = Schema.of(data), self.resolve_defaults(data)
         view = None
         if method.heading:
             poses = Poses.of(schema, self.name, self.representation)
             view = Heading(poses.skeleton, poses.protocol.observed)
-        model = method.suited_to(schema, True, view=view)
+        model = method.build_for_data(schema, True, view=view)
         if method.standardise and not schema.units:
             model.standardise(WHOLE)
         model.feeding = method.fed()
@@ -112,10 +113,10 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """One stage that minimises squared errors, on a history as the method feeds it."""
+        """Return one stage that minimises squared errors, with the history that `fed` returns."""
         stages = [Stage(steps, self.objective())]
         return Recipe(train, validation, stages, self._feeding(steps), partial(self._start, train=train))
 
     def _start(self, model: DynamicalVAE, train: Any) -> None:
-        if WHOLE in model.units and not model.units[WHOLE].scale.dim():  # those of columns are known
+        if WHOLE in model.units and not model.units[WHOLE].scale.dim():  # units of columns are known
             fit_units(model, train)

@@ -1,19 +1,20 @@
-"""DLow: futures of a moving body in K modes, by one noise that each mode's map takes to the latent of a CVAE.
+"""DLow: futures of a moving body in K modes, by one noise that each mode's affine map turns into a CVAE's latent.
 
     p(e) p(x_t | x_{<t}, h, e, k)        w = a_k(h) e + b_k(h)        q(e)
 
-A network of the observed poses h tells the maps of all modes, and the decoder of a fitted CVAE makes the future of w.
-The K futures of a window have one noise e ~ N(0, I). What is minimised is the divergence of each mode's latents from
-N(0, I), how alike the futures are, and the squared error of the best of them,
+A network of the observed poses h returns the maps of all modes, and the decoder of a fitted CVAE predicts the future
+from w. The K futures of a window share one noise e ~ N(0, I). The loss is the KL divergence of each mode's latents from
+N(0, I), plus the similarity of the futures, plus the squared error of the best future:
 
     beta mean_k KL(N(b_k, diag a_k^2) || N(0, I)) + lambda mean_{i<j} exp(-||x^i - x^j||^2 / s) + 2 min_k ||x^k - x||^2
 
-with distances over all frames and coordinates. Where parts of the body are held, it is the other joints that shall
-differ, and the squared distance of the held ones from those of the first mode is minimised too.
+Distances are over all frames and coordinates. If parts of the body are held, only the other joints should differ. The
+loss then includes the squared distance of the held joints from their positions in the first mode.
 
-Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code. For Human3.6M, the network of 10
-modes has 2,038,528 numbers, and that of 50 has 7,291,648, beside those of the decoder. Ours: the weight of what is
-held, the heading, and lambda and s on other data, which are those of HumanEva, whose windows have as many frames.
+Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code. For Human3.6M, the network has
+2,038,528 parameters with 10 modes and 7,291,648 with 50 modes, without the decoder. Our choices are the weight of held
+joints, the heading, and lambda and s for other data. These are the values of HumanEva, whose windows have as many
+frames.
 """
 
 from __future__ import annotations
@@ -47,20 +48,20 @@ PRESETS = table(
         "": (*SHAPE, 10, 50.0, 20.0, True),
     },
 )
-"""Skeleton to options: the paper's; and those for others."""
+"""Options by skeleton: the paper's, and ours for other skeletons."""
 
 
 @dataclass(frozen=True)
 class DLow(ModesMethod):
-    """See the file.
+    """The DLow sampler of a fitted CVAE.
 
     Args:
-        beta: weight of the divergence of each mode's latents from N(0, I).
-        diversity: lambda, weight of how alike the futures are; None, here and below, for the paper's.
-        diversity_scale: s, square metres.
+        beta: weight of the KL divergence of each mode's latents from N(0, I).
+        diversity: lambda, weight of the similarity of the futures; None, here and below, for the preset.
+        diversity_scale: s, in square metres.
         reconstruction: weight of the squared error of the best future.
-        held: parts of the body, or joints, whose motion is to be the same in all modes, such as lower.
-        hold: weight of the squared distance of held joints from those of the first mode, mean over the others.
+        held: parts of the body, or joints, with the same motion in all modes, such as lower.
+        hold: weight of the squared distance of held joints from the first mode, mean over the other modes.
     """
 
     name = "dlow"
@@ -81,9 +82,9 @@ class DLow(ModesMethod):
         return {NOISE: self.latent or 0, **super().sizes()}
 
     @override
-    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
-        """With one noise for the modes of a window."""
-        return {**super().described(sizes), "grouped": (NOISE,)}
+    def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """Return the arguments, with one noise for the modes of a window."""
+        return {**super().model_arguments(sizes), "grouped": (NOISE,)}
 
     @override
     def kind(self) -> type[DLowModel]:
@@ -91,13 +92,13 @@ class DLow(ModesMethod):
 
     @override
     def objective(self) -> Objective:
-        """The weighted energies, in `Evidence`'s unit, per frame.
+        """Return the weighted energies, per frame as in `Evidence`.
 
         Raises:
-            ValueError: weights that are still open, which the skeleton decides.
+            ValueError: if weights that depend on the skeleton are unset.
         """
         if self.diversity is None:
-            raise ValueError("the weights depend on the skeleton; take those of method.suited(windows)")
+            raise ValueError("the weights depend on the skeleton; call method.resolve_defaults(windows) first")
         weights = {"reconstruction": self.reconstruction, "kl": self.beta, "diversity": self.diversity}
         weights |= {"join": self.join} if self.join else {}
         weights |= {"held": self.hold} if self.held else {}
@@ -113,20 +114,20 @@ class DLowModel(ModesModel):
     def __init__(self, method: DLow, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
         super().__init__(method, frames, skeleton, **options)
         if method.held and skeleton is None:
-            raise SchemaError(f"held are {', '.join(method.held)}, of a skeleton; dlow needs to know what poses are")
+            raise SchemaError(f"held names {', '.join(method.held)}, but the data have no skeleton; pass poses to dlow")
         held = set(places_of(skeleton, method.held)) if skeleton else set()
         parts = [[c for c in range(self.sizes[WHOLE]) if (c // 3 in held) == holds] for holds in (True, False)]
         self.held, self.free = parts
         if not self.free:
-            raise ValueError(f"held are {', '.join(method.held)}, all joints, so that nothing is left to differ")
+            raise ValueError(f"held names {', '.join(method.held)}, which are all joints; leave some joints free")
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """The energies of the futures of each window in all modes."""
+        """Return the energies of the futures of each window in all modes."""
         if WHOLE_SETS not in data:
             return super().penalties(rollout, data, draws)
         found = super().penalties(rollout, data, {MODE: self.modes})
-        shapes = self.sampler(rollout.values[HISTORY]).to(like(self).dtype)  # of autocast in half precision
+        shapes = self.sampler(rollout.values[HISTORY]).to(like(self).dtype)  # half precision under autocast
         scale, location = shapes.chunk(2, -1)
         variance = scale.square()
         found["kl"] = (variance + location.square() - 1 - variance.log()).sum(2).mean(1) / 2

@@ -2,17 +2,18 @@
 
     p(x_t | x_{<t}, h, k)        w = b_k(h)        nothing is latent
 
-A network of the observed poses h tells K latents, and the decoder of a fitted CVAE makes the future of each. There is
-no noise, so that a window has K futures and no more. What is minimised is minus the number of them that a determinantal
-point process is expected to choose,
+A network of the observed poses h returns K latents, and the decoder of a fitted CVAE predicts the future of each. There
+is no noise, so that a window has exactly K futures. The loss is minus the expected number of futures that a
+determinantal point process selects,
 
     -tr(I - (L + I)^-1),    L_ij = r_i r_j exp(-||x^i - x^j||^2 / s),    log r_i = log omega - max(||w_i||^2 - R^2, 0)
 
-with distances over all frames and coordinates, and R the radius within which a share rho of N(0, I) is. Nothing but r
+Distances are over all frames and coordinates. R is the radius of the ball that contains a share rho of N(0, I). Only r
 keeps the futures near the data.
 
-Yuan and Kitani, 2020, arXiv 1907.04967, whose code is not known. Ours: omega and rho; the network, its number of modes
-and the distances s, which are those of DLow (arXiv 2003.08386), beside which the tables of motion prediction have it.
+Yuan and Kitani, 2020, arXiv 1907.04967; we know of no public code. Our choices are omega and rho. The network, its
+number of modes and the distances s are from DLow (arXiv 2003.08386), as the tables of motion prediction compare the
+two.
 """
 
 from __future__ import annotations
@@ -38,18 +39,18 @@ PRESETS = table(
     "latent width hidden modes diversity_scale heading",
     {"human36m": (*SHAPE, 50, 100.0, False), "humaneva": (*SHAPE, 50, 20.0, False), "": (*SHAPE, 10, 20.0, True)},
 )
-"""Skeleton to options: those of DLow."""
+"""Options by skeleton, as in DLow."""
 
 
 @dataclass(frozen=True)
 class DSF(ModesMethod):
-    """See the file.
+    """The diversity sampling function.
 
     Args:
-        beta: weight of half the squared norm of the latents, mean over modes; the paper has none.
-        diversity_scale: s, square metres; None for DLow's.
-        quality: omega, of a latent within the radius.
-        radius: rho, share of N(0, I) that is within it.
+        beta: weight of half the squared norm of the latents, mean over modes; the paper has no such term.
+        diversity_scale: s, in square metres; by default as in DLow.
+        quality: omega, quality of a latent within the radius.
+        radius: rho, share of N(0, I) within the radius.
     """
 
     name = "dsf"
@@ -68,7 +69,7 @@ class DSF(ModesMethod):
 
     @override
     def objective(self) -> Objective:
-        """Minus the expected number, in `Evidence`'s unit, per frame."""
+        """Return minus the expected number of futures, per frame as in `Evidence`."""
         weights = {"cardinality": 1.0}
         weights |= {"norm": self.beta} if self.beta else {}
         weights |= {"join": self.join} if self.join else {}
@@ -77,13 +78,13 @@ class DSF(ModesMethod):
 
 
 class DSFModel(ModesModel):
-    """The model of DSF. Forecasts of more than K futures have some of them several times."""
+    """The model of DSF. Forecasts of more than K futures contain repeated futures."""
 
     method: DSF
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """The energies of the futures of each window in all modes."""
+        """Return the energies of the futures of each window in all modes."""
         found = super().penalties(rollout, data, {})
         if WHOLE_SETS not in data:
             return found

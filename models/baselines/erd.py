@@ -1,14 +1,14 @@
-"""The encoder-recurrent-decoder: a perceptron on each pose, LSTMs over time, a perceptron back to the next pose.
+"""Encoder-recurrent-decoder: a perceptron on each pose, LSTMs over time, and a perceptron to the next pose.
 
     p(x_t | x_{<t})        x_t = decoder(LSTMs(encoder(x_{t-1})))
 
-In training the poses that it reads have noise, by a curriculum: the more of it, the further off from the data it learns
-to go on, as it will have to on its own output.
+In training, its input poses have noise, which increases by a curriculum. The network thereby learns to continue from
+poses that deviate from the data, as its own output will.
 
-Fragkiadaki, Levine, Felsen and Malik, 2015, arXiv 1508.00271, whose sizes for motion capture these are. Ours: positions
-in place of joints' turns, rectified linear units in all layers but the last, and noise that rises as a line, beside one
-spread for all coordinates; the reimplementation of Jain et al., 2016, arXiv 1511.05298, goes from .01 to .7 in seven
-steps, beside the spread of each.
+Fragkiadaki, Levine, Felsen and Malik, 2015, arXiv 1508.00271, with its sizes for motion capture. Our choices are
+positions instead of joint rotations, and rectified linear units in all layers except the last. Our noise rises
+linearly, relative to one scale for all coordinates. The reimplementation of Jain et al., 2016, arXiv 1511.05298,
+increases it from .01 to .7 in seven steps, relative to the scale of each coordinate.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing_extensions import override
 from ...inference.training.schedules import Schedule
 from ...networks import NetworkSpec, Recurrent
 from ...options import Amount, Layers, Size
-from ...program.rollout import InputNoise, SelfFeeding
+from ...program.rollout import InputNoise, ScheduledSampling
 from ..method import rising
 from ..motion.poses import table
 from .deterministic import DeterministicMethod
@@ -32,13 +32,13 @@ PAPER = (1000, (500, 500), (500, 100), False)
 
 @dataclass(frozen=True)
 class ERD(DeterministicMethod):
-    """See the file.
+    """The encoder-recurrent-decoder.
 
     Args:
-        encoder: widths of the perceptron before the LSTMs; None as for `width`.
-        decoder: widths of the perceptron behind them; None likewise.
-        noise: standard deviation, at the end, of the noise on what is read in training, beside the spread of x. It
-            rises from 0 over a third of training, after the first tenth. 0 for none.
+        encoder: widths of the perceptron before the LSTMs; default as for `width`.
+        decoder: widths of the perceptron after the LSTMs; default as for `width`.
+        noise: final standard deviation of the noise on the input in training, relative to the scale of x. It rises
+            from 0 over a third of training, after the first tenth. 0 for none.
     """
 
     name = "erd"
@@ -55,21 +55,21 @@ class ERD(DeterministicMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.noise and self.self_feeding:
+        if self.noise and self.scheduled_sampling:
             raise ValueError(
-                f"noise is {self.noise} and self_feeding is {self.self_feeding}, but in training a model reads data "
-                "with noise or its own means; leave one of them 0"
+                f"noise is {self.noise} and scheduled_sampling is {self.scheduled_sampling}, but in training "
+                "a model reads either noisy data or its own means; set one of them to 0"
             )
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """LSTMs between two perceptrons."""
+        """Return LSTMs between two perceptrons."""
         shape: dict[str, Any] = {"hidden": self.decoder, "activation": "relu"}
         return {"default": Recurrent(self.width or 0, layers=self.layers, extract={"x": self.encoder or ()}, **shape)}
 
     @override
-    def fed(self) -> SelfFeeding | InputNoise:
-        return InputNoise(self.noise) if self.noise else SelfFeeding(0.0, gradient=False)
+    def fed(self) -> ScheduledSampling | InputNoise:
+        return InputNoise(self.noise) if self.noise else ScheduledSampling(0.0, gradient=False)
 
     @override
     def _feeding(self, steps: int) -> Schedule | float:

@@ -1,23 +1,26 @@
-"""Motion Infilling: one motion from its first pose and what is known of joints' paths, by convolutions of an image.
+"""Motion Infilling: one motion from its first pose and known parts of joints' paths, by convolutions of an image.
 
-    p(x_t | y_{1:T}, s)        no guide: nothing is latent, and the likelihood is exact
+    p(x_t | y_{1:T}, s)        no guide: there are no latents, and the likelihood is exact
 
-The first pose s and the given trajectories y are the columns of an image with a row for each coordinate, without unit
-and 0 where nothing is known, which is also what the mean is. Convolutions and pooling halve it again and again,
-transposed convolutions bring it back, without a short cut around them, and what comes out is the motion. Minimised is
-the absolute error of all of it: x has Laplace's law, whose scale is one metre, and minus the log-density is that error
-and a constant.
+The first pose s and the given trajectories y are the columns of an image with a row for each coordinate. Values are
+standardised, and 0 (also the mean) where unknown. Convolutions and pooling halve the image repeatedly, and transposed
+convolutions restore its size, without skip connections. The output is the motion. Training minimises its absolute
+error: x has a Laplace distribution with a scale of one metre, whose negative log-density is this error plus a constant.
 
-In training a gap in time hides the paths, or some joints lack theirs. A curriculum widens the gaps and takes more
-joints.
+In training, either a gap in time hides the paths, or some joints have no path. A curriculum widens the gaps and removes
+more joints.
 
 Kaufmann, Aksan, Song, Pece, Ziegler and Hilliges, 2020, arXiv 2010.11531, with the layers, gaps and curriculum of its
 public implementation, whose network for gaps of any width has 4,703,425 parameters. It is a baseline in TrajeVAE's
-tables (arXiv 2104.00351). Ours: the frames of the paper are shares of a window, the curriculum rises evenly, each
-window draws for itself whether it has a gap or lacks joints, joints are taken over the curriculum and not over all of
-training, and all coordinates have one scale and their errors the weight of metres, where that divides each by a
-deviation. Bodies move through space, as TrajeVAE's do. Off Human3.6M's skeleton maps are a quarter as many and windows
-turned to one heading.
+tables (arXiv 2104.00351). Our differences:
+
+* Widths of gaps are shares of a window; the paper has numbers of frames.
+* The curriculum rises linearly.
+* Each window draws independently whether it has a gap or removed joints.
+* Joints are removed over the curriculum, not over all of training.
+* All coordinates have one scale, and errors are in metres; the paper divides each by its deviation.
+* Bodies move through space, as in TrajeVAE.
+* For other skeletons than Human3.6M's, there are a quarter as many maps, and windows are rotated to one heading.
 """
 
 from __future__ import annotations
@@ -34,16 +37,16 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ...data.batch import WHOLE, Batch
-from ...data.sequences import bridged
+from ...data.sequences import interpolate_missing
 from ...data.units import Units
-from ...distributions import Family, LawSpec
+from ...distributions import DistributionSpec, Family
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...inference.training.schedules import Ramp
 from ...motion import Windows
 from ...networks import Input, NetworkSpec
-from ...networks.base import AtOnce
-from ...networks.loop import once
+from ...networks.base import FixedLengthNetwork
+from ...networks.loop import memoize
 from ...options import Share, Size
 from ...program.batch import AnyBatch
 from ..motion.poses import table
@@ -53,29 +56,29 @@ PRESETS = table(
     "maps heading",
     {"human36m": ((32, 64, 128, 256, 256), False), "": ((8, 16, 32, 64, 64), True)},
 )
-"""Skeleton to options: the paper's; and for others what learns in minutes on a processor."""
+"""Options by skeleton: the paper's; for other skeletons, options that train in minutes on a CPU."""
 
 HIDDEN = "hidden"
-"""Name, in training batches, of how far the curriculum has come when an entry of y is hidden (B, T, D)."""
+"""Key in training batches: the value of the curriculum from which an entry of y is hidden, (B, T, D)."""
 NARROWEST, SPREAD = 1 / 12, 1 / 6
-"""Mean width of gaps at first, and its standard deviation, in widths of those at the end."""
+"""Initial mean width of gaps and its standard deviation, relative to the final mean width."""
 IN_TIME, JOINTS = 0.7, 3
-"""Share of windows that have a gap in time; how many joints others lack at most."""
+"""Share of windows with a gap in time, and the largest number of joints removed from the others."""
 NEVER = 2.0
-"""Where no curriculum, which goes to 1, arrives."""
+"""A value that no curriculum reaches, because curricula end at 1."""
 
 
 @dataclass(frozen=True)
 class MotionInfilling(TrajectoryMethod):
-    """See the file. Options that are None are chosen by the skeleton.
+    """Motion infilling by convolutions. Options that are None are chosen for the skeleton.
 
     Args:
-        latent: there is none.
-        maps: of the image at each size, from the whole one on.
-        keep: probability with which a joint is given, in training, where no gap hides it.
-        gap: mean width of the gaps in training, in the end, as a share of the window; 0 for neither gaps nor joints
-            that are taken, as other methods are trained (with a `keep` below 1).
-        curriculum: share of training over which gaps widen, after its first twentieth; 0 for wide ones all the time.
+        latent: always None; the method has no latents.
+        maps: numbers of feature maps at each image size, starting with the full size.
+        keep: probability that a joint is given, in training, where no gap hides it.
+        gap: final mean width of the gaps in training, as a share of the window; 0 for neither gaps nor removed joints,
+            as in the training of other methods (with a `keep` below 1).
+        curriculum: share of training over which gaps widen, after its first twentieth; 0 for wide gaps from the start.
     """
 
     name = "motion-infilling"
@@ -95,11 +98,11 @@ class MotionInfilling(TrajectoryMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.maps == ():
-            raise ValueError("maps is empty; the image has at least one size")
+            raise ValueError("maps is empty; give the number of maps for at least one image size")
 
     @override
     def sizes(self) -> dict[str, int]:
-        """No latents."""
+        """Return no sizes: the method has no latents."""
         return {}
 
     @override
@@ -107,8 +110,8 @@ class MotionInfilling(TrajectoryMethod):
         return {"p(x)": Infiller(self.maps or ())}
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """x has Laplace's law, minus whose log-density is the absolute error."""
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return a Laplace distribution of x, whose negative log-density is the absolute error."""
         return {"p(x)": Family("Laplace", {"scale": 1.0}, project=False, error_weight=True)}
 
     @override
@@ -117,7 +120,7 @@ class MotionInfilling(TrajectoryMethod):
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Minimises the absolute error, with gaps that widen; validation windows have gaps of the last width."""
+        """Return one stage on the absolute error with widening gaps; validation windows have the final width."""
         recipe = replace(super().train(train, validation, steps), prepare=partial(start, train=train))
         if not self.gap:
             return recipe
@@ -125,45 +128,45 @@ class MotionInfilling(TrajectoryMethod):
         rise = Ramp(0.0, 1.0, steps=max(min(int(self.curriculum * steps), steps - begin), 1), delay=begin)
         return replace(
             recipe,
-            batches=Gaps(recipe.batches, self.gap),
-            validation=recipe.validation and Gaps(recipe.validation, self.gap),
+            batches=RandomGaps(recipe.batches, self.gap),
+            validation=recipe.validation and RandomGaps(recipe.validation, self.gap),
             stages=[Stage(steps, curriculum=rise if self.curriculum else None)],
         )
 
 
 def start(model: InfillingModel, train: Windows) -> None:
-    """Gives the network mean and spread of 1024 windows, as the model sees them."""
+    """Set the network's mean and scale from 1024 windows, as the model sees them."""
     seen = model.read(train.sample(1024, torch.default_generator))
-    model.generator[WHOLE].network.units.fit(bridged(seen[WHOLE], seen.mask()))
+    model.generator[WHOLE].network.units.fit(interpolate_missing(seen[WHOLE], seen.mask()))
 
 
 @dataclass(frozen=True, eq=False)
-class Gaps:
-    """Windows with given trajectories, of which a curriculum hides some: a gap in time, or those of some joints.
+class RandomGaps:
+    """Windows with given trajectories, where a curriculum hides a gap in time or the paths of some joints.
 
-    Batches say how far it must have come for an entry to be hidden, so that what is hidden stays so. A gap of width w
-    in a window of length 1, drawn with its place u, is from u (1 - w) to u + (1 - u) w, which moves over all the window
-    as u does, and grows to both sides as w does.
+    For each entry, batches contain the value of the curriculum that hides it, so that hidden entries remain hidden. A
+    gap of width w and position u, in a window of length 1, extends from u (1 - w) to u + (1 - u) w. Its range over u
+    covers the whole window, and it grows to both sides with w.
 
     Args:
-        source: of the windows.
-        width: mean width of gaps at the end, as a share of the window.
+        source: source of the windows.
+        width: final mean width of gaps, as a share of the window.
     """
 
     source: Any
     width: float
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Windows with what is hidden of them."""
+        """Return random windows with their hidden entries."""
         return self._hiding(self.source.sample(batch_size, generator), generator)
 
     def all(self) -> Batch:
-        """All windows, with the same gaps every time."""
+        """Return all windows, with the same gaps every time."""
         return self._hiding(self.source.all(), torch.Generator().manual_seed(0))
 
     @property
     def fingerprint(self) -> str:
-        """That of the source."""
+        """The fingerprint of the source."""
         found: str = self.source.fingerprint
         return found
 
@@ -172,7 +175,7 @@ class Gaps:
         kind, place = torch.rand(2, count, 1, generator=generator).clamp(min=1e-6)
         noise = torch.randn(count, 1, generator=generator)
         frames = (torch.arange(length) + 0.5) / length
-        needed = torch.maximum(1 - frames / place, (frames - place) / (1 - place))  # width of the gap that has a frame
+        needed = torch.maximum(1 - frames / place, (frames - place) / (1 - place))  # gap width that hides it
         first = self.width * (NARROWEST + SPREAD * noise)
         in_time = (needed - first) / (self.width * (1 - NARROWEST))
         order = torch.rand(count, len(self.source.joints), generator=generator)
@@ -183,17 +186,17 @@ class Gaps:
 
 
 class InfillingModel(TrajectoryModel):
-    """A model of one motion given its first pose and some trajectories, of which batches may say what is hidden."""
+    """A model of one motion given its first pose and some trajectories; batches may hide parts of these."""
 
     @property
     @override
-    def gradual(self) -> bool:
-        """What is hidden comes by a curriculum."""
+    def has_curriculum(self) -> bool:
+        """True: a curriculum hides entries."""
         return True
 
     @override
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
-        """Without the trajectories that are hidden when the curriculum has come so far."""
+        """Return the batch without the trajectories that are hidden at this value of the curriculum."""
         if isinstance(batch, Mapping) and HIDDEN in batch:
             whole = batch
 
@@ -201,30 +204,30 @@ class InfillingModel(TrajectoryModel):
                 given = torch.where(whole[HIDDEN] <= curriculum, 0.0, whole[GIVEN])
                 return Batch({name: value for name, value in whole.items() if name != HIDDEN}) | {GIVEN: given}
 
-            batch = once(self, [whole, curriculum], shown)  # by guide and model both
+            batch = memoize(self, [whole, curriculum], shown)  # guide and model both call it
         return super().read(batch, size=size, curriculum=curriculum, precise=precise)
 
 
 @dataclass(frozen=True)
 class Infiller:
-    """A sequence (B, T, D) of its first step s and of y, 0 where it is not known, by convolutions over both axes.
+    """A sequence (B, T, D) from its first step s and y, with 0 where unknown, by convolutions over both axes.
 
-    The image of all frames, at each of its sizes, goes through two convolutions of 3 x 3 with leaky ReLU; pooling then
-    halves it, rounded up, in rows no further than to two. So there are no lengths that it could not take.
+    At each size, the image of all frames passes through two 3 x 3 convolutions with leaky ReLU. Pooling then halves it,
+    rounding up, with at least two rows left. Any length is therefore possible.
 
     Args:
-        maps: at each size, from the whole one on.
+        maps: numbers of feature maps at each image size, starting with the full size.
     """
 
     maps: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> InfillerNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return InfillerNetwork(self, inputs, size)
 
 
-class InfillerNetwork(AtOnce):
-    """What `Infiller` describes."""
+class InfillerNetwork(FixedLengthNetwork):
+    """Network of `Infiller`."""
 
     def __init__(self, spec: Infiller, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, size)
@@ -247,7 +250,7 @@ class InfillerNetwork(AtOnce):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """No sequence is padded."""
+        """Return the features; sequences must not be padded."""
         self.refuse_ragged(lengths)
         poses = torch.cat([parents[FIRST][:, None], parents[GIVEN]], 1)
         image = torch.where(poses == 0, 0.0, self.units(poses)).mT[:, None]

@@ -1,26 +1,29 @@
-"""MT-VAE: futures of a moving body by a latent that codes how the style of motion changes.
+"""MT-VAE: futures of a moving body by a latent that encodes the change of the motion's style.
 
     p(w) p(x_t | h, w)        q(w | x_{1:T}, h)
 
-One recurrent network with layer norms embeds the observed poses h, and the future x. An embedding has two halves,
-content and style, LN the normalisation of a layer without gain:
+One recurrent network with layer norms embeds the observed poses h and the future x. An embedding has two halves,
+content and style. LN is layer normalisation without gain:
 
     guide      w from LN(style of x - style of h)
     decoder    new style = LN(LN(T(LN(W w), style of h)) + style of h); the first state from [content of h, new style]
 
-The decoder's states read the new style at every step, and no pose. Minimised is, for J joints and D numbers of w,
+The decoder reads the new style at every step, and no pose. For J joints and D numbers of w, the loss is
 
     sum_t |x_t - mean_t| / J  +  a 5 sum_{t <= 8} |velocity_t - made velocity_t| / J  +  a max(KL / D, .01)
       +  5 |w' - w''| / D,                                                              a = 1 - .99995^step
 
-w' is a draw of the prior, and w'' one of the guide's law for the style that w' leads to. Velocities are those of the
-future of w' too. The first term is the density of a Laplace law of scale J / D metres, beside which the others have
-D times these weights: a that of the KL.
+w' is a draw from the prior, and w'' a draw from the guide given the style that results from w'. The velocity term also
+covers the future of w'. The first term is the density of a Laplace distribution of scale J / D metres. Relative to it,
+the other terms have D times these weights, so that the weight of the KL is a.
 
-Yan et al., 2018, arXiv 1808.04545, with the layers, weights and sizes of its public code, in which the decoder reads
-no pose, the cycle is of styles and not of poses that are read again, and velocities of both futures count. Ours:
-positions in metres, in place of an image's plane, made by a linear layer; the scale of w as other guides have it; a
-over a run as over the 60,000 steps there, at the end of which it is .95; the smaller sizes off Human3.6M.
+Yan et al., 2018, arXiv 1808.04545, with the layers, weights and sizes of its public code. In that code, the decoder
+reads no pose, the cycle compares styles instead of re-encoded poses, and velocities of both futures count. Our choices:
+
+* Positions are in metres instead of the image plane, and a linear layer predicts them.
+* The scale of w is parametrised as in other guides.
+* a rises over a run as over the 60,000 steps of the code, and ends at .95.
+* Sizes are smaller for other skeletons than Human3.6M's.
 """
 
 from __future__ import annotations
@@ -42,8 +45,8 @@ from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...inference.training.schedules import Saturating
 from ...networks import Input, Network, NetworkSpec
-from ...networks.base import AtOnce
-from ...networks.loop import once
+from ...networks.base import FixedLengthNetwork
+from ...networks.loop import memoize
 from ...networks.noise import Residual, half
 from ...networks.recurrent import summary
 from ...options import Amount, Size
@@ -54,24 +57,24 @@ from ..motion.poses import table
 PRESETS = table(
     "latent width heading", {**dict.fromkeys(("human36m", "humaneva"), (512, 1024, False)), "": (64, 128, True)}
 )
-"""Skeleton to options: the public code's, and smaller ones for others."""
+"""Options by skeleton: the public code's, and smaller ones for other skeletons."""
 FIRST = 8
-"""Frames whose velocities count."""
+"""Number of frames whose velocities enter the loss."""
 STEEPNESS = 3.0
-"""Of the weights' rise: 1 - .99995^step comes as near to 1 as e^{-3} in 60,000 steps."""
+"""Steepness of the weights' rise: after 60,000 steps, 1 - .99995^step differs from 1 by e^{-3}."""
 
 
 @dataclass(frozen=True)
 class MTVAE(FutureMethod):
-    """See the file. Options that are None are chosen by the skeleton.
+    """The motion transformation VAE. Options that are None are chosen for the skeleton.
 
     Args:
         latent: size of w.
-        beta: weight that of the KL rises towards; training ends at .95 of it.
-        width: units of the recurrent networks, and of embeddings, of which half is style.
-        velocity: weight of the velocities at the start, beside that of positions; it rises as that of the KL does.
-        cycle: weight of the latents' way to a style and back.
-        floor: nats for each number of w, averaged over the batch, below which the KL costs nothing more.
+        beta: limit of the rising weight of the KL; training ends at .95 of it.
+        width: units of the recurrent networks and of embeddings; half of an embedding is style.
+        velocity: weight of the first velocities relative to positions; it rises like the weight of the KL.
+        cycle: weight of the cycle from latent to style and back.
+        floor: nats for each number of w, averaged over the batch, below which the KL is not penalised.
     """
 
     name = "mt-vae"
@@ -100,12 +103,12 @@ class MTVAE(FutureMethod):
         return {"q(w)": ChangeEncoder(self.width or 0), "p(x)": StyleDecoder(self.width or 0)}
 
     @override
-    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+    def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
         emission = Family("Laplace", {"scale": self.scale(sizes[WHOLE])}, error_weight=True)
-        return {**super().described(sizes), "laws": {"p(x)": emission}}
+        return {**super().model_arguments(sizes), "distributions": {"p(x)": emission}}
 
     def scale(self, size: int) -> float:
-        """Metres, of the Laplace law of poses of so many coordinates."""
+        """Return the scale, in metres, of the Laplace distribution of poses with `size` coordinates."""
         return size / 3 / (self.latent or 1)
 
     @override
@@ -114,16 +117,18 @@ class MTVAE(FutureMethod):
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """Minimises what the file says; no pose that is made is read."""
+        """Return one stage that minimises the loss of MT-VAE; the decoder does not read its own poses."""
         schema = self.poses(train)
         frames = schema.frames - schema.protocol.observed
         return Recipe(
-            train, validation, [Stage(steps, self.suited(schema).objective(steps, frames, schema.size(WHOLE)))]
+            train,
+            validation,
+            [Stage(steps, self.resolve_defaults(schema).objective(steps, frames, schema.size(WHOLE)))],
         )
 
     @override
     def objective(self, steps: int = 60_000, frames: int = 64, size: int = 48) -> Evidence:
-        """What training minimises, over so many steps, by futures of so many frames and coordinates."""
+        """Return the objective for a number of steps, and futures of this many frames and coordinates."""
 
         def rise(weight: float) -> Saturating:
             return Saturating(0.0, -expm1(-STEEPNESS) * weight, steps, steepness=STEEPNESS)
@@ -139,11 +144,11 @@ class MTVAE(FutureMethod):
 
 
 class MTVAEModel(FutureModel):
-    """A model of MT-VAE."""
+    """The model of MT-VAE."""
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """Errors of the first velocities, of the guide's draw and of one of the prior, and of how that comes back."""
+        """Return errors of the first velocities, for draws of guide and prior, and the cycle error of the latter."""
         found, method = super().penalties(rollout, data, draws), self.method
         assert isinstance(method, MTVAE)
         if WHOLE not in data or not (method.velocity or method.cycle):
@@ -165,7 +170,7 @@ class MTVAEModel(FutureModel):
         if method.cycle:
             guide, network = self.encoder["w"], self.generator[WHOLE].network
             _, style = network.past(values[HISTORY])
-            loc, scale = guide.law(guide.network.coded(network.changed(style, other) - style))
+            loc, scale = guide.head(guide.network.coded(network.changed(style, other) - style))
             energies["cycle"] = (other - torch.addcmul(loc, scale, torch.randn_like(loc))).abs().sum(-1)
         size = rows // rollout.draws
         return found | {name: energy.unflatten(0, (-1, size)).mean(0) for name, energy in energies.items()}
@@ -176,32 +181,32 @@ class ChangeEncoder:
     """Features of w from the change of style between past and future.
 
     Args:
-        width: of the embeddings.
+        width: width of the embeddings.
     """
 
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> ChangeEncoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return ChangeEncoderNetwork(self, inputs)
 
 
 class ChangeEncoderNetwork(Network):
-    """What `ChangeEncoder` describes."""
+    """Network of `ChangeEncoder`."""
 
     def __init__(self, spec: ChangeEncoder, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, False, spec.width)
         size = next(parent.size for parent in inputs if parent.name == WHOLE)
-        self.past = Embedding(size, spec.width)  # of the future too
+        self.past = Embedding(size, spec.width)  # also embeds the future
         self.block = RectifiedResidual(half(spec.width), spec.width)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """Padding at the end is not read."""
+        """Return the features; padding at the end is not read."""
         return self.coded(self.past(parents[WHOLE], lengths)[1] - self.past(parents[HISTORY])[1])
 
     def coded(self, change: Tensor) -> Tensor:
-        """Features (B, W) of a change of style (B, S)."""
+        """Return features (B, W) of a change of style (B, S)."""
         return normed(self.block(normed(change)))
 
 
@@ -210,18 +215,18 @@ class StyleDecoder:
     """Features of x_t: states of a recurrent network that starts from content and style, and reads the style.
 
     Args:
-        width: of the states.
+        width: width of the states.
     """
 
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> StyleDecoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return StyleDecoderNetwork(self, inputs, size)
 
 
-class StyleDecoderNetwork(AtOnce):
-    """What `StyleDecoder` describes."""
+class StyleDecoderNetwork(FixedLengthNetwork):
+    """Network of `StyleDecoder`."""
 
     def __init__(self, spec: StyleDecoder, inputs: Sequence[Input], size: int) -> None:
         super().__init__(inputs, True, spec.width)
@@ -241,17 +246,17 @@ class StyleDecoderNetwork(AtOnce):
         return self.network([self.network.share(new)] * length, torch.tanh(self.hidden(joined)), self.cell(joined))
 
     def changed(self, style: Tensor, w: Tensor) -> Tensor:
-        """The new style (B, S)."""
+        """Return the new style (B, S)."""
         both = torch.cat([normed(self.read(w)), style], -1)
         return normed(normed(self.out(normed(self.block(both)))) + style)
 
 
 class Embedding(nn.Module):
-    """Content (B, W - S) and style (B, S) of a motion, S = W / 2, of the last state of a recurrent network.
+    """Content (B, W - S) and style (B, S) of a motion, S = W / 2, from the last state of a recurrent network.
 
     Args:
-        size: D.
-        width: W.
+        size: D, size of a pose.
+        width: W, width of the embedding.
     """
 
     def __init__(self, size: int, width: int) -> None:
@@ -260,7 +265,7 @@ class Embedding(nn.Module):
         self.network, self.out = NormedLSTM(size, width), nn.Linear(width, width)
 
     def forward(self, poses: Tensor, lengths: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Of (B, T, D), or of (B, T D), frame after frame; of the first steps of each where there are lengths."""
+        """Return content and style of poses (B, T, D), or (B, T D) frame by frame, up to `lengths` if given."""
 
         def compute() -> tuple[Tensor, Tensor]:
             shares = self.network.share(poses.reshape(len(poses), -1, self.size)).unbind(1)
@@ -269,30 +274,30 @@ class Embedding(nn.Module):
             content, style = self.out(last).tensor_split([-half(self.out.out_features)], -1)
             return content, normed(style)
 
-        return once(self, [poses, lengths], compute)
+        return memoize(self, [poses, lengths], compute)
 
 
 class NormedLSTM(nn.Module):
-    """An LSTM whose gates are normalised, each over its units, and whose cells are (Ba et al., 2016, arXiv 1607.06450).
+    """An LSTM with layer-normalised gates, each over its units, and cells (Ba et al., 2016, arXiv 1607.06450).
 
     Args:
-        size: D.
-        width: W.
+        size: D, size of the input.
+        width: W, width of the states.
     """
 
     def __init__(self, size: int, width: int) -> None:
         super().__init__()
         self.share, self.recurrent = nn.Linear(size, 4 * width, bias=False), nn.Linear(width, 4 * width, bias=False)
         self.gain, self.shift = nn.Parameter(torch.ones(4, width)), nn.Parameter(torch.zeros(4, width))
-        nn.init.ones_(self.shift.data[1])  # of the gate of what is kept
+        nn.init.ones_(self.shift.data[1])  # the forget gate
         self.norm = nn.LayerNorm(width, eps=EPSILON)
 
     def forward(self, shares: Sequence[Tensor], hidden: Tensor, cell: Tensor) -> Tensor:
-        """States (B, T, W).
+        """Return states (B, T, W).
 
         Args:
-            shares: of what is read in the gates (B, 4 W), step by step.
-            hidden, cell: the first state (B, W).
+            shares: contributions of the input to the gates, (B, 4 W), by step.
+            hidden, cell: first state, (B, W) each.
         """
         states, weight = [], self.recurrent.weight.t()
         for share in shares:
@@ -310,7 +315,7 @@ EPSILON = 1e-3
 
 
 class RectifiedResidual(Residual):
-    """A residual block with ReLUs behind both ways, too."""
+    """A residual block with ReLUs after both branches."""
 
     @override
     def forward(self, values: Tensor) -> Tensor:
@@ -318,5 +323,5 @@ class RectifiedResidual(Residual):
 
 
 def normed(values: Tensor) -> Tensor:
-    """(B, D) with mean 0 and variance 1 of each row."""
+    """Return (B, D) with mean 0 and variance 1 in each row."""
     return functional.layer_norm(values, values.shape[-1:])

@@ -2,11 +2,11 @@
 
     p(z_t) p(x_t | x_{<t}, h, z_t)        q(z_t | x_{<=t}, h)
 
-Latents are independent of each other, so that futures jitter. The guide's states go on from the summary of the observed
-poses h; the decoder is that of the CVAE, whose perceptron reads z_t beside the state.
+Latents are independent of each other, so that futures jitter. The guide's states start from the summary of the observed
+poses h. The decoder is the CVAE's, whose perceptron reads the state and z_t.
 
-Walker, Marino, Gupta and Hebert, 2017, arXiv 1705.00053, whose code is not known; sizes are those of the CVAE of Yuan
-and Kitani, 2020, arXiv 2003.08386, beside which the tables of motion prediction have it.
+Walker, Marino, Gupta and Hebert, 2017, arXiv 1705.00053; we know of no public code. The sizes are from the CVAE of Yuan
+and Kitani, 2020, arXiv 2003.08386, as the tables of motion prediction compare the two.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from ...data.batch import WHOLE
 from ...networks import Input, NetworkSpec
-from ...networks.base import AtOnce
+from ...networks.base import FixedLengthNetwork
 from ...networks.cells import GRU
 from ...options import Size
 from ..motion.futures import HISTORY, FutureMethod, LastState
@@ -28,11 +28,11 @@ from .cvae import SummaryDecoder
 
 @dataclass(frozen=True)
 class PoseKnows(FutureMethod):
-    """See the file.
+    """A model with a latent for each step and a recurrent decoder.
 
     Args:
         width: units of the recurrent networks.
-        hidden: widths of perceptrons.
+        hidden: widths of the perceptrons.
     """
 
     name = "pose-knows"
@@ -50,21 +50,21 @@ class PoseKnows(FutureMethod):
 
 @dataclass(frozen=True)
 class FutureFilter:
-    """Features of z_t: states of a recurrent network over the future so far, that goes on from the past.
+    """Features of z_t: states of a recurrent network over the future up to t, which continues from the past.
 
     Args:
-        width: of the states.
+        width: width of the states.
     """
 
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureFilterNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return FutureFilterNetwork(self, inputs)
 
 
-class FutureFilterNetwork(AtOnce):
-    """What `FutureFilter` describes."""
+class FutureFilterNetwork(FixedLengthNetwork):
+    """Network of `FutureFilter`."""
 
     def __init__(self, spec: FutureFilter, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, True, spec.width)

@@ -1,14 +1,14 @@
-"""RHP: futures of a moving body from the code of the past, to which a random hidden perturbation is added.
+"""RHP: futures of a moving body from the code of the past plus a random hidden perturbation.
 
     p(w) p(x_t | x_{<t}, h, w)        q(w), the prior
 
-The decoder is that of the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386, of the sum of the code of h and W w, W
-learned; nothing encodes w. The squared error of draws of the prior is minimised. It is least on average where all draws
-make the mean, at W = 0: nothing but chance keeps futures apart.
+The decoder is the one of the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. It reads the sum of the code of h and
+W w, with W learned; there is no encoder of w. Training minimises the squared error of draws from the prior. Its minimum
+has W = 0, where all draws predict the mean: only chance keeps futures apart.
 
-It is the generator of HP-GAN (Barsoum, Kender and Liu, 2018, arXiv 1711.09561) without its adversary, as Mix-and-Match
-(Aliakbarian et al., 2020, arXiv 1908.00733) compares with it. HP-GAN's own has two layers of 1024 units, all of whose
-states are perturbed, and w uniform from -.1 to .1; here it is normal, as W learns the scale.
+It is the generator of HP-GAN (Barsoum, Kender and Liu, 2018, arXiv 1711.09561) without its adversary, as a baseline of
+Mix-and-Match (Aliakbarian et al., 2020, arXiv 1908.00733). HP-GAN's own generator has two layers of 1024 units,
+perturbs all of their states, and draws w uniformly from -.1 to .1. Here w is normal, because W learns the scale.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ..motion.futures import HISTORY, FedBackNetwork, FutureMethod, LastState
 
 @dataclass(frozen=True)
 class RHP(FutureMethod):
-    """See the file.
+    """A model with a random hidden perturbation.
 
     Args:
-        beta: 0; the guide is the prior, and there is no divergence to weigh.
+        beta: always 0: the guide is the prior, so that the KL is 0.
         width: units of the recurrent networks.
-        hidden: widths of perceptrons.
+        hidden: widths of the perceptrons.
     """
 
     name = "rhp"
@@ -49,9 +49,7 @@ class RHP(FutureMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.beta:
-            raise ValueError(
-                f"beta is {self.beta}, but rhp's guide is its prior, with no divergence to weigh; leave it out"
-            )
+            raise ValueError(f"beta is {self.beta}, but rhp's guide is its prior, so that the KL is 0; leave it out")
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -62,8 +60,8 @@ class RHP(FutureMethod):
         return {"p(x)": PerturbedDecoder(self.width, self.hidden)}
 
     @override
-    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
-        return {**super().described(sizes), "inference": None}
+    def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        return {**super().model_arguments(sizes), "inference": None}
 
 
 @dataclass(frozen=True)
@@ -71,20 +69,20 @@ class PerturbedDecoder:
     """Features of x_t: states of a recurrent network over [perturbed code of h, x_{t-1}], and a perceptron.
 
     Args:
-        width: of the states and of the code.
-        hidden: widths of the perceptrons, on the code to the first state and behind the states.
+        width: width of the states and of the code.
+        hidden: widths of the perceptrons from the code to the first state and after the states.
     """
 
     width: int
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> PerturbedDecoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return PerturbedDecoderNetwork(self, inputs, size)
 
 
 class PerturbedDecoderNetwork(FedBackNetwork):
-    """What `PerturbedDecoder` describes."""
+    """Network of `PerturbedDecoder`."""
 
     def __init__(self, spec: PerturbedDecoder, inputs: Sequence[Input], size: int) -> None:
         super().__init__(inputs, spec.width, size, spec.width, spec.hidden)

@@ -1,4 +1,4 @@
-"""The classical dynamical VAEs."""
+"""Classical dynamical VAEs."""
 
 from typing import TYPE_CHECKING
 

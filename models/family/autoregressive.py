@@ -1,9 +1,8 @@
-"""The recurrent network without latents: the likelihood that every latent must beat.
+"""Recurrent network without latents: the baseline likelihood that a model with latents should exceed.
 
     p(x_t | x_{<t})        no guide: the likelihood is exact
 
-Its layers are those of the other methods of the family (Girin et al., 2021, arXiv 2008.12595), which have latents
-beside them.
+It has the same layers as the other methods of the family (Girin et al., 2021, arXiv 2008.12595), but no latents.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from ..method import LikelihoodMethod
 
 @dataclass(frozen=True)
 class Autoregressive(LikelihoodMethod):
-    """See the file.
+    """A recurrent network without latents.
 
     Args:
-        latent: there is none.
-        width: of the recurrent state.
-        embed: of the dense layer before it; 0 for none.
-        hidden: widths of the perceptron after it.
+        latent: always None; the method has no latents.
+        width: width of the recurrent state.
+        embed: width of the dense layer before the recurrent network; 0 for none.
+        hidden: widths of the perceptron after the recurrent network.
     """
 
     name = "autoregressive"
@@ -41,10 +40,10 @@ class Autoregressive(LikelihoodMethod):
 
     @override
     def sizes(self) -> dict[str, int]:
-        """No latents."""
+        """Return no sizes: the method has no latents."""
         return {}
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """One recurrent network."""
+        """Return one recurrent network."""
         return {"default": Recurrent(self.width, embed=self.embed, hidden=self.hidden)}

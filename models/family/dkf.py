@@ -1,11 +1,11 @@
-"""The deep Kalman filter, or deep Markov model: a Markov chain of latents behind independent frames.
+"""Deep Kalman filter, or deep Markov model: a Markov chain of latents, and frames that are independent given z.
 
     p(z_t | z_{t-1}) p(x_t | z_t)        q(z_t | z_{t-1}, x_{t:T})
 
-Krishnan, Shalit and Sontag, 2015 and 2017, arXiv 1511.05121 and 1609.09869; layers of the public implementation of
-Girin et al., 2021, arXiv 2008.12595. The transition is gated: its mean mixes a linear and a nonlinear proposal. The
-guide averages features of z_{t-1} and a backward recurrent state of x_{t:T}; it has the dependencies of the exact
-posterior. Nothing is shared between guide and model.
+Krishnan, Shalit and Sontag, 2015 and 2017, arXiv 1511.05121 and 1609.09869. The layers are from the public
+implementation of Girin et al., 2021, arXiv 2008.12595. The transition is gated: its mean mixes a linear and a nonlinear
+proposal. The guide averages features of z_{t-1} and a backward recurrent state of x_{t:T}; it has the dependencies of
+the exact posterior. Guide and model share no parameters.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
-from ...distributions.base import LawSpec, Parameters, Shape
+from ...distributions.base import DistributionSpec, Parameters, Shape
 from ...distributions.families import Gaussian
 from ...networks import Dense, Input, NetworkSpec, Recurrent
 from ...networks.base import Network, aligned
@@ -34,22 +34,23 @@ class Gated:
 
         g = sigmoid(MLP(z))    h = MLP(z)    mean = (1 - g) * L(z) + g * h    variance = softplus(L(relu(h)))
 
-    Gate and proposal also read what is given at t, such as covariates and the gap since t-1. Its features are the mean
-    and relu(h); `GatedNormal` is its law.
+    Gate and proposal also read parents at t, such as covariates and the time since t-1. The features are the mean and
+    relu(h); `GatedNormal` is the matching distribution.
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GatedTransition:
-        """The network of a factor whose first parent is its own last value, and others static or at t."""
+        """Return the network of a factor whose first parent is its last value; other parents are static or at t."""
         fits = bool(inputs) and inputs[0].lags == (-1,) and inputs[0].size == size
         if not fits or any(parent.relation and parent.lags != (0,) for parent in inputs[1:]):
             raise ValueError(
-                f"a gated transition is of one variable from its own last value and what is given at t, not {inputs}"
+                f"a gated transition reads the last value of its variable and parents that are static or at t, got "
+                f"{inputs}"
             )
         return GatedTransition(inputs, size)
 
 
 class GatedTransition(Network):
-    """What `Gated` describes."""
+    """Network of `Gated`."""
 
     def __init__(self, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, 2 * size)
@@ -68,7 +69,7 @@ class GatedTransition(Network):
         return torch.cat([mean, functional.relu(proposal)], dim=-1)
 
     def _given(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
-        """What is given beside z_{t-1}, (B, T, E)."""
+        """Return the parents other than z_{t-1}, (B, T, E)."""
         empty = self.linear.weight.new_empty(batch, length, 0)
         return torch.cat(aligned([empty, *(parents[name] for name in self.beside)]), -1)
 
@@ -90,15 +91,15 @@ class GatedTransition(Network):
 
 @dataclass(frozen=True)
 class GatedNormal:
-    """A normal on the features of `Gated`, whose scale stays above .001."""
+    """A normal distribution on the features of `Gated`, whose scale stays above .001."""
 
-    def build(self, shape: Shape) -> GatedLaw:
-        """The law of a variable, from features (..., 2 D)."""
-        return GatedLaw(shape.size)
+    def build(self, shape: Shape) -> GatedModule:
+        """Return the distribution of a variable, from features (..., 2 D)."""
+        return GatedModule(shape.size)
 
 
-class GatedLaw(Gaussian):
-    """What `GatedNormal` describes."""
+class GatedModule(Gaussian):
+    """Distribution of `GatedNormal`."""
 
     def __init__(self, size: int):
         super().__init__()
@@ -112,13 +113,13 @@ class GatedLaw(Gaussian):
 
 @dataclass(frozen=True)
 class DKF(LatentMethod):
-    """See the file.
+    """A deep Kalman filter.
 
     Args:
-        width: of the guide's recurrent state, and of the features of z_{t-1} beside it.
-        embed: of the dense layer before the state.
-        embed_latent: widths of the layers on z_{t-1} before its last one, of size `width`.
-        hidden: widths of the perceptron on the mean of the two.
+        width: width of the guide's recurrent state and of the features of z_{t-1}.
+        embed: width of the dense layer before the recurrent network.
+        embed_latent: widths of the layers on z_{t-1} before the last one, whose width is `width`.
+        hidden: widths of the perceptron on the mean of state and features.
         decoder: widths of the decoder.
         transition: widths of a perceptron for p(z_t | z_{t-1}) in place of the gated transition.
     """
@@ -127,7 +128,7 @@ class DKF(LatentMethod):
     source = "Krishnan, Shalit and Sontag, 2015, arXiv 1511.05121"
     generative = "p(z_t | z_{t-1}) p(x_t | z_t)"
     inference = "q(z_t | z_{t-1}, x_{t:T})"
-    apart = ("q(z)",)
+    without_covariates = ("q(z)",)
 
     width: Size = 64
     embed: Extra = 64
@@ -138,7 +139,7 @@ class DKF(LatentMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """A gated transition, a perceptron for the data, a backward network for the guide."""
+        """Return a gated transition, a perceptron for the data and a backward network for the guide."""
         extract = {"z": (*self.embed_latent, self.width)}
         return {
             "p(z)": Dense(self.transition) if self.transition else Gated(),
@@ -147,6 +148,6 @@ class DKF(LatentMethod):
         }
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """The gated transition has its own."""
-        return {**super().laws(), **({} if self.transition else {"p(z)": GatedNormal()})}
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return the distributions by factor; the gated transition has its own."""
+        return {**super().distributions(), **({} if self.transition else {"p(z)": GatedNormal()})}

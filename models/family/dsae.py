@@ -1,11 +1,11 @@
-"""The disentangled sequential autoencoder: a static latent for what lasts, a chain of latents for what moves.
+"""Disentangled sequential autoencoder: a static latent for constant content, a chain of latents for the dynamics.
 
     p(w) p(z_t | z_{<t}) p(x_t | z_t, w)        q(w | x_{1:T}) q(z_t | x_{1:T}, w)
 
-Li and Mandt, 2018, arXiv 1803.02991, their "full" guide (v in the public implementation is our w, f in the paper);
-layers of the public implementation of Girin et al., 2021, arXiv 2008.12595. q(w) reads the two final states of a
-bidirectional network, q(z_t) a recurrent network on top of another one that reads x_t and w. Nothing is shared. The
-guide misses z_{<t}.
+Li and Mandt, 2018, arXiv 1803.02991, with their "full" guide. Our w is v in the public implementation and f in the
+paper. The layers are from the public implementation of Girin et al., 2021, arXiv 2008.12595. q(w) reads the two final
+states of a bidirectional network. q(z_t) reads a recurrent network on top of a bidirectional one over x_t and w. No
+parameters are shared. The guide ignores z_{<t}.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from ..method import LatentMethod
 
 @dataclass(frozen=True)
 class Layered:
-    """A forward recurrent network (tanh) on the states of a forward and a backward LSTM, which read all parents.
+    """A forward recurrent network (tanh) on the states of a forward and a backward LSTM over all parents.
 
     Args:
-        width: of the states.
+        width: width of the states.
     """
 
     width: int = 64
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LayeredNetwork:
-        """The network of a factor whose local parents are all read over {1:T}."""
+        """Return the network of a factor whose local parents are all read over {1:T}."""
         return LayeredNetwork(self, inputs, local)
 
 
 class LayeredNetwork(Network):
-    """What `Layered` describes."""
+    """Network of `Layered`."""
 
     def __init__(self, spec: Layered, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
         for parent in inputs:
             if parent.relation not in (None, ALL):
-                raise ValueError(f"Layered reads its parents over {{1:T}}, but {parent.name} at {parent.relation}")
+                raise ValueError(f"Layered reads its parents over {{1:T}}, but {parent.name} has {parent.relation}")
         recurrent = Recurrent(spec.width)
         self.past = Memory(recurrent, [(p, 0 if p.relation is None else -1) for p in inputs], +1)
         self.future = Memory(recurrent, [(p, 0) for p in inputs], -1)
@@ -67,7 +67,7 @@ class LayeredNetwork(Network):
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """A parent over {1:T} is never drawn in the same loop."""
+        """Return the features of all steps, because a parent over {1:T} is never drawn in the same loop."""
         return self(given, length, lengths).unbind(1)
 
     @override
@@ -76,11 +76,14 @@ class LayeredNetwork(Network):
 
 
 class Recurrence(torch.autograd.Function):
-    """h_t = tanh(base_t + W h_{t-1}), (T, B, W). torch.nn.RNN records every step of it, which takes far longer."""
+    """The recurrence h_t = tanh(base_t + W h_{t-1}), (T, B, W).
+
+    torch.nn.RNN records every step for the gradient, which takes far longer.
+    """
 
     @staticmethod
     def forward(ctx: Any, base: Tensor, weight: Tensor) -> Tensor:
-        """States from base (T, B, W) and weight (W, W)."""
+        """Return the states from base (T, B, W) and weight (W, W)."""
         states = torch.empty_like(base)
         state = torch.zeros_like(base[0])
         for share, target in zip(base.unbind(0), states.unbind(0), strict=True):
@@ -91,7 +94,7 @@ class Recurrence(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_states: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients of base and weight."""
+        """Return the gradients of base and weight."""
         states, weight = ctx.saved_tensors
         to_base = torch.empty_like(states)
         targets, slopes, own = to_base.unbind(0), (1 - states * states).unbind(0), to_states.unbind(0)
@@ -105,11 +108,11 @@ class Recurrence(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class DSAE(LatentMethod):
-    """See the file.
+    """A disentangled sequential autoencoder.
 
     Args:
         static: size of w.
-        width: of the recurrent states.
+        width: width of the recurrent states.
         decoder: widths of the decoder.
     """
 
@@ -117,7 +120,7 @@ class DSAE(LatentMethod):
     source = "Li and Mandt, 2018, arXiv 1803.02991"
     generative = "p(w) p(z_t | z_{<t}) p(x_t | z_t, w)"
     inference = "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"
-    apart = ("q(z)", "q(w)")
+    without_covariates = ("q(z)", "q(w)")
 
     static: Size = 16
     width: Size = 64
@@ -129,7 +132,7 @@ class DSAE(LatentMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Recurrent networks for everything but the data."""
+        """Return recurrent networks for the latents and a perceptron for the data."""
         return {
             "q(w)": Recurrent(self.width, hidden=()),
             "q(z)": Layered(self.width),

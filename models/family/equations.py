@@ -1,4 +1,4 @@
-"""Any pair of equations, as a method: the factorization is the user's, the networks are of one kind throughout."""
+"""Method for any pair of equations: the user gives the factorization, and all factors use one kind of network."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from ...factorization.inversion import guide
 from ...factorization.notation import Factorization
 from ...networks import Attention, Dense, Linear, NetworkSpec, Recurrent
 from ...options import Range, Size, nearest
+from ...program.enumeration import LARGEST, Discrete
 from ...program.model import DynamicalVAE
-from ...program.summed import LARGEST, Discrete
 from ..method import LatentMethod
 
 
 @dataclass(frozen=True)
 class Equations(LatentMethod):
-    """A model of its own equations.
+    """A model of user-defined equations.
 
     Args:
-        generative: the model's factorization.
-        inference: the guide's; "" of a model without latents.
+        generative: factorization of the model.
+        inference: factorization of the guide; "" for a model without latents.
         network: "recurrent", "attention", "dense" or "linear", for every factor.
-        width: of the networks.
+        width: width of the networks.
         latents: sizes of the latents, where they differ from `latent`.
-        states: of discrete latents, which are summed out and have no factor in the guide: their numbers of states.
-        grouped: static latents that the sequences of a group share, see `dvae.program.groups`.
+        states: numbers of states of discrete latents, which are summed out and have no factor in the guide.
+        grouped: static latents that the sequences of a group share; see `dvae.program.groups`.
     """
 
     name = "equations"
     source = "your own"
 
-    # options here, where other methods have constants
+    # options in this method, constants in the others
     generative: str = "p(z_t | z_{t-1}) p(x_t | z_t)"  # type: ignore[misc]
     inference: str = "q(z_t | z_{t-1}, x_{1:T})"  # type: ignore[misc]
     network: str = "recurrent"
@@ -50,24 +50,24 @@ class Equations(LatentMethod):
         for name in ("generative", "inference"):
             if lag := re.search(r"\d{4,}", getattr(self, name)):
                 raise ValueError(
-                    f"{name} reads {lag[0][:20]} steps away; a lag is at most 999, or write {{<t}} for any"
+                    f"{name} has a lag of {lag[0][:20]} steps; a lag is at most 999, or write {{<t}} for any"
                 )
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        """The model and its guide, to which states are unknown."""
+        """Return the model and its guide, which has no factors of discrete latents."""
         generative = Factorization.parse(self.generative)
         return generative, guide(generative, self.inference, summed=self.states)
 
     @override
     def sizes(self) -> dict[str, int]:
-        """Sizes of all variables; the data tell their own."""
+        """Return the sizes of all variables; the sizes of the data replace theirs."""
         sizes = {name: self.latents.get(name, self.latent) for name in self.equations()[0].variables}
         return {**sizes, **{name: Discrete(states) for name, states in self.states.items()}}
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """One kind for every factor."""
+        """Return one kind of network for every factor."""
         kinds: dict[str, NetworkSpec] = {
             "recurrent": Recurrent(self.width, hidden=(self.width,)),
             "attention": Attention(self.width),
@@ -81,32 +81,32 @@ class Equations(LatentMethod):
         return {"default": kinds[self.network]}
 
     @override
-    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
-        """With what groups share."""
-        return {**super().described(sizes), "grouped": self.grouped}
+    def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """Return the arguments, with the latents that groups share."""
+        return {**super().model_arguments(sizes), "grouped": self.grouped}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model of these equations and no others; gradients flow through fed means.
+        """Return the model of exactly these equations; in scheduled sampling, gradients flow through the means.
 
         Raises:
-            SchemaError: data without context that the equations read.
+            SchemaError: if the data have no context that the equations read.
         """
         schema = Schema.of(data)
         if missing := [name for name in self._given() if name not in schema.sizes]:
             raise SchemaError(
-                f"the equations read {', '.join(missing)}, which has no factor and comes from the data, but these have "
+                f"the equations read {', '.join(missing)}, which has no factor and must be in the data, but they have "
                 f"{', '.join(schema.sizes)}; a table has covariates as c, attributes as s, and uneven steps as d"
             )
-        return self.suited_to(schema, extended=False)
+        return self.build_for_data(schema, extended=False)
 
     @override
     def check(self) -> None:
-        """Refuses options that do not fit together, whatever the sizes of the context will be."""
+        """Refuse options that do not fit together, whatever the sizes of the context."""
         self.build(Schema({"x": 1, **dict.fromkeys(self._given(), 1)}))
 
     def _given(self) -> list[str]:
-        """Names of the context of both equations."""
+        """Return the names of the context of both equations."""
         generative, inference = self.equations()
         return [
             n

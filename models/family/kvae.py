@@ -1,27 +1,27 @@
-"""The Kalman variational autoencoder: a linear-Gaussian chain z behind encoded frames a, integrated out exactly.
+"""Kalman variational autoencoder: a linear-Gaussian chain z behind encoded frames a, integrated out exactly.
 
-The paper's model, with a_0 learned and matrices that are mixtures A_t = sum_k alpha_{t,k} A^(k), likewise B_t and C_t,
+In the paper's model, a_0 is learned, and the matrices are mixtures A_t = sum_k alpha_{t,k} A^(k), likewise B_t and C_t:
 
     p(z_t | z_{t-1}, a_{<t}) = N(A_t z_{t-1} + B_t a_{t-1}, Q)        p(a_t | z_t, a_{<t}) = N(C_t z_t, R)
     p(x_t | a_t)        alpha_t = softmax(linear(LSTM(a_0, ..., a_{t-1})))        p(z_1) = N(0, 20 I)
 
     q(a_t | x_t)        q(z_{1:T} | a_{1:T}) = p(z_{1:T} | a_{1:T})
 
-Since the guide of z is the exact posterior given a, its bound is that of the pair in which z is integrated out, and
-this pair is the program:
+The guide of z is the exact posterior given a. The bound is therefore unchanged if z is integrated out, and the program
+is the resulting pair:
 
     p(a_t | a_{<t}) p(x_t | a_t)        q(a_t | x_t)
 
-p(a_t | a_{<t}) is the prediction of the Kalman filter. Its divergence is analytic where the paper draws z, and
-forecasts carry the whole distribution of z_t. `smooth` gives z back. The guide drops what the posterior of a_t reads
-besides x_t: the past a_{<t}, and the frames after it.
+p(a_t | a_{<t}) is the prediction of the Kalman filter. Its KL divergence is analytic, whereas the paper draws z, and
+forecasts propagate the whole distribution of z_t. `smooth` returns the posterior of z. The guide reads only x_t,
+whereas the posterior of a_t also depends on the past a_{<t} and on later frames.
 
-A frame of which nothing was observed is not encoded: its a_t is integrated out, as z is, and leaves filter and bound.
-What mixes the matrices reads the prediction C_t E(z_t | a_{<t}) in its place, as where the paper imputes. What the
-guide hands out there is drawn from p(a_t | all other a), so that frames are imputed from both sides.
+A frame without any observed entry is not encoded: its a_t is integrated out like z, and contributes nothing to filter
+and bound. As in the paper's imputation, the network that mixes the matrices reads the prediction C_t E(z_t | a_{<t}) in
+its place. The guide draws such an a_t from p(a_t | all other a), so that past and future frames inform the imputation.
 
-Fraccaro, Kamronn, Paquet and Winther, 2017, arXiv 1710.05741; B_t a_{t-1} as in the public implementation of Girin et
-al., 2021, arXiv 2008.12595, in whose layer sizes the defaults are.
+Fraccaro, Kamronn, Paquet and Winther, 2017, arXiv 1710.05741. The term B_t a_{t-1} and the default layer sizes are from
+the public implementation of Girin et al., 2021, arXiv 2008.12595.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from typing_extensions import override
 
 from ...data.batch import WHOLE
 from ...data.schema import Schema
-from ...distributions.base import LawSpec
+from ...distributions.base import DistributionSpec
 from ...distributions.kalman import LinearGaussianChain, update
 from ...distributions.triangular import InverseCholesky, Triangular, refuse_half
 from ...inference.training.options import Stage
@@ -58,24 +58,24 @@ from ..method import LatentMethod
 
 @dataclass(frozen=True)
 class KVAE(LatentMethod):
-    """See the file. `latent` is the size of z.
+    """A Kalman variational autoencoder. `latent` is the size of z.
 
     Args:
         auxiliary: size of a.
-        components: K, the matrices that are mixed.
-        width: of the recurrent state that mixes them.
-        hidden: widths of the encoder; the decoder has them in reverse.
-        learn_noise: Q and R, diagonal, are learned, in place of .08 I and .03 I.
-        phases: train in the paper's three phases: first encoder and decoder alone, from a tenth of the run on the
-            matrices too, from a third on also what mixes them. (On simulated people, 1500 steps, three seeds, the
-            validation bound is .9 nats a frame above that of training all at once, standard error .25.)
+        components: K, number of matrices that are mixed.
+        width: width of the recurrent state that mixes the matrices.
+        hidden: widths of the encoder; the decoder has them in reverse order.
+        learn_noise: whether to learn diagonal Q and R; otherwise they are .08 I and .03 I.
+        phases: train in the paper's three phases: first encoder and decoder alone, after a tenth of the run also the
+            matrices, after a third also the network that mixes them. (On simulated people, 1500 steps, three seeds, the
+            validation bound is .9 nats a frame higher than when training all parts at once, standard error .25.)
     """
 
     name = "kvae"
     source = "Fraccaro et al., 2017, arXiv 1710.05741"
     generative = "p(a_t | a_{<t}) p(x_t | a_t)"
     inference = "q(a_t | x_t)"
-    apart = ("p(a)",)
+    without_covariates = ("p(a)",)
 
     latent: Annotated[int, Range(1, 256)] = 8
     auxiliary: Annotated[int, Range(1, 256)] = 16
@@ -87,12 +87,12 @@ class KVAE(LatentMethod):
 
     @override
     def sizes(self) -> dict[str, int]:
-        """The size of a, the only latent that is drawn."""
+        """Return the size of a, the only latent that is drawn."""
         return {"a": self.auxiliary}
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """The Kalman filter, and perceptrons frame by frame."""
+        """Return the Kalman filter, and perceptrons that act on single frames."""
         return {
             "p(a)": Kalman(self.latent, self.components, self.width, self.learn_noise),
             "p(x)": Dense(self.hidden[::-1]),
@@ -100,18 +100,18 @@ class KVAE(LatentMethod):
         }
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """The filter's prediction has a full covariance."""
-        return {**super().laws(), "p(a)": Triangular()}
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return the distributions by factor; the prediction of the filter has a full covariance."""
+        return {**super().distributions(), "p(a)": Triangular()}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model of these equations, that integrates out frames that are missing."""
-        return self.suited_to(Schema.of(data), extended=True, kind=KalmanVAE)
+        """Return the model of these equations, which integrates out missing frames."""
+        return self.build_for_data(Schema.of(data), extended=True, kind=KalmanVAE)
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """In `phases`; in a run of fewer than three steps there is one."""
+        """Return a recipe with the stages of `phases`; a run of fewer than three steps has one stage."""
         recipe = super().train(train, validation, steps)
         if not self.phases or steps < 3:
             return recipe
@@ -123,7 +123,7 @@ class KVAE(LatentMethod):
 
 
 class KalmanVAE(DynamicalVAE):
-    """The model of `KVAE`: a_t is there at the frames of which something was observed."""
+    """The model of `KVAE`: a_t is present at frames with at least one observed entry."""
 
     @override
     def rollout(
@@ -133,7 +133,7 @@ class KalmanVAE(DynamicalVAE):
         if WHOLE not in run.observed:
             return run
         seen = run.observed[WHOLE].any(-1)
-        present = functional.pad(seen, (0, run.length - seen.shape[1]), value=True)  # what is drawn on is there
+        present = functional.pad(seen, (0, run.length - seen.shape[1]), value=True)  # forecast frames are present
         valid = None if run.lengths is None else valid_steps(run.lengths, run.length)
         present = present if valid is None else present | ~valid
         if not present.all():
@@ -145,12 +145,12 @@ class KalmanVAE(DynamicalVAE):
 
 @dataclass
 class Encoding(Rollout):
-    """A run of the guide whose a_t is drawn from p(a_t | all other a) where the frame is not encoded.
+    """A rollout of the guide that draws a_t from p(a_t | all other a) where the frame is not encoded.
 
-    Not where gradients are taken: a bound leaves these frames out, and drawing them takes as long as all else of it.
+    With gradients enabled it does not: a bound ignores these frames, and drawing them would double its run time.
 
     Args:
-        network: of p(a).
+        network: network of p(a).
     """
 
     network: Any = None
@@ -167,13 +167,13 @@ class Encoding(Rollout):
 
 @dataclass(frozen=True)
 class Kalman:
-    """The prediction of a_t from a_{<t} under a linear-Gaussian chain with mixed matrices; see the file.
+    """The prediction of a_t from a_{<t} under a linear-Gaussian chain with mixed matrices.
 
     Args:
         latent: size of z.
-        components: K.
-        width: of the recurrent state.
-        learn_noise: whether Q and R are learned, from their starts on.
+        components: K, number of matrices that are mixed.
+        width: width of the recurrent state.
+        learn_noise: whether to learn Q and R, starting from their default values.
     """
 
     latent: int = 4
@@ -182,20 +182,20 @@ class Kalman:
     learn_noise: bool = False
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> KalmanNetwork:
-        """The network of a factor p(a_t | a_{<t}), for a of dimension `size`."""
+        """Return the network of a factor p(a_t | a_{<t}), for a of dimension `size`."""
         lone = inputs[0] if len(inputs) == 1 and local else None
         if lone is None or lone.relation is None or lone.relation.intervals != ((-math.inf, -1),) or lone.size != size:
             raise ValueError(
-                "a Kalman network predicts a variable from all of its own past, p(a_t | a_{<t}), but the parents here "
-                f"are {', '.join(f'{p.name} at {p.relation and p.relation.name}' for p in inputs)}"
+                "a Kalman network predicts a variable from all of its own past, p(a_t | a_{<t}), but the parents are "
+                f"{', '.join(f'{p.name} at {p.relation and p.relation.name}' for p in inputs)}"
             )
         return KalmanNetwork(self, lone)
 
 
 class KalmanNetwork(Network):
-    """See `Kalman`; the features are location and whitening matrix of the prediction, (..., D + D * D)."""
+    """Network of `Kalman`; the features are location and whitening matrix of the prediction, (..., D + D * D)."""
 
-    law = Triangular
+    distribution = Triangular
     log_noise: Tensor
     log_emission: Tensor
 
@@ -228,14 +228,14 @@ class KalmanNetwork(Network):
     def chain_of(
         self, a: Tensor, present: Tensor | None = None, valid: Tensor | None = None
     ) -> tuple[LinearGaussianChain, Tensor, Tensor]:
-        """The chain of z given a (T, B, D), its C (T, B, D, N) and the weights alpha (T, B, K).
+        """Return the chain of z given a, its C (T, B, D, N) and the weights alpha (T, B, K).
 
         Args:
-            a: the encoded frames.
-            present: (T, B) False at frames that are not encoded, whose a is integrated out.
-            valid: (T, B) False at padding.
+            a: encoded frames, (T, B, D).
+            present: (T, B), False at frames that are not encoded, whose a is integrated out.
+            valid: (T, B), False at padding.
         """
-        before = torch.cat([self.first.expand(1, a.shape[1], -1), self.filled(a, present)[:-1]])
+        before = torch.cat([self.first.expand(1, a.shape[1], -1), self.fill_missing(a, present)[:-1]])
         alpha = self.weights(self.memory(before)[0]).softmax(-1)
         transition, control, emission = self.mixed(alpha)
         mean, covariance, noise = self.start_of(a.shape[1])
@@ -251,10 +251,11 @@ class KalmanNetwork(Network):
         chain = LinearGaussianChain(transition, offset, noise, mean, covariance, information, potential)
         return chain, emission, alpha
 
-    def filled(self, a: Tensor, present: Tensor | None) -> Tensor:
-        """a (T, B, D), with its prediction where it is not there: what mixes the matrices, if there is anything to mix.
+    def fill_missing(self, a: Tensor, present: Tensor | None) -> Tensor:
+        """Return a (T, B, D) with predictions at missing frames, the input of the network that mixes the matrices.
 
-        A loop, since every prediction is by matrices that the ones before have mixed.
+        With one component no mixing is needed, and a is unchanged. The loop is necessary, because the matrices of each
+        prediction depend on the predictions before it.
         """
         if present is None or self.spec.components == 1:
             return a
@@ -267,11 +268,11 @@ class KalmanNetwork(Network):
         return torch.stack(rows)
 
     def past(self, transition: Tensor, control: Tensor, emission: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-        """A_t and Q (..., N, N) each, with a_{t-1} = C_{t-1} z_{t-1} + N(0, R) integrated out where it is not there.
+        """Return A_t and Q, (..., N, N) each, with a_{t-1} = C_{t-1} z_{t-1} + N(0, R) integrated out where missing.
 
         Args:
             transition, control: A_t and B_t, (..., N, N) and (..., N, D).
-            emission, present: of t - 1, (..., D, N) and (...).
+            emission, present: C_{t-1} and whether a_{t-1} is present, (..., D, N) and (...).
         """
         absent = control * ~present[..., None, None]
         noise = self.log_noise.exp().diag() + (absent * self.log_emission.exp()) @ absent.mT
@@ -279,16 +280,17 @@ class KalmanNetwork(Network):
 
     @torch.no_grad()
     def completed(self, a: Tensor, present: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """a (B, T, D), with draws of p(a_t | all that is there) at frames that are not (B, T)."""
+        """Return a (B, T, D), with draws of p(a_t | all present a) at frames where `present` (B, T) is False."""
         valid = None if lengths is None else valid_steps(lengths, a.shape[1]).t()
         chain, _, alpha = self.chain_of(a.transpose(0, 1), present.t(), valid)
         drawn = self.emitted(chain.draw(torch.randn_like(chain.potential)), alpha).transpose(0, 1)
         return torch.where(present[..., None], a, drawn.to(a.dtype))
 
     def emitted(self, z: Tensor, alpha: Tensor) -> Tensor:
-        """Draws of a (T, B, D) given z_{1:T} (T, B, N), where it is not there.
+        """Return draws of a (T, B, D) given z_{1:T} (T, B, N), for missing frames.
 
-        a_t is C_t z_t + N(0, R), and moves z_{t+1}: what its draw misses that by is put right (Matheron's rule).
+        a_t is C_t z_t + N(0, R) and enters the mean of z_{t+1}. Matheron's rule corrects the unconditional draw by the
+        residual of z_{t+1}.
         """
         transition, control, emission = self.mixed(alpha)
         noise, spread = self.log_noise.exp(), self.log_emission.exp()
@@ -302,10 +304,10 @@ class KalmanNetwork(Network):
         return torch.cat([a[:-1] + back, a[-1:]])
 
     def start_of(self, batch: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean (B, N) and covariance (B, N, N) of z_1, and Q (N, N).
+        """Return mean (B, N) and covariance (B, N, N) of z_1, and Q (N, N).
 
         Raises:
-            ValueError: parameters in half precision.
+            ValueError: if the parameters have half precision.
         """
         refuse_half(self.A.dtype)
         noise = self.log_noise.exp().diag()
@@ -313,7 +315,7 @@ class KalmanNetwork(Network):
         return covariance.new_zeros(batch, len(noise)), covariance.expand(batch, -1, -1), noise
 
     def mixed(self, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A (..., N, N), B (..., N, D) and C (..., D, N) under weights (..., K), in float64."""
+        """Return A (..., N, N), B (..., N, D) and C (..., D, N) for weights (..., K), in float64."""
         parts = (self.A, self.B, self.C)
         mixed = (alpha @ torch.cat([part.flatten(1) for part in parts], dim=1)).double()
         pieces = mixed.split([part[0].numel() for part in parts], dim=-1)
@@ -321,12 +323,12 @@ class KalmanNetwork(Network):
         return a, b, c
 
     def seen(self, emission: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """What a (..., D) says of z: G (..., N, N) and g (..., N)."""
+        """Return the information G (..., N, N) and the potential g (..., N) about z in a (..., D)."""
         weighted = (emission * torch.exp(-self.log_emission)[:, None]).mT
         return weighted @ emission, (weighted @ a[..., None].double())[..., 0]
 
     def parts_of(self, mean: Tensor, covariance: Tensor, emission: Tensor) -> tuple[Tensor, Tensor]:
-        """Location (..., D) and whitening matrix (..., D * D) of a_t from the moments of z_t."""
+        """Return location (..., D) and whitening matrix (..., D * D) of a_t from the moments of z_t."""
         loc = (emission @ mean[..., None])[..., 0]
         spread = emission @ covariance @ emission.mT + self.log_emission.exp().diag()
         return loc, InverseCholesky.apply(spread).flatten(-2)
@@ -345,7 +347,7 @@ class KalmanNetwork(Network):
         return features.to(self.A.dtype), state
 
     def ahead(self, state: Predicted, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Predicted:
-        """The prediction of step t from that of the last one, and what is known by then."""
+        """Return the prediction of step t from the prediction of step t-1 and from a_{t-1}."""
         mean, covariance, emission = state.mean, state.covariance, state.emission
         values = drawn[self.inputs[0].name] if state.known is None else state.known
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)
@@ -370,13 +372,13 @@ class KalmanNetwork(Network):
 
 @dataclass
 class Predicted:
-    """The state of a `KalmanNetwork`: what is known of a, and z_t by what came before t.
+    """The state of a `KalmanNetwork`: the given a, and the distribution of z_t given a_{<t}.
 
     Args:
-        known: a by step, None where the loop draws it.
-        present: (B,) by step, whether it is there; None where it always is.
-        hidden: of the memory.
-        mean, covariance: of z_t.
+        known: a by step; None if the loop draws it.
+        present: (B,) by step, whether a is present; None if it always is.
+        hidden: hidden state of the LSTM.
+        mean, covariance: moments of z_t.
         emission: C_t; None before the first step.
     """
 
@@ -390,13 +392,13 @@ class Predicted:
 
 @dataclass(frozen=True)
 class SmoothedLatents:
-    """What a sequence says of the latents of a `kvae` model, at S draws of a.
+    """The posterior of the latents of a `kvae` model given a sequence, at S draws of a.
 
     Args:
-        a: draws from the guide, (S, B, T, D), and at frames that are not encoded of a_t given the others and z.
-        z: a draw of z_{1:T} given the encoded a for each, (S, B, T, N).
-        mean, covariance: of z_t given these, (S, B, T, N) and (S, B, T, N, N).
-        lag_one: Cov(z_{t+1}, z_t) given these, (S, B, T - 1, N, N).
+        a: draws from the guide, (S, B, T, D); at frames that are not encoded, draws of a_t given the other a and z.
+        z: one draw of z_{1:T} given the encoded a of each draw, (S, B, T, N).
+        mean, covariance: moments of z_t given the encoded a, (S, B, T, N) and (S, B, T, N, N).
+        lag_one: Cov(z_{t+1}, z_t) given the encoded a, (S, B, T - 1, N, N).
         weights: alpha_t, (S, B, T, K).
     """
 
@@ -409,21 +411,21 @@ class SmoothedLatents:
 
 
 def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLatents:
-    """The exact posterior of z given draws of a; reparameterised, so that gradients flow.
+    """Return the exact posterior of z given draws of a; draws are reparameterised, so that gradients flow.
 
-    Padded steps of a ragged batch are 0, and leave the others as they are alone.
+    Padded steps of a ragged batch are 0 and do not affect the other steps.
 
     Args:
-        model: built by `KVAE`.
-        batch: see `DynamicalVAE.model`.
-        samples: S.
+        model: model built by `KVAE`.
+        batch: batch as in `DynamicalVAE.model`.
+        samples: S, number of samples.
 
     Raises:
-        ValueError: a model without a Kalman network, or no samples.
+        ValueError: if the model has no Kalman network, or `samples` is less than 1.
     """
     network = model.generator["a"].network if "a" in model.generator else None
     if not isinstance(network, KalmanNetwork):
-        raise ValueError(f"smoothing needs the chain of a kvae model, but this one is {model.generative.text}")
+        raise ValueError(f"smoothing needs the chain of a kvae model, but this model is {model.generative.text}")
     if samples < 1:
         raise ValueError(f"samples is at least 1, got {samples}")
     data = {name: repeat(value, samples) for name, value in model.read(batch).items()}

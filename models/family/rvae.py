@@ -1,11 +1,12 @@
-"""The recurrent VAE, causal and non-causal: independent latents, all of which a frame may read.
+"""Recurrent VAE, causal and non-causal: frames read the whole sequence of independent latents or its past.
 
     p(z_t) p(x_t | z_{<=t})        q(z_t | z_{<t}, x_{t:T})        causal
     p(z_t) p(x_t | z_{1:T})        q(z_t | z_{<t}, x_{1:T})        non-causal
 
-Leglaive et al., 2020, arXiv 1910.10942; layers of the public implementation of Girin et al., 2021, arXiv 2008.12595.
-"Causal" is the generative model; its guide reads the future. Recurrent states and nothing else: one over z for the
-decoder (and a backward one, non-causal), one over z_{<t} and one or two over x for the guide, none shared.
+Leglaive et al., 2020, arXiv 1910.10942. The layers are from the public implementation of Girin et al., 2021, arXiv
+2008.12595. "Causal" refers to the generative model; its guide reads the future. All layers are recurrent and none is
+shared. The decoder has a forward network over z and, if non-causal, a backward one. The guide has one network over
+z_{<t} and one or two over x.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from ..method import LatentMethod
 
 @dataclass(frozen=True)
 class CausalRVAE(LatentMethod):
-    """See the file.
+    """A causal recurrent VAE.
 
     Args:
-        width: of the recurrent states.
-        hidden: widths of a perceptron between these and each distribution.
+        width: width of the recurrent states.
+        hidden: widths of a perceptron between the states and each distribution.
     """
 
     name = "rvae-causal"
@@ -39,17 +40,17 @@ class CausalRVAE(LatentMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """A recurrent state for each variable and direction."""
+        """Return recurrent networks with one state for each variable and direction."""
         return {"default": Recurrent(self.width, hidden=self.hidden, separate=True)}
 
 
 @dataclass(frozen=True)
 class NonCausalRVAE(CausalRVAE):
-    """See the file.
+    """A non-causal recurrent VAE.
 
     Args:
-        width: of the recurrent states.
-        hidden: widths of a perceptron between these and each distribution.
+        width: width of the recurrent states.
+        hidden: widths of a perceptron between the states and each distribution.
     """
 
     name = "rvae-noncausal"

@@ -1,10 +1,11 @@
-"""The stochastic recurrent neural network: a deterministic state of the data's past beside a Markov chain of latents.
+"""Stochastic recurrent neural network: a deterministic state of past data and a Markov chain of latents.
 
     p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)        q(z_t | z_{t-1}, x_{1:T})
 
-Fraccaro et al., 2016, arXiv 1605.07571; layers of the public implementation of Girin et al., 2021, arXiv 2008.12595.
-The three factors share the recurrent state h_t of x_{<t}; the guide's backward network reads h_t and x_t, and alone
-joins z_{t-1}. The paper's residual posterior mean is left out, as in the public implementation.
+Fraccaro et al., 2016, arXiv 1605.07571. The layers are from the public implementation of Girin et al., 2021, arXiv
+2008.12595. The three factors share the recurrent state h_t of x_{<t}. The guide's backward network reads h_t and x_t;
+in the guide, only its state is joined with z_{t-1}. As in the public implementation, the paper's residual posterior
+mean is omitted.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from ..method import LatentMethod
 
 @dataclass(frozen=True)
 class SRNN(LatentMethod):
-    """See the file.
+    """A stochastic recurrent neural network.
 
     Args:
-        width: of the recurrent states.
-        embed: of the dense layer before them.
-        hidden: widths of the perceptron after them in prior and guide.
+        width: width of the recurrent states.
+        embed: width of the dense layer before the recurrent networks.
+        hidden: widths of the perceptron after the recurrent networks in prior and guide.
         decoder: widths of the decoder.
     """
 
@@ -42,17 +43,17 @@ class SRNN(LatentMethod):
     embed: Extra = 64
     hidden: tuple[Size, ...] = (32,)
     decoder: tuple[Size, ...] = (64,)
-    self_feeding: Share | None = None
+    scheduled_sampling: Share | None = None
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """A recurrent network for each factor; `build` ties their forward states."""
+        """Return a recurrent network for each factor; `build` ties their forward states."""
         around = Recurrent(self.width, embed=self.embed, hidden=self.hidden)
         return {"p(z)": around, "p(x)": replace(around, hidden=self.decoder), "q(z)": replace(around, stack=True)}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model, with one h_t for its three factors; a guide that reads indicators has one of its own."""
+        """Return the model, whose three factors share h_t; a guide that reads indicators has its own state."""
         model = super().build(data)
         sides = model.generator["x"], *(() if model.indicators else (model.encoder["z"],))
         tie(model.generator["z"].network, *(conditional.network for conditional in sides))

@@ -1,11 +1,11 @@
-"""The stochastic recurrent network: independent latents drive a recurrent network that generates the data.
+"""Stochastic recurrent network: independent latents drive a recurrent network that generates the data.
 
     p(z_t) p(x_t | x_{<t}, z_{<=t})        q(z_t | x_{<=t})
 
-Bayer and Osendorfer, 2014, arXiv 1411.7610; layers of the public implementation of Girin et al., 2021, arXiv
-2008.12595, whose guide reads x_t too (the paper's read x_{<t}). Guide and model share nothing: each has a recurrent
-state of its own, over dense features of what it reads. All factors are evaluated at all steps at once. The guide misses
-z_{<t} and x_{>t}.
+Bayer and Osendorfer, 2014, arXiv 1411.7610. The layers are from the public implementation of Girin et al., 2021, arXiv
+2008.12595. Its guide also reads x_t, whereas the paper's guide reads x_{<t}. Guide and model share no parameters: each
+has its own recurrent state over dense features of its parents. All factors are evaluated at all steps at once. The
+guide ignores z_{<t} and x_{>t}.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from ..method import LatentMethod
 
 @dataclass(frozen=True)
 class STORN(LatentMethod):
-    """See the file.
+    """A stochastic recurrent network.
 
     Args:
-        width: of the recurrent states.
-        embed: of the dense layer on x; 0 for none.
-        embed_latent: of the dense layer on z; 0 for none.
+        width: width of the recurrent states.
+        embed: width of the dense layer on x; 0 for none.
+        embed_latent: width of the dense layer on z; 0 for none.
         hidden: widths of the perceptron after the guide's state.
     """
 
@@ -40,11 +40,11 @@ class STORN(LatentMethod):
     embed: Extra = 64
     embed_latent: Extra = 32
     hidden: tuple[Size, ...] = (32,)
-    self_feeding: Share | None = None
+    scheduled_sampling: Share | None = None
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """A recurrent network for the guide, another for the data."""
+        """Return a recurrent network for the guide and another for the data."""
         layers = {"x": self.embed, "z": self.embed_latent}
         extract = {name: (width,) for name, width in layers.items() if width}
         return {

@@ -1,10 +1,10 @@
-"""The VAE, frame by frame: what is left of a dynamical VAE without dynamics.
+"""VAE applied to each frame independently: a dynamical VAE without dynamics.
 
     p(z_t) p(x_t | z_t)        q(z_t | x_t)
 
-Kingma and Welling, 2014, arXiv 1312.6114; as a member of the family: Girin et al., "Dynamical variational autoencoders:
-a comprehensive review", 2021, arXiv 2008.12595, whose public implementation has these layer sizes for motion. Nothing
-is shared between guide and model.
+Kingma and Welling, 2014, arXiv 1312.6114. Girin et al., "Dynamical variational autoencoders: a comprehensive review",
+2021, arXiv 2008.12595, treat it as a member of the family. The layer sizes are from their public implementation for
+motion. Guide and model share no parameters.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ..method import LatentMethod
 
 @dataclass(frozen=True)
 class VAE(LatentMethod):
-    """See the file.
+    """A VAE of single frames.
 
     Args:
-        hidden: widths of the encoder; the decoder has them in reverse.
+        hidden: widths of the encoder; the decoder has them in reverse order.
     """
 
     name = "vae"
@@ -36,5 +36,5 @@ class VAE(LatentMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Perceptrons, frame by frame."""
+        """Return perceptrons that act on single frames."""
         return {"q(z)": Dense(self.hidden), "p(x)": Dense(self.hidden[::-1])}

@@ -1,4 +1,4 @@
-"""The five papers on human motion, and what several methods of motion share."""
+"""The methods of five papers on human motion, and code that several of them share."""
 
 from typing import TYPE_CHECKING
 

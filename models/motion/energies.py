@@ -1,11 +1,17 @@
-"""What methods share that learn from energies of whole motions: their options, and the model that scores its samples.
+"""Methods that learn from energies of whole motions: their common options, and the model that scores its samples.
 
-Several samples of a window are drawn together. The energies say that the best of them is near the truth and that the
-best is near each pseudo ground truth, that the samples of a body part differ, that they keep the limbs' lengths, stay
-within the joints' angles, and look like poses to a prior. Source: GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422).
+Several samples of a window are drawn together. The energies penalise
 
-Ours: a model may see every window turned so that the last observed pose faces one way, which helps on small sets; and
-it may see and make directions of bones, whose lengths then stay. The energies are of positions in either case.
+* the error of the best sample, relative to the truth and to each pseudo ground truth;
+* samples of a body part that are alike;
+* limbs that change their lengths, and joint angles outside their limits;
+* poses that are unlikely under a pose prior.
+
+Source: GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422).
+
+Our additions: a model may see every window rotated so that the last observed pose faces one way, which helps on small
+data sets. It may also read and predict directions of bones, so that their lengths are constant. The energies always
+compare positions.
 """
 
 from __future__ import annotations
@@ -23,7 +29,7 @@ from ...data.views import View, Views
 from ...motion import Bones, Heading, Skeleton, Windows
 from ...motion.geometry.angles import AngleLimits, angle_names, estimate_angle_limits
 from ...motion.geometry.views import LENGTHS
-from ...motion.judges.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
+from ...motion.metric_models.pose_prior import PosePriorModel, fit_pose_prior, load_pose_prior
 from ...motion.scoring import energies
 from ...motion.scoring.truths import PseudoTruths, WithPseudoTruths
 from ...options import Amount, Count, Positive, Range, Size
@@ -37,23 +43,23 @@ class EnergyMethod(PoseMethod):
 
     Args:
         reconstruction: weight of the squared error of the best sample.
-        multimodal: weight of that to the pseudo ground truths.
-        diversity: weight of the likeness of a part's samples, for each part.
-        diversity_scale: metres, L1, over which samples of a part are alike, for each part.
+        multimodal: weight of the squared error of the best sample to each pseudo ground truth.
+        diversity: weight of the similarity of a part's samples, for each part.
+        diversity_scale: length scale of this similarity, in metres of L1 distance, for each part.
         limb: weight of the squared error of the limbs' lengths.
-        angles: weight of the violation of the angles' limits.
+        angles: weight of the violation of the joint-angle limits.
         pose_prior: weight of the poses' energy under a pose prior.
         pose_prior_run: run directory of a fitted pose-prior; "" to fit one first.
-        angle_quantile: share of the training poses that an angle's limit leaves out at each end.
-        pseudo_threshold: metres between last observed poses, within which futures are exchanged.
-        pseudo_minimum: metres, mean over joints, that such a future keeps from the true one.
-        pseudo_most: largest number of them for a window.
-        pool_stride: frames between the windows that they are taken from.
-        bones: see and make the directions of bones, whose lengths are those that the observed frames have: no future of
-            this method stretches a bone. There is no density then and no bound, and windows have to be complete.
-        heading: turn every window so that its last observed pose faces one way, and the futures back. Whatever reads
-            the frames before then knows of that one, and bounds are those of turned windows, whose heading nothing
-            scores: they compare with those of models that turn them too, and with no others.
+        angle_quantile: share of the training poses beyond an angle's limit, at each end.
+        pseudo_threshold: largest distance between last observed poses of windows that exchange futures, in metres.
+        pseudo_minimum: smallest distance of a pseudo ground truth from the true future, in metres, mean over joints.
+        pseudo_most: largest number of pseudo ground truths of a window.
+        pool_stride: frames between the windows that provide pseudo ground truths.
+        bones: whether to read and predict directions of bones, so that futures keep the bone lengths of the observed
+            frames. The model then has no density and no bound, and windows must be complete.
+        heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures
+            back. All earlier frames then depend on that pose. Bounds score rotated windows and ignore the heading:
+            compare them only with bounds of models that rotate too.
     """
 
     weights: ClassVar[tuple[str, ...]] = ("reconstruction", "multimodal", "diversity", "limb", "angles", "pose_prior")
@@ -75,10 +81,10 @@ class EnergyMethod(PoseMethod):
     heading: bool | None = None
 
     def start(self, model: EnergyModel, windows: Windows) -> None:
-        """Has a model take the limits of the angles and the pose prior.
+        """Set the limits of the angles and the pose prior of a model.
 
         Raises:
-            ValueError: a pose prior of another skeleton.
+            ValueError: if the pose prior has another skeleton.
         """
         if model.limits is not None:
             limits = estimate_angle_limits(windows.poses(), windows.skeleton, self.angle_quantile)
@@ -91,7 +97,7 @@ class EnergyMethod(PoseMethod):
             model.pose_prior.load_state_dict(prior.state_dict())
 
     def scored(self, windows: Windows) -> Source:
-        """Windows with their pseudo ground truths, if these count; of a method with no option left open."""
+        """Return windows with pseudo ground truths if these have a weight; all options must be resolved."""
         method: Any = self
         if not method.multimodal:
             return windows
@@ -103,14 +109,14 @@ class EnergyMethod(PoseMethod):
 class EnergyModel(DynamicalVAE):
     """A model of windows whose samples are scored by energies.
 
-    Batches may hold "pseudo" (B, M, T, D) and "valid" (B, M): further futures of the windows.
+    Batches may contain "pseudo" (B, M, T, D) and "valid" (B, M): further futures of the windows.
 
     Args:
-        method: with no option left open.
-        skeleton: of poses whose root was dropped, D = 3 (J - 1).
-        observed: O, frames before the present.
-        views: of the windows, once these are turned.
-        **options: of `DynamicalVAE`.
+        method: method whose options are all resolved.
+        skeleton: skeleton of poses without root, D = 3 (J - 1).
+        observed: O, number of observed frames.
+        views: views applied to windows after their rotation.
+        **options: arguments of `DynamicalVAE`.
     """
 
     extras: ClassVar[tuple[str, ...]] = ("pseudo", "valid")
@@ -132,12 +138,12 @@ class EnergyModel(DynamicalVAE):
         self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
 
     def best(self, samples: Tensor, truth: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """The energies of the best sample, (B,) each; those of weight 0 are left out.
+        """Return the energies of the best sample that have a weight, (B,) each.
 
         Args:
-            samples: (S, B, T, D), the frames that count, of positions that are turned as the networks see motion.
-            truth: (B, T, D), likewise; NaN where it was not observed.
-            batch: with "pseudo" and "valid", where there are further futures, whose last T frames count.
+            samples: positions (S, B, T, D) of the frames to score, rotated as the networks see them.
+            truth: (B, T, D), rotated likewise; NaN where it was not observed.
+            batch: batch, with "pseudo" and "valid" if there are further futures, whose last T frames are scored.
         """
         found: dict[str, Tensor] = {}
         if self.method.reconstruction:
@@ -150,12 +156,12 @@ class EnergyModel(DynamicalVAE):
         return found
 
     def realism(self, samples: Tensor, truth: Tensor, judged: Tensor) -> dict[str, Tensor]:
-        """The energies of the limbs' lengths, the angles and the pose prior, (B,) each; as in `best`.
+        """Return the energies of limb lengths, angles and pose prior that have a weight, (B,) each.
 
         Args:
-            samples: (S, B, T, D), whose limbs count in all frames.
-            truth: (B, T, D), whose first frame, of those that have the most joints, has the right lengths.
-            judged: (S, B, T, D), those whose poses count.
+            samples: (S, B, T, D), whose limb lengths are scored in all frames.
+            truth: (B, T, D); the first of the frames with the most joints defines the true lengths.
+            judged: (S, B, T, D), frames whose angles and poses are scored.
         """
         found: dict[str, Tensor] = {}
         if self.method.limb:
@@ -163,30 +169,30 @@ class EnergyModel(DynamicalVAE):
             reference = truth.take_along_dim(fullest[:, None, None], 1).squeeze(1)
             found["limb"] = energies.limb_length(samples, reference, self.skeleton)
         if self.limits is not None:
-            if self.angles is None or self.angles.low is not self.angle_low:  # checked once, which is waited for
+            if self.angles is None or self.angles.low is not self.angle_low:  # once: checks synchronise
                 self.angles = AngleLimits(self.limits, self.angle_low, self.angle_high)
             found["angles"] = energies.joint_angles(judged, self.angles, self.skeleton)
         if self.pose_prior is not None:
-            offset = int(torch.randint(min(3, judged.shape[2]), ()))  # every third frame, another third at every step
+            offset = int(torch.randint(min(3, judged.shape[2]), ()))  # every third frame, randomly shifted at each step
             found["pose_prior"] = energies.pose_prior_energy(judged[:, :, offset::3], self.pose_prior, self.skeleton)
         return found
 
     def turned(self, x: Tensor) -> Tensor:
-        """Windows (..., T, D) turned as the networks see them."""
+        """Return windows (..., T, D) rotated as the networks see them."""
         return x if self.heading is None else self.heading.face(x)
 
     def positions(self, values: Mapping[str, Tensor], data: Batch) -> Batch:
-        """Positions (..., B, T, D), turned, from x or all its parts as the networks see them."""
+        """Return rotated positions (..., B, T, D) from x or all its parts as the networks see them."""
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
         return self.view.inverse(Batch(values) | lengths)
 
     def _turned(self, others: Tensor, batch: Batch) -> Tensor:
-        """Other futures (B, M, T, D) of the windows of a batch, turned as these were."""
+        """Return other futures (B, M, T, D) of the windows of a batch, rotated like the windows."""
         if self.heading is None:
             return others
         return self.heading(Batch({WHOLE: others.transpose(0, 1)}), batch)[WHOLE].transpose(0, 1)
 
     def seen(self, x: Tensor, batch: Batch) -> Tensor:
-        """x (B, T, D) of a batch as it was read, NaN where it was not observed."""
+        """Return x (B, T, D) as read from a batch, NaN where it was not observed."""
         mask = batch.mask(self.view.history or WHOLE)
         return x if mask is None else torch.where(mask, x, torch.nan)

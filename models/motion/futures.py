@@ -1,12 +1,12 @@
-"""What methods share that make futures of a body from the poses observed of it.
+"""Base of the methods that predict futures of a body from its observed poses.
 
-    h_{1:O} the observed poses, x_{1:T} those that follow
+    h_{1:O} the observed poses, x_{1:T} the poses that follow
 
-Their programs are of the future alone, given the past (`dvae.data.views.Past`): a forecast, which knows no future, has
+The programs model only the future, given the past (`dvae.data.views.Past`): a forecast, which knows no future, draws
 its latents from the prior. Poses are positions relative to the pelvis, in metres. The likelihood is the squared error
-of the papers, beside which the KL has the weight beta, and decoders read what they have made, in training too.
+of the papers, and the KL has the weight beta. Decoders read their own output, in training too.
 
-Ours: windows may be turned so that the last observed pose faces one way, which helps on small sets.
+Our addition: windows may be rotated so that the last observed pose faces one way, which helps on small data sets.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing_extensions import override
 from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
 from ...data.views import Past, Views
-from ...distributions import FixedNormal, LawSpec
+from ...distributions import DistributionSpec, FixedNormal
 from ...inference.training.objectives import Evidence, Objective
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
@@ -34,12 +34,12 @@ from ...motion.scoring import energies
 from ...networks import Input, Network
 from ...networks.base import perceptron, share_modules
 from ...networks.cells import GRU
-from ...networks.loop import once
+from ...networks.loop import memoize
 from ...networks.recurrent import gru_cell
 from ...options import Amount, Size
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
-from ...program.rollout import Rollout, SelfFeeding
+from ...program.rollout import Rollout, ScheduledSampling
 from .poses import PoseMethod, table, without_gaps
 
 HISTORY = "h"
@@ -47,15 +47,15 @@ HISTORY = "h"
 
 @dataclass(frozen=True)
 class FutureMethod(PoseMethod):
-    """A method that makes futures.
+    """A method that predicts futures.
 
     Args:
         latent: size of the latent.
-        beta: weight of the KL, beside squared errors in square metres. None for the papers' with the poses of Human3.6M
-            and HumanEva, and for Human3.6M's with others.
-        join: weight of the squared distance from the last observed pose to the first one that is made.
-        heading: turn every window so that its last observed pose faces one way, and the futures back. None for not with
-            the papers' poses, of Human3.6M and HumanEva, and for so with others whose left and right are known.
+        beta: weight of the KL, relative to squared errors in square metres. By default the papers' for Human3.6M and
+            HumanEva, and the one of Human3.6M for other poses.
+        join: weight of the squared distance between the last observed pose and the first predicted one.
+        heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures
+            back. By default off for Human3.6M and HumanEva, and on for other skeletons with known left and right.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = table(
@@ -75,52 +75,52 @@ class FutureMethod(PoseMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Where left and right are unknown, so are headings."""
+        """Return the preset, without headings if left and right of the skeleton are unknown."""
         found = super().preset(skeleton)
         return found if skeleton.left and skeleton.right else {**found, "heading": False}
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """x is normal with variance 1/2, minus whose log-density is the squared error."""
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return a normal distribution of x with variance 1/2, whose negative log-density is the squared error."""
         return {"p(x)": FixedNormal(scale=sqrt(0.5), error_weight=True)}
 
     @override
     def build(self, data: Any) -> FutureModel:
-        """The model for windows of poses relative to the pelvis.
+        """Return the model for windows of poses relative to the pelvis.
 
-        Of sizes alone it is one whose batches hold h, two frames of the size of x, beside x.
+        From sizes alone, it is a model whose batches contain x and h, two frames of the size of x.
 
         Raises:
-            ValueError: poses with a root.
+            ValueError: if the poses have a root.
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            return self.filled(self.presets[HUMAN36M.name])._built(schema.size(WHOLE), 2)
+            return self.with_presets(self.presets[HUMAN36M.name])._built(schema.size(WHOLE), 2)
         schema = self.poses(schema)
-        method, observed = self.suited(schema), schema.protocol.observed
+        method, observed = self.resolve_defaults(schema), schema.protocol.observed
         return method._built(schema.size(WHOLE), observed, schema.skeleton)
 
     def kind(self) -> type[FutureModel]:
-        """The class of the model."""
+        """Return the class of the model."""
         return FutureModel
 
     def _built(self, size: int, frames: int, skeleton: Skeleton | None = None) -> FutureModel:
         views = [Heading(skeleton, frames)] if skeleton and self.heading else []
-        given = self.described({WHOLE: size, HISTORY: frames * size})
+        given = self.model_arguments({WHOLE: size, HISTORY: frames * size})
         model = self.kind()(self, frames, skeleton, view=Views(*views, Past(HISTORY, frames)), **given)
         networks = [side[name].network for side in (model.encoder, model.generator) for name in side]
         share_modules([network for network in networks if hasattr(network, "past")], "past")
-        model.feeding = SelfFeeding(1.0, gradient=True)
+        model.feeding = ScheduledSampling(1.0, gradient=True)
         return model
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """Minimises squared errors and the weighted KL; the best weights are those of the lowest loss."""
-        return Recipe(train, validation, [Stage(steps, self.suited(train).objective())], 1.0)
+        """Return one stage that minimises squared errors and the weighted KL; the best weights have the lowest loss."""
+        return Recipe(train, validation, [Stage(steps, self.resolve_defaults(train).objective())], 1.0)
 
     def objective(self) -> Objective:
-        """What training minimises."""
-        assert self.beta is not None  # of a method that is suited
+        """Return the objective of training."""
+        assert self.beta is not None  # set by resolve_defaults
         return Evidence(kl_weight=self.beta, energy_weights={"join": self.join} if self.join else {}, select="loss")
 
 
@@ -128,10 +128,10 @@ class FutureModel(DynamicalVAE):
     """A model of futures given the past.
 
     Args:
-        method: with no option left open.
-        frames: O, that are observed.
-        skeleton: of the poses; None where it is not known.
-        **options: of `DynamicalVAE`.
+        method: method whose options are all resolved.
+        frames: O, number of observed frames.
+        skeleton: skeleton of the poses; None if unknown.
+        **options: arguments of `DynamicalVAE`.
     """
 
     def __init__(self, method: FutureMethod, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
@@ -140,7 +140,7 @@ class FutureModel(DynamicalVAE):
 
     @override
     def read(self, batch: AnyBatch | None, **options: Any) -> Batch:
-        """The batch, whose observed frames have no gaps (see `without_gaps`)."""
+        """Return the batch, with missing entries of observed frames filled in by `without_gaps`."""
         if (
             self.skeleton
             and isinstance(batch, Mapping)
@@ -155,7 +155,7 @@ class FutureModel(DynamicalVAE):
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """How far the first pose is from the last observed one; and the best of several draws from what happened."""
+        """Return the distance of the first pose from the last observed one, and the error of the best draw."""
         if WHOLE not in data or not (self.method.join or draws):
             return {}
         size = rollout.batch // rollout.draws
@@ -170,15 +170,15 @@ class FutureModel(DynamicalVAE):
 
 
 class FedBackNetwork(Network):
-    """Features of x_t: states of a recurrent network over what is known at t and x_{t-1}, and a perceptron on them.
+    """Features of x_t: states of a recurrent network over x_{t-1} and the inputs known at t, and a perceptron on them.
 
     Args:
         inputs: parents of x.
-        known: numbers that are known at each step, beside x_{t-1}.
-        size: D.
-        width: of the states.
+        known: number of inputs known at each step, without x_{t-1}.
+        size: D, size of x.
+        width: width of the states.
         hidden: widths of the perceptron.
-        own: name and size of a latent of each step, which the perceptron reads beside the state; no other step does.
+        own: name and size of a local latent, which the perceptron reads together with the state of its step.
     """
 
     def __init__(
@@ -196,15 +196,15 @@ class FedBackNetwork(Network):
         self.behind = perceptron((width + latent, *hidden), "tanh")
 
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
-        """What is known at each step, the pose before the first (B, D), and the first state (B, W).
+        """Return the inputs known at each step, the pose before the first (B, D), and the first state (B, W).
 
-        The first is (B, T, known), or (B, 1, known) where it is the same at all steps.
+        The inputs are (B, T, known), or (B, 1, known) if they are the same at all steps.
         """
         raise NotImplementedError
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """Padding at the end changes nothing before it."""
+        """Return the features of all steps; padding at the end does not affect the steps before it."""
         known, first, state = self.known(parents, length)
         before = torch.cat([first[:, None], parents[WHOLE][:, : length - 1]], 1)
         states = self.cell(torch.cat([known.expand(-1, length, -1), before], -1), state[None].contiguous())[0]
@@ -235,8 +235,8 @@ class LastState(nn.Module):
     """The last state (B, W) of a recurrent network over poses.
 
     Args:
-        size: D.
-        width: W.
+        size: D, size of a pose.
+        width: W, width of the state.
     """
 
     def __init__(self, size: int, width: int) -> None:
@@ -245,7 +245,7 @@ class LastState(nn.Module):
         self.network = GRU(size, width, batch_first=True)
 
     def forward(self, poses: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Of (B, T, D), or of (B, T D), frame after frame; of the first steps of each where there are lengths."""
+        """Return the last state for poses (B, T, D), or (B, T D) frame by frame, at `lengths` if given."""
 
         def last() -> Tensor:
             states, final = self.network(poses.reshape(len(poses), -1, self.size))
@@ -254,4 +254,4 @@ class LastState(nn.Module):
             found: Tensor = states.take_along_dim((lengths - 1)[:, None, None], 1)[:, 0]
             return found
 
-        return once(self, [poses] if lengths is None else [poses, lengths], last)
+        return memoize(self, [poses] if lengths is None else [poses, lengths], last)

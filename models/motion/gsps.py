@@ -1,20 +1,25 @@
-"""GSPS: diverse futures of a moving body, part after part, each a function of its own latent and of the parts before.
+"""GSPS: diverse futures of a moving body, part by part, each a function of its own latent and of earlier parts.
 
 With the parts lower and upper, and h the motion observed up to frame O,
 
     p(a) p(b) p(lower_t | h_{1:O}, a) p(upper_t | h_{1:O}, lower_{1:T}, b)        q(a) q(b)
 
-Every part is a point mass: a trajectory that a residual graph convolutional network makes, all steps at once, as its
-first cosine coefficients. There is no inference network. The guide is the prior, so that every divergence is exactly
-zero and what is minimised is the expected energy of futures that are drawn together for each window: several draws of
-a, and for each of them several of b. The energies say that the best of these futures is near the true one and that the
-best is near each pseudo ground truth, that the futures of a part differ, that they begin like the past, keep the limbs'
-lengths, stay within the joints' angles, and look like poses to a prior.
+Every part is a point mass: a residual graph convolutional network predicts the first cosine coefficients of its
+trajectory, all steps at once. The guide is the prior instead of an inference network, so that every KL divergence is
+exactly zero. Training minimises the expected energy of futures that are drawn together for each window: several draws
+of a, and for each of them several draws of b. The energies penalise
 
-A fixed latent, or a fixed motion of the first parts, leaves those parts as they are while the others vary.
+* the error of the best future, relative to the true future and to each pseudo ground truth;
+* futures of a part that are alike;
+* futures that differ from the past in the observed frames;
+* limbs that change their lengths, and joint angles outside their limits;
+* poses that are unlikely under a pose prior.
 
-Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the layers, weights and normalisations of its public code. Ours: the
-generator may see every window turned so that the last observed pose faces one way, which the presets for small sets do.
+With a fixed latent, or a fixed motion of the first parts, these parts are constant while the others vary.
+
+Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the layers, weights and normalisations of its public code. Our
+addition: the generator may see every window rotated so that the last observed pose faces one way, as in the presets for
+small data sets.
 """
 
 from __future__ import annotations
@@ -34,7 +39,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import WHOLE, Batch
-from ...data.sequences import bridged
+from ...data.sequences import interpolate_missing
 from ...data.views import History, Parts
 from ...distributions import Delta, Directions
 from ...factorization.notation import Factorization
@@ -59,24 +64,24 @@ PRESETS = table(
         "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
     },
 )
-"""Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
+"""Options by skeleton: the paper's; for other skeletons, at 30 frames a second, 15 observed and 60 predicted frames."""
 
 
 @dataclass(frozen=True)
 class GSPS(EnergyMethod):
-    """See the file. Options that are None are the paper's for Human3.6M and HumanEva-I, and smaller ones for others.
+    """Diverse futures, part by part. Defaults are the paper's for Human3.6M and HumanEva-I, and smaller for others.
 
-    What is given once for each part may be given as one number for all.
+    Options with one number for each part also accept one number for all parts.
 
     Args:
         latent: size of each part's latent.
-        parts: parts of the body in the order in which they are made: "lower" and "upper", or some of "torso",
+        parts: parts of the body, in the order of their prediction: "lower" and "upper", or some of "torso",
             "right_leg", "left_leg", "left_arm", "right_arm"; or new ones, such as "legs=right_leg+left_leg" or
             "head=Neck+Head".
-        coefficients: of the cosine transform, of the whole window.
+        coefficients: number of cosine coefficients of the whole window.
         width: features of a joint in the networks.
-        blocks: residual blocks in each.
-        draws: of each part's latent, in training, for each draw of the parts before.
+        blocks: residual blocks of each network.
+        draws: number of draws of each part's latent, in training, for each draw of the earlier parts.
         history: weight of the squared error in the observed frames.
     """
 
@@ -106,7 +111,7 @@ class GSPS(EnergyMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.parts:
-            raise ValueError(f"{self.name} makes the body part by part; name at least one part")
+            raise ValueError("parts is empty; name at least one part of the body")
         for name in ("draws", "diversity", "diversity_scale"):
             values = getattr(self, name)
             if values is not None and len(values) not in (1, len(self.parts)):
@@ -116,7 +121,7 @@ class GSPS(EnergyMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        """The generative model and the guide; here half of the steps count as observed."""
+        """Return the generative model and the guide; here half of the steps are observed."""
         generative = part_by_part(self.names, lambda length: max(1, length // 2))
         return generative, generative.prior_guide(self.names)
 
@@ -127,11 +132,14 @@ class GSPS(EnergyMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """For these parts."""
+        """Return the preset, adapted to these parts."""
         return {name: self._spread(name, value) for name, value in super().preset(skeleton).items()}
 
     def _spread(self, name: str, value: Any) -> Any:
-        """A preset for two parts, for the parts that there are: with no more futures, if each has two draws."""
+        """Return the preset of two parts adapted to these parts.
+
+        The number of futures does not increase unless that requires fewer than two draws per part.
+        """
         count = len(self.parts)
         if not isinstance(value, tuple) or count == len(value):
             return value
@@ -141,29 +149,29 @@ class GSPS(EnergyMethod):
 
     @override
     def build(self, data: Any) -> GSPSModel:
-        """The model for such windows.
+        """Return the model for windows of poses.
 
         Raises:
-            ValueError: poses with a root, or parts that are not those of the skeleton.
+            ValueError: if the poses have a root, or the skeleton does not have these parts.
         """
         schema = self.poses(data)
-        return GSPSModel(self.suited(schema), schema.skeleton, schema.protocol.observed, schema.frames)
+        return GSPSModel(self.resolve_defaults(schema), schema.skeleton, schema.protocol.observed, schema.frames)
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """One stage that minimises the weighted energies."""
-        method = self.suited(train)
+        """Return one stage that minimises the weighted energies."""
+        method = self.resolve_defaults(train)
         stages = [Stage(steps, method.objective())]
         return Recipe(method.scored(train), validation, stages, prepare=partial(method.start, windows=train))
 
     def objective(self) -> Objective:
-        """The weighted energies, summed; in `Evidence`'s unit, per frame. There is no likelihood, and no bound.
+        """Return the sum of the weighted energies, per frame as in `Evidence`, without a likelihood or bound.
 
         Raises:
-            ValueError: weights that are still open, which the skeleton decides.
+            ValueError: if weights that depend on the skeleton are unset.
         """
         if self.diversity is None:
-            raise ValueError("the weights depend on the skeleton; take those of method.suited(windows)")
+            raise ValueError("the weights depend on the skeleton; call method.resolve_defaults(windows) first")
         weights = {name: getattr(self, name) for name in WEIGHTS}
         diversity = _each(self.diversity, self.parts)
         weights |= {f"diversity_{name}": weight for name, weight in zip(self.names, diversity, strict=True)}
@@ -177,15 +185,15 @@ WEIGHTS = ("reconstruction", "multimodal", "history", "limb", "angles", "pose_pr
 class GSPSModel(EnergyModel):
     """The model of GSPS.
 
-    On a batch of whole windows its program draws futures jointly and scores them by energies, with "pseudo"
-    (B, M, T, D) and "valid" (B, M) in the batch where there are further futures; on observed frames it goes on from
-    them.
+    On a batch of whole windows, the program draws futures jointly and scores them by energies. The batch contains
+    "pseudo" (B, M, T, D) and "valid" (B, M) if there are further futures. On observed frames alone, the program
+    continues from them.
 
     Args:
-        method: with no option left open.
-        skeleton: of poses whose root was dropped, D = 3 (J - 1).
-        observed: O, frames that the networks see.
-        length: T, frames that they make.
+        method: method whose options are all resolved.
+        skeleton: skeleton of poses without root, D = 3 (J - 1).
+        observed: O, number of frames that the networks read.
+        length: T, number of frames that the networks predict.
     """
 
     def __init__(self, method: Any, skeleton: Skeleton, observed: int, length: int):
@@ -203,14 +211,14 @@ class GSPSModel(EnergyModel):
             inference=None,
             sizes={HISTORY: 3 * count, **dict.fromkeys(codes, method.latent), **{n: len(p) for n, p in parts.items()}},
             network={f"p({name})": GraphConv(everything, name, length, *shape) for name in parts},
-            laws={f"p({name})": Directions(project=False) if method.bones else Delta() for name in parts},
+            distributions={f"p({name})": Directions(project=False) if method.bones else Delta() for name in parts},
         )
         self.length = length
         self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
 
     @override
     def model(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
-        """Of whole windows, with energies. Values are as the networks see them, turned."""
+        """Run the generative program, with energies for whole windows. Values are rotated as the networks see them."""
         return super().model(batch, **self._drawing(batch, options))
 
     @override
@@ -218,14 +226,14 @@ class GSPSModel(EnergyModel):
         return super().guide(batch, **self._drawing(batch, options))
 
     def _drawing(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
-        """The options, with several draws where the batch holds whole windows, a truth to score futures by."""
+        """Return the options, with several draws if the batch has whole windows, whose truth scores futures."""
         given = batch.get(WHOLE) if isinstance(batch, Mapping) else None
         whole = given is not None and given.shape[1] == self.length and options.get("length") is None
         return {**({"draws": self.draws} if whole else {}), **options}
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """Those of whole windows."""
+        """Return the energies of whole windows."""
         if not draws:
             return {}
         truth = self.positions({WHOLE: self.seen(data[HISTORY], data)}, data)[WHOLE]
@@ -234,16 +242,16 @@ class GSPSModel(EnergyModel):
         return self.energies(values, truth, data)
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """The energies of futures that were drawn together, (B,) each; those of weight 0 are left out.
+        """Return the energies, if they have a weight, of futures that were drawn together, (B,) each.
 
         Args:
-            values: name to rows, draw by draw, of a run with `draws`.
+            values: mapping from name to rows, draw by draw, of a rollout with `draws`.
             truth: (B, T, D), NaN where it was not observed.
-            batch: as it was read, with "pseudo" and "valid" where there are further futures.
+            batch: batch after `read`, with "pseudo" and "valid" if there are further futures.
         """
         method, past, size = self.method, self.frames, len(truth)
         samples = values[WHOLE].unflatten(0, (-1, size))  # (S, B, T, D)
-        ahead = samples[:, :, past:]  # once: each cut of its own has a gradient of the whole samples' size
+        ahead = samples[:, :, past:]  # once: each slice's gradient has the full size
         found = self.best(ahead, truth[:, past:], batch)
         if method.history:
             found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
@@ -254,14 +262,16 @@ class GSPSModel(EnergyModel):
         for i, rows in enumerate(accumulate(draws, mul)):
             if not weights[i]:
                 continue
-            motions = values[names[i]][: rows * size, past:].unflatten(0, (draws[i], -1))  # those that share the rest
+            motions = values[names[i]][: rows * size, past:].unflatten(
+                0, (draws[i], -1)
+            )  # futures that share earlier parts
             likeness = energies.pairwise_diversity(motions, scales[i])
             found[f"diversity_{names[i]}"] = likeness.unflatten(0, (-1, size)).mean(0)
         return found
 
     @override
     def read(self, batch: AnyBatch | None, **options: Any) -> Batch:
-        """The batch, whose observed frames have no gaps (see `without_gaps`)."""
+        """Return the batch, with missing entries of observed frames filled in by `without_gaps`."""
         data = super().read(batch, **options)
         mask = data.mask(HISTORY)
         if mask is None or mask.all():
@@ -272,17 +282,17 @@ class GSPSModel(EnergyModel):
     @torch.no_grad()
     @override
     def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
-        """At most as far as the networks' T frames, all of which a fixed part has.
+        """Forecast up to the T frames of the networks; a fixed part must have all of these frames.
 
         Raises:
-            ValueError: other observed frames than the networks see, or a horizon beyond what they make.
+            ValueError: if the batch has another number of observed frames, or the horizon is too long.
         """
         data, most = self.read(batch), self.length - self.frames
         past = data[HISTORY].shape[1]
         if past != self.frames or not 1 <= horizon <= most:
             raise ValueError(
-                f"this model sees {self.frames} frames and makes up to {most} more, but was given {past} frames and "
-                f"asked for {horizon}"
+                f"this model reads {self.frames} frames and predicts up to {most} more; got {past} frames and a "
+                f"horizon of {horizon}"
             )
         out = super().forecast(data, most, samples, **options)
         return {
@@ -302,7 +312,7 @@ class GSPSModel(EnergyModel):
 
         Args:
             batch: whole windows x (B, T, D) with a mask.
-            samples: S.
+            samples: S, number of samples.
             draw: ignored.
             options: options of `DynamicalVAE.impute`.
 
@@ -313,11 +323,11 @@ class GSPSModel(EnergyModel):
             ValueError: if the batch has no mask, or the windows have another length than the model.
         """
         if not isinstance(batch, Mapping) or (mask := Batch(batch).mask()) is None:
-            return super().impute(batch, samples, **options)  # which says so
+            return super().impute(batch, samples, **options)  # which raises
         if (length := batch[WHOLE].shape[1]) != self.length:
             raise ValueError(
-                f"{self.method.name} fills gaps in windows of {self.length} frames, not {length}; cut the motion so, "
-                "as `dvae impute` does without --clip"
+                f"{self.method.name} fills gaps in windows of {self.length} frames, not {length}; cut the motion into "
+                "such windows, as `dvae impute` does without --clip"
             )
         filled, count = [], prod(self.draws.values())
         for _ in range(samples):
@@ -325,18 +335,18 @@ class GSPSModel(EnergyModel):
             given, seen = torch.as_tensor(batch[WHOLE]).to(made), torch.as_tensor(mask).to(made.device)
             nearest = (made - given).square().masked_fill(~seen, 0.0).sum((2, 3)).argmin(0)
             best = made.take_along_dim(nearest[None, :, None, None], 0)[0]
-            filled.append(torch.where(seen, given, best + bridged(given - best, seen)))
+            filled.append(torch.where(seen, given, best + interpolate_missing(given - best, seen)))
         return {WHOLE: torch.stack(filled)}
 
     @torch.no_grad()
     @override
     def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
-        """The batch holds what was observed."""
+        """Draw futures of the observed motion in the batch."""
         return super().sample(n, self.length if length is None else length, batch)
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:
-    """The generative model of parts that are made in this order; `observed`: O of T steps."""
+    """Return the generative model of parts in this order; `observed` returns O for T steps."""
     text = " ".join(
         f"p({code}) p({name}_t | h_{{1:O}}, {''.join(f'{before}_{{1:T}}, ' for before in parts[:i])}{code})"
         for i, (code, name) in enumerate(zip(_codes(parts), parts, strict=True))
@@ -345,11 +355,11 @@ def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factor
 
 
 def _codes(parts: Sequence[str]) -> list[str]:
-    """The names of the parts' latents: a, b, ..., but for names that are taken."""
+    """Return the names of the parts' latents: a, b, ..., except names that are in use."""
     free = (letter for letter in ascii_lowercase if letter not in {HISTORY, WHOLE, *parts})
     return [code for code, _ in zip(free, parts, strict=False)]
 
 
 def _each(values: Sequence[Any], parts: Sequence[str]) -> Sequence[Any]:
-    """One value for each part, from one for all of them."""
+    """Return one value for each part; a single value applies to all."""
     return tuple(values) * len(parts) if len(values) == 1 else values

@@ -1,35 +1,38 @@
-"""HiT-DVAE, the hierarchical transformer dynamical VAE: a static latent for what lasts, local ones for what moves.
+"""HiT-DVAE, the hierarchical transformer dynamical VAE: a static latent per sequence and a local latent per step.
 
     p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)        q(w | x_{1:T}) q(z_t | x_{1:T}, w)
 
-Poses become features by graph convolutions over the joints, one set for the guide and one for the model. w sums up a
-short window by graph convolutions over its frames, z comes from a transformer's encoder, and the two generative factors
-attend to the past: z from x_{t-1} to z_{<t}, x from z_t to x_{<t}. The guide does not read z_{<t}, on which the exact
-posterior depends (`guide_past` adds it).
+Graph convolutions over the joints turn poses into features, with separate weights for guide and model. For w, graph
+convolutions over the frames summarise a short window. For z, the guide uses the encoder of a transformer. The two
+generative factors attend to the past: z from x_{t-1} to z_{<t}, x from z_t to x_{<t}. The guide ignores z_{<t},
+although the exact posterior depends on it (`guide_past` adds it).
 
-The paper does not maximise the evidence. It draws K motions of the guide's latents for each window and takes the best:
+The paper does not maximise the evidence. For each window it draws K motions from the guide and takes the best:
 
     L = lr min_k |x_k - x|^2 + lmm (the same to pseudo ground truths) + lz KL_z + lw KL_w + energies
 
-with means over time, KL_w whole, and the energies of GSPS (diversity, limbs, angles, pose prior) over all frames; in
-training the model soon reads its own output alone. The paper prints its squared errors as sums; means over time, which
-its weights beside those of GSPS speak for, are one reading of it, and what its weights mean depends on that. Both
-objectives are here: loss="best-of-many" and loss="evidence".
+Errors are means over time, KL_w is a sum, and the energies of GSPS (diversity, limbs, angles, pose prior) cover all
+frames. Early in training, the model begins to read only its own output. The paper prints its squared errors as sums.
+We read them as means over time, because its weights then agree with the weights of GSPS; the meaning of the weights
+depends on this choice. Both objectives are available: loss="best-of-many" and loss="evidence".
 
-Bie et al., 2022, arXiv 2204.01565. There is no public code. Ours where the paper is silent or cannot be followed:
+Bie et al., 2022, arXiv 2204.01565. There is no public code. Our choices where the paper gives no detail or did not
+work:
 
-* One layer a factor; linear biases for positions (`networks.Attention`), so that motions may be longer than in
-  training; a learned start token in place of the first step's past, so that x_1 and z_1 are part of the model.
-* The mean of x_t keeps half of x_{t-1} (`residual`): without that the first predicted frame is off by twice as much,
-  and whole offsets diverge. Poses are standardised: in metres the networks take several times as long to learn what
-  poses have in common. No normalisation over the batch.
-* With best-of-many, the density of x has one scale per coordinate, fitted to the errors and no more: its gradient does
-  not reach the poses. The paper's unit variance is emission="unit".
-* Off the paper's data z costs .03 a nat and not .5, under which it falls silent in short runs: motions then lose their
-  rhythm. A nat of w costs .03 and not 7.5, under which it carries nothing (docs/results/hit_dvae.md).
-* The observed frames are never replaced in training, as they will not be in a forecast, unless `feed_observed`. Means
-  that are fed back carry no gradient, unless `feeding_gradient`; `feeding_passes` feeds them in parallel.
-* A model may see windows turned so that the last observed pose faces one way, which it does on small sets.
+* Each factor has one layer. Positions enter by linear biases (`networks.Attention`), so that motions may be longer than
+  in training. A learned start token replaces the past of the first step, so that x_1 and z_1 are part of the model.
+* The mean of x_t keeps half of x_{t-1} (`residual`). Without it, the error of the first predicted frame doubles; with
+  all of x_{t-1}, motions diverge. Poses are standardised: in metres, training takes several times as long to learn the
+  features that all poses share. There is no batch normalisation.
+* With best-of-many, the density of x has one scale per coordinate, which is only fitted to the errors: its gradient
+  does not reach the poses. emission="unit" gives the paper's unit variance.
+* On other data than the paper's, a nat of z costs .03 instead of .5. With .5, z collapses in short runs and motions
+  lose their rhythm. A nat of w costs .03 instead of 7.5; with 7.5, w carries no information
+  (docs/results/hit_dvae.md).
+* Training never replaces the observed frames, since a forecast does not either, unless `feed_observed` is set. No
+  gradient flows through means that are fed back, unless `feeding_gradient` is set. `feeding_passes` computes these
+  means in parallel.
+* A model may see windows rotated so that the last observed pose faces one way; on small data sets this is the default.
 """
 
 from __future__ import annotations
@@ -59,7 +62,7 @@ from ...networks import Attention, FrameGraph, NetworkSpec, NodeGraph, Recurrent
 from ...networks.extract import share
 from ...options import Amount, Delay, Extra, Layers, Range, Share, Size
 from ...program.model import DynamicalVAE
-from ...program.rollout import Rollout, SelfFeeding
+from ...program.rollout import Rollout, ScheduledSampling
 from ..method import SHAPES, LatentMethod, fit_units, start_priors
 from .energies import EnergyMethod, EnergyModel
 from .poses import table
@@ -77,47 +80,51 @@ NETWORKS = table(
     {"humaneva": (8, 10, 256, 15, False), "human36m": (8, 10, 256, 20, False), "": (8, 6, 128, 10, True)},
 )
 PRESETS = {skeleton: options | NETWORKS[skeleton] for skeleton, options in ENERGIES.items()}
-"""Skeleton to options: the paper's; and for others, at 30 frames a second, 15 observed and 60 predicted frames."""
+"""Options by skeleton: the paper's; for other skeletons, at 30 frames a second, 15 observed and 60 predicted frames."""
 
 PARTS = ("lower", "upper")
 FRAMES = 15
-"""Observed frames, where there are no windows to tell."""
+"""Number of observed frames if no windows define it."""
 
 
 @dataclass(frozen=True)
 class HiTDVAE(EnergyMethod, LatentMethod):
-    """See the file. With loss="evidence" the energies do not apply.
+    """A hierarchical transformer dynamical VAE. With loss="evidence" the energies do not apply.
 
     Args:
-        emission: as everywhere, but with loss="best-of-many" the "normal" and "student" do not apply, and with `bones`
-            none does: x is a point.
+        emission: distribution of x. loss="best-of-many" does not support "normal" and "student". With `bones` there is
+            none: x is a point mass.
         loss: "best-of-many" (the paper's) or "evidence" (the plain bound).
-        samples: K, motions that are drawn for a window in training; with loss="evidence" there is one.
+        samples: K, number of motions drawn for each window in training; 1 with loss="evidence".
         kl_local: weight of the KL of z.
-        kl_static: weight of the KL of w, in the bound's unit; the paper's .1 beside means over T frames is .1 T.
+        kl_static: weight of the KL of w, in the unit of the bound; the paper's .1, which multiplies means over T
+            frames, is .1 T.
         static: size of w; 0 for a model without w.
-        attention: False for LSTMs in place of the transformers, to which `heads_count` and `nearest` do not apply.
-        width: of the attention of guide and prior.
+        attention: whether to use transformers; otherwise LSTMs, which ignore `heads_count` and `nearest`.
+        width: width of the attention of guide and prior.
         heads_count: number of attention heads.
         decoder: width of the attention of x.
-        layers: of each factor.
-        nearest: the last frame that a generative factor may read joins its query; in the paper it is one key of many.
-        standardise: networks read and make poses without unit, by the mean pose and one spread (`dvae.data.units`).
-        pose_width: features of a joint, by graph convolutions; 0 for poses as they are. None for 8 where windows tell
-            that x are poses, and for 0 where a model is built from sizes alone.
-        summary: of x for w: "graph" (a graph of `frames` frames) or "attention" (over any length: all frames, in no
-            order, of a window in training and of its past in a forecast).
-        frames: of the graph's window; None for as many as the protocol observes. The same for all draws of a window in
-            training, and the first ones else.
-        guide_past: the guide of z reads z_{<t} too.
-        feed_observed: whether the observed frames may be replaced too, so that motions come of their latents alone. In
-            the paper that is open.
-        feeding_passes: the means that are fed back, computed in so many parallel passes; 0 for exactly, step by step.
+        layers: number of layers of each factor.
+        nearest: whether the last frame that a generative factor may read joins its query; in the paper it is one of
+            the keys.
+        standardise: whether networks read and predict standardised poses, by the mean pose and one scale
+            (`dvae.data.units`).
+        pose_width: features of a joint, by graph convolutions; 0 for raw poses. By default 8 for windows of poses and
+            0 for a model built from sizes alone.
+        summary: network of w: "graph" (a graph of `frames` frames) or "attention" (over any length, ignoring the order:
+            all frames of a window in training, and its past in a forecast).
+        frames: length of the graph's window, by default the observed frames of the protocol. In training the window is
+            the same for all draws; otherwise it is the first frames.
+        guide_past: whether the guide of z also reads z_{<t}.
+        feed_observed: whether scheduled sampling may also replace observed frames, so that motions depend only on their
+            latents. The paper leaves this open.
+        feeding_passes: number of parallel passes that approximate the means that are fed back; 0 for exact means, step
+            by step.
         feeding_gradient: whether gradients flow through these means.
-        warm_up: steps over which the KL weights rise from 0; None for the first 4 % of the run, the paper's 20 epochs
+        warm_up: steps over which the KL weights rise from 0; by default the first 4 % of the run, the paper's 20 epochs
             of 500.
-        self_feeding: final probability that a frame of x's history is the model's own mean. It rises from 0 over 16 %
-            of training, after the first 4 %: the paper's 80 and 20 of 500 epochs.
+        scheduled_sampling: final probability that a frame of x's history is the model's own mean. It rises from 0 over
+            16 % of training, after the first 4 %: the paper's 80 and 20 of 500 epochs.
     """
 
     name = "hit-dvae"
@@ -131,7 +138,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         "": Training(2400, 16, 2e-3, 0.8),
     }
     residual: Share = 0.5
-    self_feeding: Share = 1.0
+    scheduled_sampling: Share = 1.0
     warm_up: Delay | None = None
     loss: Literal["best-of-many", "evidence"] = "best-of-many"
     samples: Annotated[int, Range(2, 4096)] | None = None
@@ -160,10 +167,12 @@ class HiTDVAE(EnergyMethod, LatentMethod):
                 f"emission={self.emission!r} needs loss='evidence'; with best-of-many it is 'fixed' or 'unit'"
             )
         if self.hide:
-            raise ValueError("hit-dvae has no hide: its guide reads whole poses, beside which there are no indicators")
+            raise ValueError(
+                f"hide is {self.hide}, but the guide of hit-dvae reads whole poses without indicators; leave hide at 0"
+            )
         own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
         if self.loss == "evidence" and (given := [name for name in own if getattr(self, name)]):
-            raise ValueError(f"loss='evidence' has no {', '.join(given)}; these are of loss='best-of-many'")
+            raise ValueError(f"loss='evidence' has no {', '.join(given)}; use loss='best-of-many' or leave them out")
         for name in ("diversity", "diversity_scale"):
             values = getattr(self, name)
             if values is not None and len(values) != len(PARTS):
@@ -171,7 +180,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        """The generative model and the guide."""
+        """Return the generative model and the guide."""
         p, q = self.generative, self.inference
         if self.guide_past:
             q = q.replace("q(z_t | ", "q(z_t | z_{<t}, ")
@@ -181,12 +190,12 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def sizes(self) -> dict[str, int]:
-        """Sizes of w and z."""
+        """Return the sizes of w and z."""
         return {**({"w": self.static} if self.static else {}), **super().sizes()}
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """The paper's networks, or LSTMs; `build` shares the features of poses."""
+        """Return the paper's networks, or LSTMs; `build` shares the features of poses."""
         poses = {"x": NodeGraph(self.pose_width, coordinates=3)} if self.pose_width else {}
         decoder = self.decoder or PRESETS[""]["decoder"]
         shape: dict[str, Any] = {"heads": self.heads_count, "layers": self.layers, "extract": poses}
@@ -206,49 +215,55 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model; without a skeleton there are no energies, and x are numbers, not poses (`pose_width`).
+        """Return the model; without a skeleton it has no energies, and x are numbers, not poses (`pose_width`).
 
         Raises:
-            ValueError: windows with a root, of which there are energies or headings.
+            ValueError: if the poses have a root and the method uses energies or headings.
         """
         schema = Schema.of(data)
         method, observed = self, self.frames or FRAMES
         if self.bones or isinstance(schema, Poses):
             schema = Poses.of(schema, self.name)
-            method, observed = self.suited(schema), schema.protocol.observed
-        described = method.described(schema.sizes)
+            method, observed = self.resolve_defaults(schema), schema.protocol.observed
+        model_arguments = method.model_arguments(schema.sizes)
         if isinstance(schema, Poses) and (method.loss == "best-of-many" or method.heading):
             self.poses(schema)
             if method.loss == "best-of-many":
-                fitted = replace(described["laws"]["p(x)"], fitted="scale")
-                described["laws"]["p(x)"] = Directions(residual=method.residual) if method.bones else fitted
-            model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **described)
+                fitted = replace(model_arguments["distributions"]["p(x)"], fitted="scale")
+                model_arguments["distributions"]["p(x)"] = (
+                    Directions(residual=method.residual) if method.bones else fitted
+                )
+            model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **model_arguments)
         else:
-            model = method.suited_to(schema, extended=True)
+            model = method.build_for_data(schema, extended=True)
         if method.pose_width:
             for side in (model.generator, model.encoder):
                 share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
         if self.standardise and not schema.units:
             model.standardise(WHOLE)
         kept = 0 if self.feed_observed else observed
-        model.feeding = SelfFeeding(0.0, self.feeding_passes or None, self.feeding_gradient, kept)
+        model.feeding = ScheduledSampling(0.0, self.feeding_passes or None, self.feeding_gradient, kept)
         return model
 
     @override
-    def suited(self, data: Any) -> HiTDVAE:
-        """With loss="evidence" windows are turned only if asked for: their bounds are of no other model."""
+    def resolve_defaults(self, data: Any) -> HiTDVAE:
+        """Return the method with unset options chosen for the skeleton.
+
+        With loss="evidence" windows are rotated only on request, because their bounds are not comparable with the
+        bounds of other models.
+        """
         schema = Poses.of(data, self.name)
         suited = replace(self, frames=self.frames or schema.protocol.observed)
         if self.loss == "evidence":
             preset = self.preset(schema.skeleton)
             open_ = {name: preset[name] for name in ("decoder", "pose_width") if getattr(self, name) is None}
             return replace(suited, heading=bool(self.heading), **open_)
-        return super(HiTDVAE, suited).suited(schema)
+        return super(HiTDVAE, suited).resolve_defaults(schema)
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """One stage of the paper's objective, or of the evidence, with warm-up and self-feeding over its shares."""
-        method = self.suited(train) if self.loss == "best-of-many" else self
+        """Return one stage of the paper's objective, or of the evidence, with warm-up and scheduled sampling."""
+        method = self.resolve_defaults(train) if self.loss == "best-of-many" else self
         if self.warm_up is None:
             method = replace(method, warm_up=round(0.04 * steps))
         stages = [Stage(steps, method.objective())]
@@ -258,35 +273,35 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def _feeding(self, steps: int) -> Schedule | float:
-        """Over the paper's shares of the run."""
-        if not self.self_feeding:
+        """Return the probability of scheduled sampling, which rises over the paper's shares of the run."""
+        if not self.scheduled_sampling:
             return 0.0
-        return Ramp(0.0, self.self_feeding, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
+        return Ramp(0.0, self.scheduled_sampling, steps=max(round(0.16 * steps), 1), delay=round(0.04 * steps))
 
     @override
     def start(self, model: Any, windows: Any) -> None:
-        """With the units of the poses, where a learned scale of x starts."""
+        """Prepare a model, fit the units of the poses, and start a learned scale of x at these units."""
         start_priors(model, windows)
         if isinstance(model, EnergyModel):
             super().start(model, windows)
-        if self.standardise and not model.units[WHOLE].scale.dim():  # those of columns are known
+        if self.standardise and not model.units[WHOLE].scale.dim():  # units of columns are known
             fit_units(model, windows)
             if self.emission in (None, "fixed") and not self.bones:
-                nn.init.zeros_(model.generator[WHOLE].law.log_scale)
+                nn.init.zeros_(model.generator[WHOLE].head.log_scale)
 
     @override
     def objective(self) -> Objective:
-        """The paper's weighted energies, or the evidence.
+        """Return the paper's weighted energies, or the evidence.
 
         Raises:
-            ValueError: weights that are still open, which the skeleton decides.
+            ValueError: if weights that depend on the skeleton are unset.
         """
         if self.loss == "evidence":
             return super().objective()
         if self.diversity is None or self.kl_local is None or self.kl_static is None or self.samples is None:
             raise ValueError(
-                "the weights depend on the skeleton; take those of method.suited(windows), or for data that are no "
-                "poses the plain bound, loss='evidence'"
+                "the weights depend on the skeleton; call method.resolve_defaults(windows) first, or use "
+                "loss='evidence' for data that are not poses"
             )
         weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}
         ramp = SHAPES[self.warm_up_shape]
@@ -296,7 +311,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             kl_weight={n: ramp(0.0, w, steps=self.warm_up) if self.warm_up else w for n, w in weights.items()},
             free_bits=self.free_bits,
             energy_weights={name: weight for name, weight in energy_weights.items() if weight},
-            likelihood_weight=1e-3,  # for the scale alone, whose steps are Adam's at any weight
+            likelihood_weight=1e-3,  # for the scale alone: Adam's steps do not depend on the weight
             draws={"w" if self.static else "z": self.samples},
             select="loss",
         )
@@ -305,8 +320,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 class HiTModel(EnergyModel):
     """The model of HiT-DVAE for the poses of a skeleton.
 
-    Asked for several draws of a latent, its program scores the motions that come of them, which are the means of x.
-    Energies are of whole sequences, T times the paper's means, so that `Evidence` weighs them as the paper does.
+    With several draws of a latent, the program scores the resulting motions, which are the means of x. The energies
+    are sums over a sequence, T times the paper's means, so that `Evidence` weighs them as the paper does.
     """
 
     def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, **options: Any):
@@ -320,7 +335,7 @@ class HiTModel(EnergyModel):
             return {}
         if rollout.lengths is not None:
             raise ValueError(
-                "the energies are of whole windows; leave 'lengths' out of the batch, or fit with loss='evidence'"
+                "the energies need whole windows; leave 'lengths' out of the batch, or fit with loss='evidence'"
             )
         size = rollout.batch // rollout.draws
         x = rollout.values[WHOLE]

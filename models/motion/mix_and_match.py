@@ -1,21 +1,26 @@
-"""Mix-and-Match: futures of a moving body whose noise perturbs random indices of the code of its past.
+"""Mix-and-Match: futures of a moving body, by noise that perturbs random indices of the code of its past.
 
-With h the observed poses, x those that follow, and i indices that are drawn once for a batch,
+h are the observed poses, x the poses that follow, and i indices that are drawn once for a batch:
 
     p(z) p(x_t | x_{<t}, h, z, i)        q(z | x_{1:T}, h, i)
 
-Recurrent networks sum up past and future. The first code, perturbed by z at the drawn indices, is the state from which
-a recurrent decoder goes on from the last observed pose, by quaternions of all joints. Other ways for the noise to
-enter are options, with the same recurrent networks, losses and representation (see `dvae.networks.noise`):
+Recurrent networks summarise past and future. The code of the past, perturbed by z at the drawn indices, is the initial
+state of a recurrent decoder. The decoder starts at the last observed pose and predicts quaternions of all joints. An
+option selects other ways to add the noise, with the same recurrent networks, losses and representation
+(see `dvae.networks.noise`):
 
     concatenate   p(z) p(x_t | x_{<t}, h, z)          q(z | x_{1:T}, h)
     add           p(z) p(x_t | x_{<t}, h, z)          q(z), the prior
     step          p(z_t) p(x_t | x_{<t}, h, z_t)      q(z_t | x_{<=t}, h)
 
-Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733; for the others see there. What the paper
-leaves open, and there is no public code for motion to tell, is ours: the layers of the blocks and of the code's
-decoder, that this ends in the range of a state, the likelihood's scale in place of a weight of the KL, and how long the
-schedules run. Quaternions are brought to unit length where poses are shown, and fed back as they were made.
+Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733, which cites the sources of the other ways.
+There is no public code for motion. Our choices where the paper gives no detail:
+
+* The layers of the blocks and of the decoder of the code, whose output has the range of a state.
+* The scale of the likelihood, in place of a weight of the KL.
+* The lengths of the schedules.
+
+Quaternions are normalised to unit length when poses are returned, and fed back without normalisation.
 """
 
 from __future__ import annotations
@@ -32,7 +37,7 @@ from ...constants import constant
 from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
 from ...data.views import Past, Views
-from ...distributions import FixedNormal, LawSpec
+from ...distributions import DistributionSpec, FixedNormal
 from ...factorization.notation import Factorization
 from ...inference.training.objectives import Evidence
 from ...inference.training.options import Stage, Training
@@ -47,7 +52,7 @@ from ...networks.noise import AddProjected, Concatenate, MixAndMatch, Noise, Res
 from ...networks.recurrent import gru_cell
 from ...options import Amount, Positive, Share, Size
 from ...program.model import DynamicalVAE
-from ...program.rollout import Rollout, SelfFeeding
+from ...program.rollout import Rollout, ScheduledSampling
 from ..baselines.pose_knows import FutureFilter
 from .futures import HISTORY, LastState
 from .poses import PoseMethod
@@ -58,29 +63,29 @@ EQUATIONS = {
     "add": ("p(z) p(x_t | x_{<t}, h, z)", "q(z)"),
     "step": ("p(z_t) p(x_t | x_{<t}, h, z_t)", "q(z_t | x_{<=t}, h)"),
 }
-"""Other ways for the noise to enter than to be mixed in, and the factorization that each has."""
+"""Equations of the other ways to add the noise, by option."""
 
 
 @dataclass(frozen=True)
 class MixAndMatchMotion(PoseMethod):
-    """See the file.
+    """The Mix-and-Match model of human motion.
 
     Args:
-        noise: how it enters: "mix" (Mix-and-Match), "concatenate" (MT-VAE's way), "add" (HP-GAN's), "step"
-            (Pose-Knows').
-        alpha: of "mix": the share of the code that is perturbed. 0 for a deterministic model.
-        width: units of recurrent networks and of the code, L; by default 1024 with Human3.6M's skeleton, as in the
-            paper, and 128 with others.
-        latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 with the others.
-        scale: standard deviation of the quaternions' numbers; what it stands for is the weight of the KL.
-        skeleton: weight of the squared error of positions, with the root not turned, beside that of quaternions, each
-            the mean over its numbers.
-        velocity: what is added to the pose before, in place of the pose.
-        curriculum: share of training over which the drawn indices become random, from the first ones on; 0 for
-            random ones all the time.
+        noise: way to add the noise: "mix" (Mix-and-Match), "concatenate" (MT-VAE), "add" (HP-GAN) or "step"
+            (Pose-Knows).
+        alpha: share of the code that "mix" perturbs; 0 for a deterministic model.
+        width: L, units of recurrent networks and of the code; by default 1024 for Human3.6M's skeleton, as in the
+            paper, and 128 for others.
+        latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 otherwise.
+        scale: standard deviation of the quaternions' numbers, which sets the relative weight of the KL.
+        skeleton: weight of the squared error of positions without the root's rotation, relative to the error of
+            quaternions; both are means over their numbers.
+        velocity: whether to predict the difference from the previous pose instead of the pose.
+        curriculum: share of training over which the drawn indices change from the first ones to random ones; 0 for
+            random indices from the start.
         annealing: share of training over which the weight of the KL rises to 1, by a logistic curve.
-        feeding: probability, at the end, that a pose of the past is the model's own mean; it rises from 0 over nine
-            tenths of training. 1 is the paper's.
+        feeding: final probability that a pose of the past is the model's own mean; it rises from 0 over nine tenths of
+            training. The paper has 1.
     """
 
     name = "mix-and-match"
@@ -110,7 +115,7 @@ class MixAndMatchMotion(PoseMethod):
         for name, default in (("alpha", 0.5), ("curriculum", 0.5)):
             if self.noise != "mix" and (value := getattr(self, name)) != default:
                 raise ValueError(
-                    f"{name} is {value}, but noise that is {self.noise!r} draws no indices; {name} is an option of "
+                    f"{name} is {value}, but noise={self.noise!r} draws no indices; leave {name} at its default or use "
                     "noise='mix'"
                 )
 
@@ -120,7 +125,7 @@ class MixAndMatchMotion(PoseMethod):
         return generative, inference
 
     def entering(self) -> Noise | None:
-        """How the noise enters the code; None where each step has its own."""
+        """Return how the noise enters the code; None if each step has its own noise."""
         ways: dict[str, Noise] = {"mix": MixAndMatch(self.alpha), "concatenate": Concatenate(), "add": AddProjected()}
         return ways.get(self.noise)
 
@@ -137,37 +142,37 @@ class MixAndMatchMotion(PoseMethod):
         return {**guide, "p(x)": FutureDecoder(width, way, self.velocity)}
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
+    def distributions(self) -> Mapping[str, DistributionSpec]:
         return {"p(x)": FixedNormal(self.scale, project=False, error_weight=True)}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model for windows whose representation is quaternions.
+        """Return the model for windows of quaternions.
 
-        Of sizes alone it is one whose batches hold h, two frames of the size of x, beside x.
+        From sizes alone, it is a model whose batches contain x and h, two frames of the size of x.
 
         Raises:
-            SchemaError: windows with another representation.
+            SchemaError: if the windows have another representation.
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            return self.filled(self.presets[""])._built(DynamicalVAE, schema.size(WHOLE), 2)
-        schema, method = Poses.of(schema, self.name, self.representation), self.suited(schema)
+            return self.with_presets(self.presets[""])._built(DynamicalVAE, schema.size(WHOLE), 2)
+        schema, method = Poses.of(schema, self.name, self.representation), self.resolve_defaults(schema)
         return method._built(MixAndMatchModel, schema.size(WHOLE), schema.protocol.observed, method, schema)
 
     def _built(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:
-        described = self.described({WHOLE: size, HISTORY: frames * size})
+        model_arguments = self.model_arguments({WHOLE: size, HISTORY: frames * size})
         shared = {INDICES: MixAndMatch(self.alpha).indices} if self.noise == "mix" else {}
-        described |= {"inference": None} if self.noise == "add" else {}
-        model = kind(*arguments, **described, shared=shared)
+        model_arguments |= {"inference": None} if self.noise == "add" else {}
+        model = kind(*arguments, **model_arguments, shared=shared)
         if self.noise != "add":
             share_modules([model.encoder["z"].network, model.generator[WHOLE].network], "past")
-        model.feeding = SelfFeeding(0.0)
+        model.feeding = ScheduledSampling(0.0)
         return model
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """Minimises squared errors of quaternions and positions and the annealed KL, by the model's own poses."""
+        """Return one stage on squared errors of quaternions and positions and the KL, with scheduled sampling."""
         size = Schema.of(train).size(WHOLE)
         objective = Evidence(
             kl_weight=Logistic(0.0, 1.0, steps=max(int(self.annealing * steps), 1)) if self.annealing else 1.0,
@@ -181,12 +186,12 @@ class MixAndMatchMotion(PoseMethod):
 
 
 class MixAndMatchModel(DynamicalVAE):
-    """A model of quaternions that learns from positions too.
+    """A model of quaternions that also learns from positions.
 
     Args:
-        method: with no option left open.
-        schema: of the windows.
-        **options: of `DynamicalVAE`.
+        method: method whose options are all resolved.
+        schema: schema of the windows.
+        **options: arguments of `DynamicalVAE`.
     """
 
     def __init__(self, method: MixAndMatchMotion, schema: Poses, **options: Any) -> None:
@@ -196,7 +201,7 @@ class MixAndMatchModel(DynamicalVAE):
 
     @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """The squared error of positions, mean over their numbers, where there is a future to compare with."""
+        """Return the squared error of positions, mean over their numbers, if the data contain the future."""
         if not self.method.skeleton or WHOLE not in data or LENGTHS not in data:
             return {}
         value = rollout.values[WHOLE]
@@ -208,7 +213,7 @@ class MixAndMatchModel(DynamicalVAE):
 
 
 def _aligned(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
-    """Positions (B, T, 3 J') of poses (B, T, D) whose root is at the origin and not turned."""
+    """Return positions (B, T, 3 J') of poses (B, T, D), with the root at the origin and without rotation."""
     place, start = view.turning.index(view.skeleton.root), 3 * view.root
     unturned = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
     first = torch.zeros_like(quaternions[..., :start])
@@ -220,23 +225,23 @@ def _aligned(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
 
 @dataclass(frozen=True)
 class FutureEncoder:
-    """Features of z from the codes of past and future; of z_t, states of a network that goes on from the past.
+    """Features of z from the codes of past and future, or of z_t from a network that continues from the past.
 
     Args:
-        width: units, L.
-        noise: how the noise enters; None where each step has its own.
+        width: L, number of units.
+        noise: how the noise enters; None if each step has its own noise.
     """
 
     width: int
     noise: Noise | None
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return FutureFilter(self.width).build(inputs, local, size) if local else FutureEncoderNetwork(self, inputs)
 
 
 class FutureEncoderNetwork(Network):
-    """What `FutureEncoder` describes, of one latent for all steps."""
+    """Network of `FutureEncoder` for one latent for all steps."""
 
     def __init__(self, spec: FutureEncoder, inputs: Sequence[Input]) -> None:
         super().__init__(inputs, False, spec.width)
@@ -255,12 +260,12 @@ class FutureEncoderNetwork(Network):
 
 @dataclass(frozen=True)
 class FutureDecoder:
-    """Poses after the past, from states of a recurrent network that reads the pose before.
+    """Poses after the past, from states of a recurrent network that reads the previous pose.
 
     Args:
-        width: units, L.
-        noise: how the noise enters the first state; None where each step has its own, which joins behind the state.
-        velocity: add what is made to the pose before.
+        width: L, number of units.
+        noise: how the noise enters the first state; None if each step has its own noise, which joins after the state.
+        velocity: whether to add the output to the previous pose.
     """
 
     width: int
@@ -268,12 +273,12 @@ class FutureDecoder:
     velocity: bool
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return FutureDecoderNetwork(self, inputs, size)
 
 
 class FutureDecoderNetwork(Network):
-    """What `FutureDecoder` describes."""
+    """Network of `FutureDecoder`."""
 
     def __init__(self, spec: FutureDecoder, inputs: Sequence[Input], size: int) -> None:
         super().__init__(inputs, True, size)
@@ -293,12 +298,15 @@ class FutureDecoderNetwork(Network):
 
     @property
     def entrance(self) -> nn.Module:
-        """Of which the noise becomes (B, L): the first state, or the features of each step that poses are made of."""
+        """The module through which the noise enters, with output (B, L).
+
+        Its output is the first state, or the features of each step that poses are computed from.
+        """
         found: Any = self.noise if self.join is None else self.join
         return found
 
     def code(self, parents: Mapping[str, Tensor]) -> Tensor:
-        """The first state (B, L)."""
+        """Return the first state (B, L)."""
         code = self.past(parents[HISTORY])
         if self.noise is None:
             return code
@@ -306,7 +314,7 @@ class FutureDecoderNetwork(Network):
         return entered
 
     def _last(self, parents: Mapping[str, Tensor]) -> Tensor:
-        """The last pose of the past (B, D)."""
+        """Return the last pose of the past (B, D)."""
         return parents[HISTORY][:, -self.features :]
 
     def _pose(self, state: Tensor, z: Tensor, before: Tensor) -> Tensor:

@@ -1,16 +1,16 @@
-"""What methods share that map a past to the latents of several futures, jointly, for the decoder of a fitted CVAE.
+"""Base of the methods that map a past jointly to latents of several futures, for the decoder of a fitted CVAE.
 
     p(x_t | x_{<t}, h, k, ...)
 
-k = 1..K is the mode, one-hot context. A network of the observed poses h gives the CVAE's latent in each mode, and the
-CVAE's decoder, whose weights stay as they are, makes the future. Energies compare the K futures of a window, which are
-drawn together.
+k = 1..K is the mode, a one-hot context. A network of the observed poses h returns the CVAE's latent in each mode, and
+the CVAE's decoder, with frozen weights, predicts the future. The K futures of a window are drawn together, and energies
+compare them.
 
-The weights of the decoder are part of the model. They are those of a run of `cvae` (`cvae_run`) on the same windows;
-where none is given, one is fitted first, in as many steps as the run itself has, and not kept.
+The weights of the decoder are part of the model. They are from a run of `cvae` (`cvae_run`) on the same windows.
+Without such a run, a CVAE is fitted first, with the same number of steps, and not saved.
 
-Sources: Yuan and Kitani, 2020, arXiv 1907.04967 and 2003.08386. Ours: a batch that says nothing of k has a mode at
-random, and samples whose number is no multiple of K are whole sets and a random part of one.
+Sources: Yuan and Kitani, 2020, arXiv 1907.04967 and 2003.08386. Our choices: a batch without k has random modes. If the
+number of samples is not a multiple of K, samples are whole sets and a random part of one set.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from ...motion import HUMAN36M, HUMANEVA, Skeleton
 from ...motion.data.protocols import Poses
 from ...networks import Input, Network, NetworkSpec
 from ...networks.base import perceptron
-from ...networks.loop import once
+from ...networks.loop import memoize
 from ...options import Size, flat
 from ...program.batch import CHUNK, AnyBatch, repeat, rows
 from ...program.rollout import Rollout
@@ -46,26 +46,25 @@ from .futures import HISTORY, FutureMethod, FutureModel, LastState
 
 MODE, NOISE = "k", "e"
 WHOLE_SETS = "sets"
-"""Name in batches that are of every window in all modes, mode by mode, whose futures energies compare; all True."""
+"""Key of batches that contain every window in all modes, mode by mode, for energies to compare; its value is True."""
 OF_CVAE = ("latent", "width", "hidden", "heading")
-"""Options that are the CVAE's."""
+"""Options of the CVAE."""
 SHAPE = (CVAE.latent, CVAE.width, CVAE.hidden)
-"""Sizes among them, where there is no run."""
+"""Sizes of the CVAE if there is no run."""
 
 
 @dataclass(frozen=True)
 class ModesMethod(FutureMethod):
-    """A method that makes futures by the modes of a network, and a CVAE that was fitted before.
+    """A method that predicts futures by a network with K modes and the decoder of a fitted CVAE.
 
     Args:
-        latent: size of the CVAE's latent; None, here and below, for that of the run, or of the CVAE's presets.
+        latent: size of the CVAE's latent; None, here and below, for the value of the run or of the CVAE's presets.
         width: units of the CVAE's recurrent networks.
         hidden: widths of the CVAE's perceptrons.
-        modes: K, futures that are made together; None for 50 with the poses of Human3.6M and HumanEva, and for 10 with
-            others.
-        cvae_run: run directory of a fitted cvae; "" to fit one first, in as many steps as the run itself has.
-        sampler_width: units of the recurrent network over the past whose last state the modes are read from.
-        sampler_hidden: widths of the perceptron behind it.
+        modes: K, number of futures drawn together; by default 50 for Human3.6M and HumanEva, and 10 for other poses.
+        cvae_run: run directory of a fitted cvae; "" to fit one first, with the same number of steps.
+        sampler_width: units of the recurrent network over the past.
+        sampler_hidden: widths of the perceptron on the last state of this network.
     """
 
     inference = ""
@@ -84,18 +83,18 @@ class ModesMethod(FutureMethod):
     sampler_hidden: tuple[Size, ...] = (1024, 512)
 
     @override
-    def suited(self, data: Any) -> Self:
-        """With the options that are left open chosen: the CVAE's by its run, if there is one.
+    def resolve_defaults(self, data: Any) -> Self:
+        """Return the method with unset options chosen; a run of the CVAE determines the CVAE's options.
 
         Raises:
-            ValueError: a run of something else.
-            CheckpointError: no run, or a damaged one.
+            ValueError: if the run is not of a cvae.
+            CheckpointError: if the run does not exist or is damaged.
         """
         if not self.cvae_run or all(getattr(self, name) is not None for name in OF_CVAE):
-            return super().suited(data)
+            return super().resolve_defaults(data)
         cvae, *_ = _read(self.cvae_run)
-        taken = self.filled({name: getattr(cvae, name) for name in OF_CVAE})
-        return super(ModesMethod, taken).suited(data)
+        taken = self.with_presets({name: getattr(cvae, name) for name in OF_CVAE})
+        return super(ModesMethod, taken).resolve_defaults(data)
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -107,27 +106,27 @@ class ModesMethod(FutureMethod):
         return {"p(x)": ModesDecoder(*shape)}
 
     @override
-    def described(self, sizes: Mapping[str, int]) -> dict[str, Any]:
-        """With the prior for a guide."""
-        return {**super().described(sizes), "inference": None}
+    def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
+        """Return the arguments, with the prior as the guide."""
+        return {**super().model_arguments(sizes), "inference": None}
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
-        """Minimises the energies of futures that are drawn together; the best weights are those of the lowest loss."""
-        method = self.suited(train)
+        """Return one stage on the energies of futures drawn together; the best weights have the lowest loss."""
+        method = self.resolve_defaults(train)
         prepare = partial(method.start, train=train, validation=validation, steps=steps)
         return Recipe(train, validation, [Stage(steps, method.objective())], 1.0, prepare)
 
     def start(self, model: ModesModel, train: Any, validation: Any, steps: int) -> None:
-        """Has a model take the weights of the CVAE's decoder.
+        """Load the weights of the CVAE's decoder into a model.
 
         Raises:
-            ValueError: a run of something else, on other windows or with other options.
-            CheckpointError: no run, or a damaged one.
+            ValueError: if the run is not of a cvae, or has other windows or options.
+            CheckpointError: if the run does not exist or is damaged.
         """
         cvae: Any = self._loaded(train) if self.cvae_run else self._fitted(train, validation, steps)
         model.generator[WHOLE].network.decoder.load_state_dict(cvae.generator[WHOLE].network.state_dict())
-        model.generator[WHOLE].law.load_state_dict(cvae.generator[WHOLE].law.state_dict())
+        model.generator[WHOLE].head.load_state_dict(cvae.generator[WHOLE].head.state_dict())
 
     def _loaded(self, windows: Any) -> FutureModel:
         path, (cvae, schema, model) = self.cvae_run, _read(self.cvae_run)
@@ -135,14 +134,14 @@ class ModesMethod(FutureMethod):
         if differing := [name for name in ours | theirs if ours.get(name) != theirs.get(name)]:
             values = (f"{name} is {brief(theirs.get(name))}, not {brief(ours.get(name))}" for name in differing)
             raise ValueError(
-                f"the cvae of {path} was fitted on other windows: {'; '.join(islice(values, 3))}; fit one on these, "
-                "by the same --data and --protocol"
+                f"the cvae of {path} was fitted on other windows: {'; '.join(islice(values, 3))}; fit one on these "
+                "windows, with the same --data and --protocol"
             )
         for name in OF_CVAE:
             if getattr(cvae, name) != getattr(self, name):
                 raise ValueError(
-                    f"{name} is {getattr(self, name)}, but {path} was fitted with {getattr(cvae, name)}; leave it out, "
-                    f"and {self.name} takes it from there"
+                    f"{name} is {getattr(self, name)}, but {path} was fitted with {getattr(cvae, name)}; leave it out: "
+                    f"{self.name} reads it from the run"
                 )
         load_weights(model, path)
         return model
@@ -156,29 +155,29 @@ class ModesMethod(FutureMethod):
 
 
 def _read(path: str) -> tuple[CVAE, Poses, FutureModel]:
-    """Options, schema and model of the run of a cvae; the weights are not its own yet."""
+    """Return options, schema and model of the run of a cvae; the weights are not loaded yet."""
     run = Run(path)
     config, size = run.config, run.size()
     try:
         schema = {**config["schema"]}
-        described, found = schema.pop("kind"), configured(config["method"])
-        if described == Poses.kind and isinstance(found, CVAE) and found.components == 1:
+        model_arguments, found = schema.pop("kind"), configured(config["method"])
+        if model_arguments == Poses.kind and isinstance(found, CVAE) and found.components == 1:
             poses = Poses.from_config(schema)
             with at_most(size, f"{run.path / CONFIG}"):
                 return found, poses, found.build(poses)
     except CheckpointError:
         raise
-    except Exception as error:  # whatever stands in a file of somebody else's
-        raise ValueError(f"{run.path / CONFIG} is none of a cvae: {str(error)[:200]}") from error
+    except Exception as error:  # a file from elsewhere may contain anything
+        raise ValueError(f"{run.path / CONFIG} is not the configuration of a cvae: {str(error)[:200]}") from error
     raise ValueError(
-        f"{path} holds no cvae whose latent is near N(0, I); fit one first, by `dvae fit cvae … --out {path}-cvae`"
+        f"{path} is not a run of a cvae with prior N(0, I); fit one first, with `dvae fit cvae … --out {path}-cvae`"
     )
 
 
 class ModesModel(FutureModel):
-    """A model whose futures are made together, one in each mode.
+    """A model whose futures are drawn together, one in each mode.
 
-    Rows of a batch that are one window in several modes have the same "group", and the noise in common.
+    Rows of a batch that are one window in several modes have the same "group" and share the noise.
     """
 
     extras: ClassVar[tuple[str, ...]] = (WHOLE_SETS,)
@@ -191,24 +190,24 @@ class ModesModel(FutureModel):
 
     @property
     def modes(self) -> int:
-        """K."""
+        """K, number of modes."""
         return self.sizes[MODE]
 
     @property
     def sampler(self) -> Sampler:
-        """The network of the modes."""
+        """The network that returns the latents of all modes."""
         found: Sampler = self.generator[WHOLE].network.sampler
         return found
 
     def in_modes(self, data: Batch, modes: Tensor) -> Batch:
-        """What was read of B windows in each of these modes, mode by mode.
+        """Return data of B windows in each of the given modes, mode by mode.
 
         Args:
-            data: as `read` gives it.
-            modes: (M,), from 0.
+            data: data returned by `read`.
+            modes: indices of M modes, (M,), from 0.
 
         Returns:
-            Likewise, M B rows.
+            Data of M B rows.
         """
         size = len(data[HISTORY])
         places = self._coded(modes.repeat_interleave(size), data[HISTORY])
@@ -216,24 +215,24 @@ class ModesModel(FutureModel):
         return Batch(repeat(data, len(modes))) | {MODE: places, "group": group}
 
     def _coded(self, modes: Tensor, like: Tensor) -> Tensor:
-        """(B, K), 1 at the mode of each row."""
+        """Return the one-hot codes (B, K) of the modes of each row."""
         return torch.eye(self.modes, dtype=like.dtype, device=like.device).index_select(0, modes.to(like.device))
 
     def in_sets(self, batch: AnyBatch | None) -> Batch:
-        """A batch of B windows in all modes, as `in_modes` has it, whose futures are to be compared."""
+        """Return a batch of B windows in all modes, as `in_modes` does, whose futures energies compare."""
 
         def compute() -> Batch:
             read = self.read(batch)
             data = self.in_modes(read, torch.arange(self.modes, device=read[HISTORY].device))
             return data | {WHOLE_SETS: torch.ones_like(data.group, dtype=torch.bool)}
 
-        return once(self.generator, [batch], compute)
+        return memoize(self.generator, [batch], compute)
 
     @override
     def model(
         self, batch: AnyBatch | None = None, *, draws: Mapping[str, int] | None = None, **options: Any
     ) -> dict[str, Tensor]:
-        """The generative program, with `draws` of the mode in all modes at once."""
+        """Run the generative program; with `draws` of the mode, in all modes at once."""
         return super().model(self.in_sets(batch) if draws else batch, **options)
 
     @override
@@ -263,7 +262,7 @@ class ModesModel(FutureModel):
         chunk: int = CHUNK,
         **options: Any,
     ) -> dict[str, Tensor]:
-        """Sets of a future in each mode, one after the other; of the last set so many modes as are left, at random."""
+        """Return whole sets of futures, one per mode; an incomplete last set has random modes."""
         making = super().forecast
 
         def make(part: slice, modes: Tensor, count: int) -> dict[str, Tensor]:
@@ -278,7 +277,7 @@ class ModesModel(FutureModel):
 
     @override
     def reconstruct(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
-        """Means of the data, of sets as in `forecast`."""
+        """Return the means of the data, in sets as in `forecast`."""
         making = super().reconstruct
 
         def make(part: slice, modes: Tensor, count: int) -> dict[str, Tensor]:
@@ -297,7 +296,7 @@ class ModesModel(FutureModel):
         samples: int,
         chunk: int,
     ) -> dict[str, Tensor]:
-        """What is made (n, M b, ...) of a slice of b windows in M modes, n times, as samples (S, B, ...) of all."""
+        """Return samples (S, B, ...) of all windows; `make` returns n draws (n, M b, ...) of b windows in M modes."""
         size, step = len(data[HISTORY]), max(chunk // self.modes, 1)
         whole, rest = divmod(samples, self.modes)
         sets = [(torch.arange(self.modes), whole)] if whole or not rest else []
@@ -315,13 +314,13 @@ class ModesModel(FutureModel):
 
 @dataclass(frozen=True)
 class ModesDecoder:
-    """Features of x_t: those of a CVAE's decoder, whose latent a network of the past tells for each mode.
+    """Features of x_t from a CVAE's decoder, whose latent is a function of the past for each mode.
 
-    It is a_k(h) e + b_k(h) where the factor reads a noise e, else b_k(h).
+    The latent is a_k(h) e + b_k(h) if the factor reads a noise e, otherwise b_k(h).
 
     Args:
         latent: size of the CVAE's latent.
-        width, hidden: see `SummaryDecoder`.
+        width, hidden: widths as in `SummaryDecoder`.
         sampler_width: units of the recurrent network over the past.
         sampler_hidden: widths of the perceptron on its last state.
     """
@@ -333,12 +332,12 @@ class ModesDecoder:
     sampler_hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> ModesDecoderNetwork:
-        """The network of a factor with these parents."""
+        """Return the network of a factor with these parents."""
         return ModesDecoderNetwork(self, inputs, size)
 
 
 class ModesDecoderNetwork(Network):
-    """What `ModesDecoder` describes."""
+    """Network of `ModesDecoder`."""
 
     code: ClassVar[str] = "w"
 
@@ -375,13 +374,13 @@ class ModesDecoderNetwork(Network):
 
 
 class Sampler(nn.Module):
-    """What the observed poses say of each mode.
+    """Network from the observed poses to the parameters of each mode.
 
     Args:
-        size: D.
-        modes: K.
-        told: L, numbers of each mode.
-        spec: with the widths.
+        size: D, size of a pose.
+        modes: K, number of modes.
+        told: L, number of parameters of each mode.
+        spec: specification with the widths.
     """
 
     def __init__(self, size: int, modes: int, told: int, spec: ModesDecoder) -> None:
@@ -392,9 +391,9 @@ class Sampler(nn.Module):
         self.behind, self.heads = perceptron(shape, "tanh"), nn.Linear(shape[-1], modes * told)
 
     def forward(self, history: Tensor) -> Tensor:
-        """(R, K, L) from the past (N, O D).
+        """Return the parameters (R, K, L) of the modes from the past (N, O D).
 
-        R is N, or N / K where the rows are the same R, K times over, of which once is enough.
+        R is N, or N / K if the rows repeat the same R rows K times; then they are computed once.
         """
 
         def compute() -> Tensor:
@@ -403,4 +402,4 @@ class Sampler(nn.Module):
             found: Tensor = self.heads(self.behind(self.past(history[:count] if alike else history)))
             return found.unflatten(1, (self.modes, -1))
 
-        return once(self, [history], compute)
+        return memoize(self, [history], compute)

@@ -1,4 +1,4 @@
-"""What methods for poses have in common: options that are left open are chosen by the skeleton."""
+"""Base of the methods for poses: unset options are chosen for the skeleton."""
 
 from __future__ import annotations
 
@@ -10,29 +10,31 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ...data.sequences import bridged
+from ...data.sequences import interpolate_missing
 from ...motion import Skeleton
 from ...motion.data.protocols import Poses
 from ..method import Method
 
 
 def table(options: str, rows: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
-    """Presets from rows of values, by skeleton, under the names of their options."""
+    """Return presets by skeleton from rows of values and the names of their options."""
     return {skeleton: dict(zip(options.split(), values, strict=True)) for skeleton, values in rows.items()}
 
 
 def without_gaps(skeleton: Skeleton, poses: Tensor, seen: Tensor) -> Tensor:
-    """Poses (B, T, D) without a root whose missing joints are where one would take them to be.
+    """Return poses (B, T, D) without a root, with missing joints filled in.
 
-    Ours: across a gap a joint goes straight from where it was to where it is next. One that is never seen is at its
-    parent's place.
+    Our choice: across missing frames, a joint is interpolated linearly in time. A joint that is never observed is at
+    its parent's position.
 
     Args:
-        skeleton: of the poses.
-        poses: anything where entries are missing.
+        skeleton: skeleton of the poses.
+        poses: (B, T, D), with any values at missing entries.
         seen: (B, T, D), True where an entry was observed.
     """
-    found, shown = (skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (bridged(poses, seen), seen.any(1)))
+    found, shown = (
+        skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (interpolate_missing(poses, seen), seen.any(1))
+    )
     for joint in skeleton.order[1:]:
         above = found[..., skeleton.parents[joint], :]
         found[..., joint, :] = torch.where(shown[:, None, joint], found[..., joint, :], above)
@@ -41,36 +43,36 @@ def without_gaps(skeleton: Skeleton, poses: Tensor, seen: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PoseMethod(Method):
-    """A method for poses. Options that are None are chosen by the skeleton."""
+    """A method for poses. Options that are None are chosen for the skeleton."""
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"": {}}
-    """What they stand for, by the skeleton's name, and "" for any other."""
+    """Values of options that are None, by the skeleton's name, and "" for any other skeleton."""
     representation: ClassVar[str] = "positions"
-    """Of a protocol under which it can be used."""
+    """Representation that the protocol of the data must have."""
 
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """What options that are None stand for, with poses of this skeleton."""
+        """Return the values of options that are None, for poses of this skeleton."""
         return self.presets.get(skeleton.name, self.presets[""])
 
     @override
-    def suited(self, data: Any) -> Self:
-        """With the options that are left open chosen for the skeleton of these data."""
-        return self.filled(self.preset(Poses.of(data, self.name, self.representation).skeleton))
+    def resolve_defaults(self, data: Any) -> Self:
+        """Return the method with unset options chosen for the skeleton of the data."""
+        return self.with_presets(self.preset(Poses.of(data, self.name, self.representation).skeleton))
 
     def poses(self, data: Any) -> Poses:
-        """The schema of data, of poses without a root.
+        """Return the schema of data that are poses without a root.
 
         Raises:
-            ValueError: poses with a root, or no poses.
+            ValueError: if the poses have a root, or the data are not poses.
         """
         schema = Poses.of(data, self.name)
         if schema.protocol.root != "drop":
             raise ValueError(
-                f"{self.name} makes poses relative to the pelvis, but the protocol {schema.protocol.name} has the "
-                f"root {schema.protocol.root!r}; use one with root='drop'"
+                f"{self.name} predicts poses relative to the pelvis, but the protocol {schema.protocol.name} has "
+                f"root={schema.protocol.root!r}; use one with root='drop'"
             )
         return schema
 
-    def filled(self, preset: Mapping[str, Any]) -> Self:
-        """With options that are None taken from a preset."""
+    def with_presets(self, preset: Mapping[str, Any]) -> Self:
+        """Return the method with options that are None taken from a preset."""
         return replace(self, **{name: value for name, value in preset.items() if getattr(self, name) is None})

@@ -1,10 +1,10 @@
-"""What methods share that make motion from one pose and the paths that some joints are to take.
+"""Base of the methods that complete motion from one pose and given paths of some joints.
 
     s the first pose, y_{1:T} the given trajectories, r_{1:T} the other joints', x_{1:T} the motion
 
-Poses are positions in metres relative to the first pelvis, so that the body moves through space; y and r are x with
-zeros at the joints that are not theirs. In training, every joint of a window is given with probability `keep`, over all
-its frames: so one model takes any number of trajectories.
+Poses are positions in metres relative to the first pelvis, so that the body moves through space. y and r are copies of
+x with zeros at all other joints. In training, every joint of a window is given with probability `keep`, over all its
+frames. One model therefore accepts any number of trajectories.
 
 Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with what its public implementation does.
 """
@@ -26,13 +26,13 @@ from typing_extensions import override
 from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
 from ...data.views import Past, View, Views
-from ...distributions import FixedNormal, LawSpec
+from ...distributions import DistributionSpec, FixedNormal
 from ...inference.training.objectives import Evidence
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...inference.training.schedules import Piecewise
 from ...motion import HUMAN36M, PROTOCOLS, Clip, Heading, Skeleton, Windows
-from ...motion.control import bend
+from ...motion.control import follow_paths
 from ...motion.data.clips import defect
 from ...motion.data.protocols import Poses
 from ...options import Amount, Share, Size
@@ -42,7 +42,7 @@ from .poses import PoseMethod
 
 FIRST, GIVEN, REST = "s", "y", "r"
 NEEDED = "relative", 1
-"""Root and number of observed frames of a protocol under which methods complete motion."""
+"""Root and number of observed frames that the protocol must have."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ class TrajectoryMethod(PoseMethod):
 
     Args:
         latent: size of the latent.
-        keep: probability with which a joint is given, in training.
-        rotate: turn every training window about the up axis by a uniform angle.
-        heading: turn every window so that its first pose faces one way, and the motion back. Turned windows then have
-            turned motions, exactly, and `rotate` changes nothing. None for not with Human3.6M's poses, as in the
-            paper, where that is left to learn, and for so with others whose left and right are known.
+        keep: probability that a joint is given, in training.
+        rotate: whether to rotate every training window about the up axis by a uniform angle.
+        heading: whether to rotate every window so that its first pose faces one way, and rotate the motion back. The
+            model is then exactly equivariant, and `rotate` has no effect. By default off for Human3.6M, as in the
+            paper, which leaves it to learning, and on for other skeletons with known left and right.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
@@ -67,55 +67,55 @@ class TrajectoryMethod(PoseMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Where left and right are unknown, so are headings."""
+        """Return the preset, without headings if left and right of the skeleton are unknown."""
         found = super().preset(skeleton)
         return found if skeleton.left and skeleton.right else {**found, "heading": False}
 
-    def beside(self) -> Paths:
-        """What its models see beside the motion."""
+    def extra_inputs(self) -> Paths:
+        """Return the view that adds inputs to the motion."""
         return Paths()
 
     def kind(self) -> type[TrajectoryModel]:
-        """Of its models for poses."""
+        """Return the class of the models for poses."""
         return TrajectoryModel
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """The model for windows with a root and one observed frame.
+        """Return the model for windows with a root and one observed frame.
 
-        Of sizes alone it is one with the paper's options whose batches hold y, r and s, of the size of x, beside x.
+        From sizes alone, it has the paper's options, and its batches contain x and y, r and s of the size of x.
 
         Raises:
-            ValueError: windows without a root, or with more than one observed frame; no size of x.
+            ValueError: if windows have no root or more than one observed frame, or the size of x is missing.
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            return self.filled(self.presets[HUMAN36M.name])._built(DynamicalVAE, schema.size(WHOLE))
+            return self.with_presets(self.presets[HUMAN36M.name])._built(DynamicalVAE, schema.size(WHOLE))
         protocol = Poses.of(schema, self.name).protocol
         if (protocol.root, protocol.observed) != NEEDED:
             raise ValueError(
-                f"{self.name} moves a body through space from one pose on, but the protocol {protocol.name} has "
+                f"{self.name} moves a body through space from one pose, but the protocol {protocol.name} has "
                 f"root={protocol.root!r} and {protocol.observed} observed frames; use one with root='relative' and "
                 f"observed=1, such as {', '.join(n for n, p in PROTOCOLS.items() if (p.root, p.observed) == NEEDED)}"
             )
         return self.build_on(schema.skeleton, schema.frames - 1)
 
     def build_on(self, skeleton: Skeleton, frames: int | None = None) -> TrajectoryModel:
-        """The model for poses of this skeleton, to be fitted to motions of T frames after the first pose."""
-        method = self.filled(self.preset(skeleton))
+        """Return the model for poses of this skeleton, to fit to motions of T frames after the first pose."""
+        method = self.with_presets(self.preset(skeleton))
         if method.heading:
-            skeleton.heading(torch.zeros(skeleton.joints, 3))  # refuses one without left and right
+            skeleton.heading(torch.zeros(skeleton.joints, 3))  # raises without left and right
         return method._built(method.kind(), 3 * skeleton.joints, method, skeleton, frames)
 
     def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
         generative, inference = self.equations()
         names = {*generative.variables, *generative.context, *inference.context}
         poses = {name: size for name in (WHOLE, FIRST, GIVEN, REST) if name in names}
-        return kind(*arguments, **self.described(poses))
+        return kind(*arguments, **self.model_arguments(poses))
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Maximises the bound, on windows that are turned anyhow, with some paths given."""
+        """Return one stage that maximises the bound, on windows with random rotations and given paths."""
         turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))
         return Recipe(turned.given(self.keep), validation and validation.given(self.keep), [Stage(steps)])
 
@@ -125,8 +125,8 @@ class LatentTrajectoryMethod(TrajectoryMethod):
     """A method that completes motion in many ways. The likelihood is the paper's squared error.
 
     Args:
-        beta: weight of the KL, beside squared errors in square metres.
-        complement: the guide sees the joints that are not given, and not the others.
+        beta: weight of the KL, relative to squared errors in square metres.
+        complement: whether the guide reads only the joints that are not given.
     """
 
     trainings: ClassVar[Mapping[str, Training]] = {
@@ -140,48 +140,48 @@ class LatentTrajectoryMethod(TrajectoryMethod):
     complement: bool = True
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """x is normal with variance 1/2, minus whose log-density is the squared error."""
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return a normal distribution of x with variance 1/2, whose negative log-density is the squared error."""
         return {"p(x)": FixedNormal(scale=sqrt(0.5), error_weight=True)}
 
     @override
-    def beside(self) -> Paths:
-        return Rest(self.complement)
+    def extra_inputs(self) -> Paths:
+        return OtherJoints(self.complement)
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Minimises squared errors and the weighted KL, on such windows.
+        """Return one stage that minimises squared errors and the weighted KL, on the same windows.
 
-        The best weights are those of the lowest loss: beta is part of the model, which the bound does not know.
+        The best weights have the lowest loss, because the bound does not include beta, which is part of the model.
         """
-        method: Any = self.suited(train)
+        method: Any = self.resolve_defaults(train)
         stages = [Stage(steps, Evidence(kl_weight=method.beta, select="loss"))]
         return replace(super().train(train, validation, steps), stages=stages)
 
 
 class Paths(View):
-    """Beside the motion, given trajectories; without any in a batch none are."""
+    """A view that adds given trajectories to the motion; a batch without trajectories gives none."""
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         return Batch({GIVEN: torch.zeros_like(data[WHOLE]), **data}) if WHOLE in data else data
 
 
 @dataclass(frozen=True)
-class Rest(Paths):
-    """Beside the motion, given trajectories and the joints that are not given.
+class OtherJoints(Paths):
+    """A view that adds given trajectories and the joints that are not given to the motion.
 
     Args:
-        complement: False for r that is all of x.
+        complement: whether r has zeros at the given joints; otherwise r is all of x.
     """
 
     complement: bool
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         if WHOLE not in data:
             return data
-        seen, x = super().__call__(data, beside), data[WHOLE]
+        seen, x = super().__call__(data, view_inputs), data[WHOLE]
         if (mask := data.mask()) is not None:
             x = torch.where(mask, x, 0.0)
         return Batch({REST: torch.where(seen[GIVEN] == 0, x, 0.0) if self.complement else x, **seen})
@@ -190,20 +190,20 @@ class Rest(Paths):
 class TrajectoryModel(DynamicalVAE):
     """A model of motion given its first pose and some trajectories.
 
-    A batch holds either windows x (B, 1 + T, D), whose first frame is s, with y (B, 1 + T, D) if trajectories are
-    given, or the variables themselves: s (B, D), y (B, T, D) and, to train, x and r.
+    A batch contains either windows x (B, 1 + T, D), whose first frame is s, with y (B, 1 + T, D) if trajectories are
+    given, or the variables themselves: s (B, D), y (B, T, D) and, for training, x and r.
 
-    Its programs see windows turned if the method says so (`heading`); what else it returns is as the batch was.
+    With the option `heading`, the programs see rotated windows; all other results have the orientation of the batch.
 
     Args:
-        method: with no option left open.
-        skeleton: of the poses.
-        frames: T of the motions that it is fitted to; None if that is not known.
-        **options: of `DynamicalVAE`.
+        method: method whose options are all resolved.
+        skeleton: skeleton of the poses.
+        frames: T, length of the motions that the model is fitted to; None if unknown.
+        **options: arguments of `DynamicalVAE`.
     """
 
     def __init__(self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, **options: Any):
-        seen: list[View] = [Past(FIRST, also=(GIVEN,)), method.beside()]
+        seen: list[View] = [Past(FIRST, also=(GIVEN,)), method.extra_inputs()]
         if method.heading:
             seen.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
         super().__init__(view=Views(*seen), **options)
@@ -211,10 +211,10 @@ class TrajectoryModel(DynamicalVAE):
 
     @override
     def model(self, batch: AnyBatch | None = None, *, curriculum: float = 1.0, **options: Any) -> dict[str, Tensor]:
-        """Without trajectories in the batch, none are given.
+        """Run the generative program; a batch without trajectories gives none.
 
         Raises:
-            ValueError: no pose to start from.
+            ValueError: if the batch has no initial pose.
         """
         data = self.read(batch, curriculum=curriculum)
         if FIRST not in data:
@@ -237,43 +237,43 @@ class TrajectoryModel(DynamicalVAE):
         temperature: float = 1.0,
         chunk: int = CHUNK,
     ) -> dict[str, Tensor]:
-        """Goes on from a pose, along the given trajectories if there are any.
+        """Continue from a pose, along the given trajectories if there are any.
 
-        (Longer than other functions by what its arguments mean.)
+        (This function is longer than others because of the documentation of its arguments.)
 
-        Of motions that are shorter than those the model was fitted to, it makes the whole, with joints at rest where
-        their trajectories end, and gives the beginning: z has the length of the whole.
+        For a horizon shorter than the motions that the model was fitted to, it predicts the whole motion and returns
+        the beginning, because z has the length of the whole. Joints rest where their trajectories end.
 
         Args:
             batch: x (B, 1, D) and, if trajectories are given, y (B, 1 + H, D) or longer; or s (B, D) and y (B, H, D).
-            horizon: H.
-            samples: S, motions for each pose.
-            draw_emission: see `DynamicalVAE.forecast`.
-            fix: nothing can be fixed; give trajectories.
-            temperature: of the latent's scale: 0 for the motion of the prior's mean, in all samples the same.
-            chunk: see `DynamicalVAE.forecast`.
+            horizon: H, number of frames to return.
+            samples: S, number of motions for each pose.
+            draw_emission: as in `DynamicalVAE.forecast`.
+            fix: not supported; give trajectories instead.
+            temperature: factor on the latents' scales; with 0 all samples are the motion of the prior's mean.
+            chunk: as in `DynamicalVAE.forecast`.
 
         Returns:
-            "x" (S, B, H, D) and the latents.
+            {"x": (S, B, H, D)} and the latents.
 
         Raises:
-            ValueError: more than one observed frame, trajectories that end before the horizon or are not of the poses'
-                size, or a temperature that is negative or not finite.
+            ValueError: if there is more than one observed frame, trajectories end before the horizon or do not have the
+                size of the poses, or the temperature is negative or not finite.
         """
         if fix:
-            raise ValueError(f"cannot fix {', '.join(fix)}: what is known of a motion are its trajectories, in y")
+            raise ValueError(f"cannot fix {', '.join(fix)}; give known parts of a motion as trajectories, in y")
         if horizon < 1 or samples < 1:
             raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
         if not 0 <= temperature < inf:
             raise ValueError(f"temperature is {temperature}; it must be finite and at least 0")
         data = self.read(batch)
         if WHOLE in data or FIRST not in data:
-            raise ValueError("a motion goes on from one pose: x (B, 1, D) or s (B, D)")
+            raise ValueError("a motion starts from one pose; give a batch with x (B, 1, D) or s (B, D)")
         data = self._whole(data, horizon)
         if self.frames is not None and horizon > self.frames:
             warnings.warn(
-                f"this model was fitted to motions of {self.frames} frames, and knows little of {horizon}: ask for "
-                "fewer, or fit it under a protocol that predicts so many",
+                f"this model was fitted to motions of {self.frames} frames, and may predict {horizon} frames badly; "
+                "reduce the horizon, or fit the model under a protocol that predicts as many",
                 stacklevel=3,  # torch.no_grad is between
             )
         length = data[GIVEN].shape[1]
@@ -290,30 +290,30 @@ class TrajectoryModel(DynamicalVAE):
             out = program(repeat(some, count), length=length, mean_emission=not draw_emission)
             made = {name: out[name].unflatten(0, (count, -1)) for name in (WHOLE, *self.latents)}
             made[WHOLE] = made[WHOLE][:, :, :horizon]
-            return self.shown(made, some)
+            return self.to_data_space(made, some)
 
         with self.running():
             out = in_chunks(futures, len(data[FIRST]), distinct, chunk)
-        # Samples that are all the same are one: rows of one product may differ in their last bits.
+        # Equal samples are copies of one, because rows of one matrix product may differ in their last bits.
         return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
     def _whole(self, data: Batch, horizon: int) -> Batch:
-        """The data, and trajectories over all frames that the networks are to make for a horizon.
+        """Return the data with trajectories over all frames that the networks predict for a horizon.
 
         Raises:
-            ValueError: trajectories that end before the horizon or are not of the poses' size.
+            ValueError: if trajectories end before the horizon or do not have the size of the poses.
         """
         first = data[FIRST]
         given = data.get(GIVEN, first.new_zeros(len(first), horizon, first.shape[-1]))
         if given.dim() != 3 or (len(given), given.shape[-1]) != first.shape:
             raise ValueError(
-                f"beside poses {tuple(first.shape)} trajectories are of shape (B, frames, D); got {tuple(given.shape)}"
+                f"poses have shape {tuple(first.shape)}; expected trajectories (B, frames, D), got {tuple(given.shape)}"
             )
         if given.shape[1] < horizon:
-            raise ValueError(f"the trajectories have {given.shape[1]} frames, but {horizon} are asked for")
+            raise ValueError(f"the trajectories have {given.shape[1]} frames, but the horizon is {horizon}")
         if not given.isfinite().all():
             raise ValueError(
-                "trajectories are finite, 0 at joints that are not given; `complete` takes paths with gaps"
+                "trajectories must be finite, and 0 at joints that are not given; `complete` accepts paths with gaps"
             )
         made = max(horizon, self.frames or horizon)
         rest = given[:, -1:].expand(-1, max(made - given.shape[1], 0), -1)
@@ -331,29 +331,31 @@ class TrajectoryModel(DynamicalVAE):
         steps: int = 400,
         progress: bool = False,
     ) -> Completion:
-        """Motions that start at a pose and follow paths of some joints.
+        """Return motions that start at a pose and follow paths of some joints.
 
-        (Longer than other functions by the arguments that it refuses.)
+        (This function is longer than others because of the arguments that it refuses.)
 
-        The networks know of a path frame by frame. Where it has gaps they are told of a straight one across them, from
-        the joint's place in the first pose on, and of a resting joint behind the last known frame. See `forecast` for
-        motions of other lengths than those that the model was fitted to.
+        The networks read a path frame by frame. Missing frames are interpolated linearly, starting from the joint's
+        position in the first pose; after the last known frame the joint rests. `forecast` describes motions of other
+        lengths than those that the model was fitted to.
 
         Args:
-            initial_pose: positions (J, 3) of all joints in metres, anywhere in the world.
-            trajectories: joint to its path (T, 3) in metres in the same world, one frame after the pose first; a
-                frame with a NaN is not known. A joint has its name in the skeleton, or one such as "left_wrist".
-            frames: T; needed without trajectories.
-            samples: S, motions.
-            exact: have the given joints on their paths, by the most likely move of the latents and correction of the
-                poses, with bones at their lengths; see `dvae.motion.control`. The completion has the corrections.
-            temperature: of the latents' scales; 0 for the motion of the prior's mean.
-            steps: of the optimiser, with `exact`.
+            initial_pose: positions (J, 3) of all joints, in metres, in world coordinates.
+            trajectories: mapping from joint to path (T, 3), in metres, in the same coordinates. The first frame follows
+                the pose; a frame with a NaN is missing. A joint has its name in the skeleton, or one such as
+                "left_wrist".
+            frames: T, number of frames; required without trajectories.
+            samples: S, number of motions.
+            exact: whether to put the given joints exactly on their paths, with the most likely change of the latents
+                and a correction of the poses that keeps bone lengths; see `dvae.motion.control`. The completion
+                contains the corrections.
+            temperature: factor on the latents' scales; 0 for the motion of the prior's mean.
+            steps: steps of the optimiser, with `exact`.
             progress: whether to show a progress bar, with `exact`.
 
         Raises:
-            ValueError: an unknown joint, a path of another length or without a known frame, positions that are not in
-                metres, or an exact motion without a path.
+            ValueError: if a joint is unknown, a path has another length or no known frame, positions are not in metres,
+                or `exact` is given without a path.
         """
         pose = _numbers(initial_pose, "the initial pose")
         if pose.shape != (self.skeleton.joints, 3):
@@ -363,8 +365,8 @@ class TrajectoryModel(DynamicalVAE):
             )
         if lacking := [name for name, place in zip(self.skeleton.names, pose, strict=True) if place.isnan().any()]:
             raise ValueError(
-                f"the initial pose lacks {', '.join(lacking)}, but motion starts at a whole one; take another window, "
-                "or fill the gaps first (`dvae impute RUN --filled FILE`)"
+                f"the initial pose has no positions of {', '.join(lacking)}, but must be complete; choose another "
+                "window, or fill the gaps first (`dvae impute RUN --filled FILE`)"
             )
         if complaint := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
             raise ValueError(complaint.replace("clip initial/pose", "the initial pose"))
@@ -379,23 +381,23 @@ class TrajectoryModel(DynamicalVAE):
             got = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
             raise ValueError(f"expected paths of one length, or frames= without any; got {got}")
         if exact and not paths:
-            raise ValueError("exact=True has motions follow paths; give some trajectories")
+            raise ValueError("exact=True makes motions follow paths, but got no path; give trajectories")
         if exact and not self.latents:
             raise ValueError(
-                f"exact=True has motions follow paths by a move of their latents, of which {self.method.name} has "
-                "none; take a method with latents, such as trajevae"
+                f"exact=True makes motions follow paths by a change of their latents, but {self.method.name} has no "
+                "latents; use a method with latents, such as trajevae"
             )
         length = next(iter(lengths.values()))
         world = pose[self.skeleton.root]
         told, known = pose.new_zeros(2, length, self.skeleton.joints, 3)
         for joint, path in paths.items():
             seen = path.isfinite().all(-1)
-            told[:, joint] = _bridged(path, seen, pose[joint]) - world
+            told[:, joint] = _interpolated(path, seen, pose[joint]) - world
             known[:, joint] = seen[:, None].double()
             if not told[:, joint].any():
                 warnings.warn(
-                    f"{self.skeleton.names[joint]} rests where the first pose has the root, which is how networks are "
-                    "told of no path at all; exact=True holds it there",
+                    f"{self.skeleton.names[joint]} rests at the root of the first pose, which networks read as a joint "
+                    "without a path; exact=True keeps it there",
                     stacklevel=2,
                 )
         first = (pose - world).flatten()[None]
@@ -415,7 +417,7 @@ class TrajectoryModel(DynamicalVAE):
         return Completion(self.skeleton, motion.numpy(), errors, corrections)
 
     def _path(self, joint: str, given: Any, pose: Tensor) -> Tensor:
-        """A path as it was given, if it can be one."""
+        """Return a given path, after checking it."""
         path = _numbers(given, f"the path of {joint}")
         path[~path.isfinite()] = torch.nan
         if path.dim() != 2 or path.shape[-1] != 3:
@@ -430,7 +432,7 @@ class TrajectoryModel(DynamicalVAE):
         if leaps[worst] > LEAP:
             what = (
                 f"the path of {joint} moves by {leaps[worst]:.4g} m a frame before its frame {frames[worst + 1]} "
-                f"(from {'the pose' if worst == 0 else f'frame {frames[worst]}'} on)"
+                f"(since {'the pose' if worst == 0 else f'frame {frames[worst]}'})"
             )
             if leaps[worst] > FAR:
                 raise ValueError(f"{what}; paths are in metres, in the same world as the pose")
@@ -440,7 +442,7 @@ class TrajectoryModel(DynamicalVAE):
     def _followed(
         self, batch: Mapping[str, Tensor], latents: Tensor, known: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor]:
-        """Motions (S, T, D) on the given paths where these are known, and their corrections."""
+        """Return motions (S, T, D) that are on the given paths at known frames, and their corrections."""
         data = self._whole(self.read(batch), len(known))
         known = torch.cat([known, known.new_zeros(data[GIVEN].shape[1] - len(known), known.shape[1])])
         bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
@@ -454,23 +456,23 @@ class TrajectoryModel(DynamicalVAE):
         with self.running():
             with torch.no_grad():
                 scale = self.generator[self.latents[0]](data, 1, len(known))[1]
-            x, corrections = bend(means, latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options)
-        return self.shown({WHOLE: x}, data)[WHOLE], corrections
+            x, corrections = follow_paths(means, latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options)
+        return self.to_data_space({WHOLE: x}, data)[WHOLE], corrections
 
     def _warn_of_stretching(self, motion: Tensor, pose: Tensor) -> None:
-        """Warns where more than one bone of twenty is more than a tenth too long or too short."""
+        """Warn if more than 5 % of the bones are more than 10 % too long or too short."""
         lengths, true = (self.skeleton.bone_lengths(positions.numpy()) for positions in (motion, pose))
         share = np.mean(np.abs(lengths - true) < 0.1 * true)
         if share < 0.95:
             warnings.warn(
-                f"only {share:.1%} of the bones are within 10 % of their length; the paths may be out of reach for "
-                "this body, or the model too little fitted",
+                f"only {share:.1%} of the bones are within 10 % of their length; the body may not reach the paths, or "
+                "the model needs more training",
                 stacklevel=3,
             )
 
 
 FAR, LEAP = 5.0, 0.5
-"""Metres a frame: no joint moves so far, and one that moves so is odd."""
+"""Metres per frame: no joint moves farther than `FAR`, and a joint that moves farther than `LEAP` is suspicious."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -478,10 +480,10 @@ class Completion:
     """Motions along given paths.
 
     Args:
-        skeleton: the tree.
-        positions: (S, T, J, 3), metres, in the world of the pose and the paths.
-        errors: joint to (S, T), metres between it and its path; NaN where that is not known.
-        corrections: (S, T, J), metres by which exact motions are moved beyond what the decoder makes; else None.
+        skeleton: skeleton of the positions.
+        positions: (S, T, J, 3), in metres, in the coordinates of the pose and the paths.
+        errors: mapping from joint to its distance from its path, (S, T), in metres; NaN at missing frames.
+        corrections: (S, T, J), distances between exact motions and the decoder's output, in metres; otherwise None.
     """
 
     skeleton: Skeleton
@@ -503,15 +505,15 @@ class Completion:
 
 
 def _numbers(given: Any, what: str) -> Tensor:
-    """A copy of an array, in double precision."""
+    """Return a copy of an array, in double precision."""
     try:
         return torch.tensor(np.array(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=np.float64))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} is no array of numbers: {error}") from error
+        raise ValueError(f"{what} is not an array of numbers: {error}") from error
 
 
-def _bridged(path: Tensor, seen: Tensor, start: Tensor) -> Tensor:
-    """The path (T, 3) without gaps: straight between known frames, from its start one frame before."""
+def _interpolated(path: Tensor, seen: Tensor, start: Tensor) -> Tensor:
+    """Return the path (T, 3), interpolated linearly between known frames, from `start` one frame before it."""
     times = np.concatenate([[-1], seen.nonzero()[:, 0].numpy()])
     places = torch.cat([start[None], path[seen]]).numpy()
     now = np.arange(len(path))

@@ -1,18 +1,19 @@
-"""TrajeVAE: motion from one pose and any number of joint trajectories, all at once, by its cosine coefficients.
+"""TrajeVAE: motion from one pose and any number of joint trajectories, all steps at once, by cosine coefficients.
 
     p(z_k | y_{1:T}, s) p(x_t | z_{1:T}, s)        q(z_k | r_{1:T}, s)
 
-k counts coefficients of the cosine transform, t frames; z has as many of the one as x has of the other, so that here
-both are steps. The prior is learned: a transformer of the given trajectories y and the first pose s. The guide reads
-what the trajectories leave out, r. The mean of x is s plus offsets, summed up over time. Minimised is
+k counts coefficients of the cosine transform, and t counts frames. z has as many coefficients as x has frames, so that
+both are steps here. The prior is learned: a transformer of the given trajectories y and the first pose s. The guide
+reads the remaining joints, r. The mean of x is s plus the cumulative sum of offsets over time. The loss is
 
     sum_t |x_t - mean_t|^2 + .01 KL(q | p)
 
-Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation: prior and guide
-share the perceptrons of poses and two of three transformers, and the decoder the perceptron of s. Ours: scales of z are
-softplus where that has log-variances; and without the learned prior, of which the paper says little, the decoder reads
-the trajectories beside z, in time and as they are. Off the paper's data, options left open stand for small networks,
-few coefficients, a cheaper z and windows turned to one heading (docs/results/trajevae.md).
+Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation. Prior and guide
+share the perceptrons of poses and two of three transformers; the decoder shares the perceptron of s. Two choices are
+ours. Scales of z use softplus, whereas the public implementation has log-variances. Without the learned prior, on which
+the paper gives little detail, the decoder reads z and the trajectories, the latter in time without a transform. On
+other data than the paper's, the defaults are small networks, few coefficients, a smaller weight of the KL and windows
+rotated to one heading (docs/results/trajevae.md).
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ...distributions.base import Law, LawSpec, Parameters, Shape
-from ...distributions.families import FixedNormal, Normal, NormalLaw
+from ...distributions.base import ConditionalDistribution, DistributionSpec, Parameters, Shape
+from ...distributions.families import FixedNormal, Normal, NormalModule
 from ...factorization.notation import Factorization
 from ...motion import Skeleton
 from ...networks import CosineDecoder, CosineEncoder, NetworkSpec
@@ -42,23 +43,23 @@ PRESETS = table(
     "latent beta components width feedforward layers dropout heading",
     {"human36m": (512, 0.01, 0, 256, 512, 2, 0.1, False), "": (32, 0.001, 15, 32, 128, 1, 0.0, True)},
 )
-"""Skeleton to options: the paper's; and for others what learns in minutes on a processor."""
+"""Options by skeleton: the paper's; for other skeletons, options that train in minutes on a CPU."""
 
 
 @dataclass(frozen=True)
 class TrajeVAE(LatentTrajectoryMethod):
-    """See the file. Options that are None are chosen by the skeleton.
+    """The TrajeVAE. Options that are None are chosen for the skeleton.
 
     Args:
         latent: size of z, for each coefficient.
-        components: coefficients of z, the slow ones; 0 for as many as there are frames.
+        components: number of low-frequency coefficients of z; 0 for as many as frames.
         width: features of a pose; the transformers have twice as many.
-        feedforward: hidden units in their layers.
-        heads_count: of their attention.
-        layers: of each transformer.
-        dropout: share of units left out in training.
-        learned_prior: False for p(z) = N(0, I); the decoder then reads y.
-        cosine: False to leave out the cosine transform, so that z has one value for each frame.
+        feedforward: hidden units in the layers of the transformers.
+        heads_count: number of attention heads.
+        layers: layers of each transformer.
+        dropout: share of units dropped in training.
+        learned_prior: whether to learn the prior; otherwise p(z) = N(0, I), and the decoder reads y.
+        cosine: whether to use the cosine transform; otherwise z has one value for each frame.
     """
 
     name = "trajevae"
@@ -81,15 +82,17 @@ class TrajeVAE(LatentTrajectoryMethod):
         super().__post_init__()
         if self.width is not None and 2 * self.width % self.heads_count:
             raise ValueError(
-                f"{self.heads_count} heads do not divide the transformers' {2 * self.width} features; take a width "
-                "whose double they divide"
+                f"heads_count={self.heads_count} does not divide the transformers' {2 * self.width} features; choose "
+                "a width whose double it divides"
             )
         if self.components and not self.cosine:
-            raise ValueError("components are of the cosine transform; leave them at 0 without it")
+            raise ValueError(
+                f"components is {self.components}, but cosine=False has no coefficients; leave components at 0"
+            )
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Without the cosine transform there are no coefficients."""
+        """Return the preset; without the cosine transform it has no coefficients."""
         return {**super().preset(skeleton), **({} if self.cosine else {"components": 0})}
 
     @override
@@ -105,7 +108,7 @@ class TrajeVAE(LatentTrajectoryMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """The transformers; the model has them share what they share."""
+        """Return the transformers; the model ties their shared parts."""
         shared = ("width", "feedforward", "layers", "dropout", "cosine", "components")
         shape: dict[str, Any] = {"heads": self.heads_count, **{name: getattr(self, name) for name in shared}}
         encoder = CosineEncoder(**shape)
@@ -115,9 +118,9 @@ class TrajeVAE(LatentTrajectoryMethod):
         return {**found, "p(x)": CosineDecoder(hidden=2 * shape["width"], **shape)}
 
     @override
-    def laws(self) -> Mapping[str, LawSpec]:
-        """The decoder makes poses; normal latents, of which those beyond `components` are noise that nothing reads."""
-        latent: LawSpec = SlowNormal(steps=self.components) if self.components else Normal()
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return a normal distribution of poses and normal latents; no factor reads latents beyond `components`."""
+        latent: DistributionSpec = SlowNormal(steps=self.components) if self.components else Normal()
         emission = FixedNormal(scale=sqrt(0.5), project=False, error_weight=True)
         return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
 
@@ -132,27 +135,27 @@ class TrajeVAE(LatentTrajectoryMethod):
 
 
 def _slow(length: int, components: int) -> np.ndarray:
-    """Which coefficients each frame reads: the first ones."""
+    """Return the mask of the coefficients that each frame reads: the first ones."""
     return np.arange(length)[None] < components
 
 
 @dataclass(frozen=True)
 class SlowNormal(Normal):
-    """A `Normal` of the first so many steps of a local variable; later ones are N(0, I), whatever the features.
+    """A `Normal` for the first steps of a local variable; later steps are N(0, I), whatever the features.
 
     Args:
-        steps: how many.
+        steps: number of first steps.
     """
 
     steps: int = 0
 
     @override
-    def build(self, shape: Shape) -> Law:
-        return SlowNormalLaw(self, shape)
+    def build(self, shape: Shape) -> ConditionalDistribution:
+        return SlowNormalModule(self, shape)
 
 
-class SlowNormalLaw(NormalLaw):
-    """What `SlowNormal` describes."""
+class SlowNormalModule(NormalModule):
+    """Distribution of `SlowNormal`."""
 
     def __init__(self, spec: SlowNormal, shape: Shape):
         super().__init__(spec, shape)

@@ -20,8 +20,8 @@ import dvae
 from dvae import motion
 from dvae.cli import main
 from dvae.cli.app import exit_code
+from dvae.inference.diagnostics.reference_posterior import ReferencePosterior
 from dvae.inference.diagnostics.stein import SteinDiscrepancy
-from dvae.inference.diagnostics.yardstick import ReferencePosterior
 from dvae.motion.data.dataset import MotionData
 from dvae.runs import directory as runs
 
@@ -116,6 +116,11 @@ def test_a_closed_output_is_no_error(tmp_path):
     started = subprocess.run(["sh", "-c", '"$0" "$@" >&-', sys.executable, "-c", program], capture_output=True)
     assert (started.returncode, started.stderr) == (0, b"")
     assert (tmp_path / "a").read_bytes() == b""
+
+
+def test_all_options_of_equations_are_listed(capsys):
+    assert main(["fit", "equations", "--help-all"]) == 0
+    assert "--latents" in capsys.readouterr().out
 
 
 def test_version_is_printed(capsys):
@@ -250,7 +255,7 @@ def test_motion_is_completed_along_the_paths_of_a_clip_or_a_file(capsys, tracker
     error = failure(
         capsys, *run, "--out", str(out), "--joints", "LWrist", "--paths", str(tmp_path / "hand.csv"), code=2
     )
-    assert "LWrist is named by --joints" in error
+    assert "LWrist: both --joints and" in error
 
 
 def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
@@ -281,7 +286,7 @@ def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
     out = ["--out", str(tmp_path / "walk.npz")]
     along = ["--joints", "LWrist"]
     assert "which takes no paths" in failure(capsys, "forecast", str(fitted), *out, *along, code=2)
-    assert "by --joints or --paths" in failure(capsys, "forecast", str(tracker), *out, "--exact", code=2)
+    assert "with --joints or --paths" in failure(capsys, "forecast", str(tracker), *out, "--exact", code=2)
     assert "no joint 'tail'" in failure(capsys, "forecast", str(tracker), *out, "--joints", "tail")
     assert "none.csv" in failure(capsys, "forecast", str(tracker), *out, "--paths", str(tmp_path / "none.csv"))
     error = failure(capsys, "fit", "trajevae", "--data", str(people), "--out", str(tmp_path / "run"), "--steps", "2")
@@ -295,8 +300,8 @@ def log(run):
 
 @pytest.mark.filterwarnings("ignore:.*it is shortened to:UserWarning")
 def test_a_longer_run_is_laid_out_anew(people, tmp_path):
-    """The learning rate falls over the last half of all steps, self-feeding rises over their first half."""
-    out, options = tmp_path / "run", ["--width", "8", "--self-feeding", "0.5", *SMALL]
+    """The learning rate falls over the last half of all steps, scheduled sampling rises over their first half."""
+    out, options = tmp_path / "run", ["--width", "8", "--scheduled-sampling", "0.5", *SMALL]
     fit = ["fit", "vrnn", "--data", str(people), "--out", str(out), "--learning-rate", "0.01", "--tensorboard"]
     assert main([*fit, "--steps", "20", *options]) == 0
     assert [row["learning_rate"] for row in log(out)] == pytest.approx([0.01, 0.001])
@@ -306,7 +311,9 @@ def test_a_longer_run_is_laid_out_anew(people, tmp_path):
     rates = [row["learning_rate"] for row in log(out)]
     assert rates[2:] == pytest.approx([0.01, 0.01 * 21 / 30, 0.01 * 11 / 30, 0.01 / 30])
     feeding = dvae.load(out).method.train({}, steps=60).feeding
-    assert [row["self_feeding"] for row in log(out)][2:] == pytest.approx([feeding(s - 1) for s in (30, 40, 50, 60)])
+    assert [row["scheduled_sampling"] for row in log(out)][2:] == pytest.approx(
+        [feeding(s - 1) for s in (30, 40, 50, 60)]
+    )
     assert main(["resume", str(out), "--steps", "70", "--learning-rate", "0.02"]) == 0
     assert log(out)[-1]["learning_rate"] == pytest.approx(0.02 / 35)
 
@@ -339,7 +346,7 @@ def test_what_torchrun_starts_again_goes_on_with_its_run(people, tmp_path, capsy
     arguments = ["fit", "vae", "--data", str(people), "--out", str(tmp_path / "run"), "--steps", "5", *SMALL]
     assert main(arguments) == 0
     assert main(arguments) == 0
-    assert "holds a run, which goes on" in capsys.readouterr().err
+    assert "contains a run; continuing it" in capsys.readouterr().err
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
     assert "already holds a run" in failure(capsys, *arguments)
     assert "start it without torchrun" in failure(capsys, "sweep", "vae", "--out", str(tmp_path / "runs"))
@@ -364,9 +371,14 @@ def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeyp
 
 
 def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
-    with pytest.raises(ValueError, match=r"instead of self_feeding=0\.5 here write dvae\.method\(…, self_feeding=…\)"):
+    with pytest.raises(
+        ValueError, match=r"instead of scheduled_sampling=0\.5 here write dvae\.method\(…, scheduled_sampling=…\)"
+    ):
         dvae.fit(
-            dvae.method("vrnn"), MotionData.open(people), out=tmp_path / "run", **vars(dvae.Training(self_feeding=0.5))
+            dvae.method("vrnn"),
+            MotionData.open(people),
+            out=tmp_path / "run",
+            **vars(dvae.Training(scheduled_sampling=0.5)),
         )
 
 
@@ -392,7 +404,7 @@ def test_a_damaged_run_is_refused(capsys, run):
     (run / "config.json").write_text(json.dumps({**config, "method": {**config["method"], "latent": 4}}))
     assert "weights of another model" in failure(capsys, "evaluate", str(run))
     (run / "config.json").write_text(json.dumps({"method": config["method"]}))
-    assert "does not tell method, schema, data and training" in failure(capsys, "evaluate", str(run))
+    assert "does not describe method, schema, data and training" in failure(capsys, "evaluate", str(run))
     (run / "config.json").write_text("{")
     assert "not JSON" in failure(capsys, "evaluate", str(run))
 
@@ -450,7 +462,7 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
     capsys.readouterr()
     for command in ("forecast run --out f.npz", "evaluate run", "compare run", "resume run --steps 6"):
         assert "or other data (--data)" in failure(capsys, *command.split())
-    assert "own/people.npz is not here" in failure(capsys, "resume", "run", "--data", "own/people.npz")
+    assert "own/people.npz does not exist" in failure(capsys, "resume", "run", "--data", "own/people.npz")
     assert "has changed since" in failure(capsys, "resume", "run", *other)
     for command in (
         "forecast run --out f.npz --samples 2",
@@ -495,7 +507,7 @@ def test_data_of_other_joints_are_refused_unless_they_mean_the_same(capsys, run,
     motion.write_motion(tmp_path / "bvh", other, "bvh")  # whose joints mean those of the run
     told = ["forecast", str(run), "--data", str(tmp_path / "bvh"), "--out", str(tmp_path / "f.npz"), "--samples", "1"]
     assert main(told) == 0
-    assert "its joints are taken for those of" in capsys.readouterr().err
+    assert "its joints are matched with those of" in capsys.readouterr().err
 
 
 def test_debug_shows_where_it_failed(capsys, tmp_path):
@@ -576,7 +588,7 @@ def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, 
     assert "gsps reads positions of joints" in failure(capsys, *other, "--steps", "2")
 
 
-def test_forecasts_become_tubes_on_validation_windows_or_on_clips_of_a_label(capsys, tmp_path):
+def test_forecasts_become_bands_on_validation_windows_or_on_clips_of_a_label(capsys, tmp_path):
     clips = motion.simulate(clips=30, frames=90, seed=1)
     styled = [replace(clip, labels={"style": "ab"[place % 2]}) for place, clip in enumerate(clips)]
     styled[0] = replace(styled[0].between(0, 60), split="test", name="short")
@@ -586,17 +598,17 @@ def test_forecasts_become_tubes_on_validation_windows_or_on_clips_of_a_label(cap
     assert "too short for one: short" in capsys.readouterr().err
     assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5"]) == 0
     opened = dvae.load(run).data
-    assert dvae.Tubes.load(run / "coverage.json").clips == len(opened.windows("validation").clips)
+    assert dvae.PredictionBands.load(run / "coverage.json").clips == len(opened.windows("validation").clips)
     told = ["--label", "style", "--values", "a", "--out", str(tmp_path / "a.json"), "--figure", str(tmp_path / "a.png")]
     assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5", *told]) == 0
     assert "held 50 %, future" in capsys.readouterr().out
     test = opened.windows("test").clips
-    assert dvae.Tubes.load(tmp_path / "a.json").clips == sum(clip.labels["style"] == "a" for clip in test)
+    assert dvae.PredictionBands.load(tmp_path / "a.json").clips == sum(clip.labels["style"] == "a" for clip in test)
     assert (tmp_path / "a.png").stat().st_size
     for wrong, said in (
-        (["--label", "style"], "are given together"),
+        (["--label", "style"], "select the test clips for calibration; give both"),
         (["--label", "style", "--values", "c"], "no test clip has style c; there are a, b"),
-        (["--label", "style", "--values", "a", "b"], "all test clips would calibrate"),
+        (["--label", "style", "--values", "a", "b"], "selects all test clips"),
         (["--level", ".9"], "90 % need 9 clips"),
     ):
         assert main(["check", "coverage", str(run), "--samples", "4", *wrong])

@@ -9,7 +9,7 @@ import pytest
 import dvae
 from dvae import motion
 from dvae.cli import main
-from dvae.motion.segments.completion import glimpsed
+from dvae.motion.segments.completion import simulate_observations
 from dvae.motion.segments.reconstruction import Reconstruction
 from dvae.motion.segments.recovery import read_seen
 
@@ -80,7 +80,7 @@ def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder,
     assert "PCA of 11" in Reconstruction.load(run / "evaluation-people.json").rows
     change(second, ("data", "path"), "gone.npz")
     assert main(["evaluate", str(second), *other]) == 0
-    assert "no principal components" in capsys.readouterr().err
+    assert "omitted principal components" in capsys.readouterr().err
     assert list(Reconstruction.load(second / "evaluation-people.json").rows) == ["motion-latent"]
 
 
@@ -128,7 +128,10 @@ def opened(folder):
 def observations(run, **options):
     """What is seen of the body's markers in two segments of the run, for a file."""
     truth = run.data.windows("test").all()
-    return {name: value.numpy() for name, value in glimpsed(run.model, *truth.values(), "markers", **options).items()}
+    return {
+        name: value.numpy()
+        for name, value in simulate_observations(run.model, *truth.values(), "markers", **options).items()
+    }
 
 
 def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, opened, tmp_path):
@@ -139,12 +142,12 @@ def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, opened,
     np.savez(tmp_path / "both.npz", **seen)
     np.savez(tmp_path / "one.npz", **{name: value[0] for name, value in seen.items()})
     table, said = recovered(capsys, moved, "--file", tmp_path / "both.npz")
-    assert "the search starts from it alone" in said
+    assert "the search starts from this prior only" in said
     assert "seen/segment-00" in table
     assert "seen/segment-01" in table
     assert "vertex" not in table
     table, said = recovered(capsys, folder, "--file", tmp_path / "one.npz", "--out", tmp_path / "one.html")
-    assert "no segments are known" not in said
+    assert "no known segments" not in said
     assert "&#34;truth&#34;" not in (tmp_path / "one.html").read_text()
     names = [clip.name for clip in dvae.load(folder / "run").data.windows("test").motion]
     theirs, _ = recovered(capsys, folder, "--from", f"test/{names[0]}", "--seen", "markers", "--fps", "10")
@@ -178,7 +181,7 @@ def test_files_of_what_nobody_can_have_seen_are_refused(opened, tmp_path, change
 def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     error = failure(capsys, *command.replace("RUN", str(folder / "run")).split())
-    assert "is a fitted motion-latent, which makes whole segments and forecasts nothing; use dvae evaluate" in error
+    assert "is a fitted motion-latent, which generates whole segments and has no forecasts; use dvae evaluate" in error
     assert "impute" in error
     assert not list(tmp_path.iterdir())
 
@@ -189,20 +192,23 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
         ("fit motion-latent --protocol cmu8 --out new", "--protocol is about motion, and motion-latent is fitted on"),
         ("fit vae --cut clips --out new", "--cut is about segments of motion, and vae is fitted on motion"),
         ("fit motion-latent --cut clip --out new", "did you mean 'clips'"),
-        ("sweep motion-latent vae --out new", "motion-latent on segments of motion and vae on windows; give those of"),
+        (
+            "sweep motion-latent vae --out new",
+            "motion-latent on segments of motion and vae on windows; give methods of",
+        ),
         ("impute FITTED --from a", "are for runs of motion-latent"),
-        ("evaluate RUN --samples 3", "--samples is about forecasts"),
-        ("evaluate RUN FITTED", "on data of several kinds"),
-        ("impute RUN", "--from NAME --seen KIND of the run's segments, or a --file"),
-        ("impute RUN --from person_0001", "--seen what of it: surfaces, points or markers"),
-        ("impute RUN --file b.npz --seen points", "--file says all that was seen"),
-        ("impute RUN --from a --seen markers --frames 3 --fps 10", "--frames are seen at unknown times"),
+        ("evaluate RUN --samples 3", "--samples is for forecasts"),
+        ("evaluate RUN FITTED", "on several kinds of data"),
+        ("impute RUN", "--from NAME --seen KIND for segments of the run, or --file"),
+        ("impute RUN --from person_0001", "--from requires --seen surfaces, points or markers"),
+        ("impute RUN --file b.npz --seen points", "--file contains all observations"),
+        ("impute RUN --from a --seen markers --frames 3 --fps 10", "--frames is for unknown times"),
         ("impute RUN --from person_0001 --seen markers --frames 101", "segments of this run have 100"),
-        ("impute RUN --from person_0001 --seen markers --points 9", "--points says how many are seen of a surface"),
+        ("impute RUN --from person_0001 --seen markers --points 9", "--points is for --seen points"),
         ("impute RUN --from a --seen markers --samples 101", "--samples is 101; it must be at most 100"),
         ("impute RUN --from person_0001 person_0001 --seen markers", "names a segment twice"),
-        ("impute RUN --from person_0001 person_0002 --seen markers --out a.html", "shows one segment, of 2"),
-        ("impute RUN --from a --seen markers --out a.gif", "end its name in .npz or .html or"),
+        ("impute RUN --from person_0001 person_0002 --seen markers --out a.html", "can show one of 2 segments"),
+        ("impute RUN --from a --seen markers --out a.gif", "end the name in .npz or .html or"),
     ],
 )
 def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypatch, arguments, message):

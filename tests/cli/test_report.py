@@ -16,8 +16,8 @@ from dvae import motion
 from dvae.cli import main
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.drawing.player import SCRIPT, player
-from dvae.motion.drawing.plot import staged
-from dvae.runs.report import Section, document, lacking, sections
+from dvae.motion.drawing.plot import make_scene
+from dvae.runs.report import Section, document, missing_part, sections
 
 SMALL = ["--windows", "2", "--samples", "3", "--bound-windows", "3", "--particles", "4"]
 EVIL = "<script>said=1</script><img src=x onerror=said=1>$\\frac$"
@@ -131,7 +131,7 @@ def test_people_play_scrub_and_turn(page, tab):
 def test_the_browser_unpacks_the_motion_itself(tmp_path, tab):
     people = motion.simulate(clips=3, frames=12, seed=2)
     positions = np.stack([clip.positions for clip in people])
-    scene = staged(people.skeleton, positions[0, :5], positions[1:, 5:], positions[0, 5:9], every=1)
+    scene = make_scene(people.skeleton, positions[0, :5], positions[1:, 5:], positions[0, 5:9], every=1)
     path = tmp_path / "page.html"
     path.write_text(document("motion", [Section("a", before=player({"b": scene}))], [SCRIPT]), encoding="utf-8")
     tab.open(path, 800)
@@ -163,9 +163,15 @@ def scored(fitted, tmp_path_factory):
 def test_records_beside_a_run_are_shown(scored, tmp_path):
     run = {"a": dvae.load(scored)}
     evaluation = dvae.Evaluation.load(scored / "evaluation.json")
-    made = (sections.overview, sections.evaluated, sections.calibration, sections.bracketed, sections.yardsticks)
-    facts, scores, criticism, bracket, beside, tubes = (
-        Tags(document("a", [make(run)])).text for make in (*made, sections.tubes)
+    made = (
+        sections.overview,
+        sections.evaluated,
+        sections.calibration,
+        sections.bracketed,
+        sections.reference_posteriors,
+    )
+    facts, scores, criticism, bracket, beside, bands = (
+        Tags(document("a", [make(run)])).text for make in (*made, sections.prediction_bands)
     )
     assert str(evaluation["vae"]["ADE"]) in facts
     assert "lowest" in facts or "best bound" in facts
@@ -178,12 +184,12 @@ def test_records_beside_a_run_are_shown(scored, tmp_path):
     assert "amortisation" in bracket
     assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in beside
     assert "beside the posterior of 1 sequences" in beside
-    assert "held 40 %" in tubes
+    assert "held 40 %" in bands
     pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
-    dvae.ablate(pair, steps=2, twins=1).save(tmp_path / "a.json")
-    arrows = document("a", [sections.arrows(dvae.Ablation.load(tmp_path / "a.json"))])
-    assert "z_{t-1} to z_t" in Tags(arrows).text
-    assert "<img" in arrows
+    dvae.ablate(pair, steps=2, surrogates=1).save(tmp_path / "a.json")
+    edges = document("a", [sections.edges(dvae.Ablation.load(tmp_path / "a.json"))])
+    assert "z_{t-1} to z_t" in Tags(edges).text
+    assert "<img" in edges
     (tmp_path / "none.json").write_text("{}")
     assert main(["report", str(scored), "--out", "a.html", "--edges", str(tmp_path / "none.json")]) == 2
 
@@ -213,12 +219,13 @@ def test_runs_stand_side_by_side_with_a_table_first(people, fitted, tmp_path):
 def test_of_a_model_without_a_likelihood_it_is_said():
     windows = dvae.ArrayWindows(np.zeros((2, 4, 1), np.float32), 2)
     run = SimpleNamespace(model=SimpleNamespace(likelihood=False))
-    assert "It has no likelihood" in sections.weighed({"a": run}, windows).cells["a"]
+    assert "The model has no likelihood" in sections.weighed({"a": run}, windows).cells["a"]
 
 
 def test_what_runs_share_is_shown_once():
     page = document(
-        "a", [Section("b", {"first": lacking("same"), "second": lacking("same"), "third": lacking("else")})]
+        "a",
+        [Section("b", {"first": missing_part("same"), "second": missing_part("same"), "third": missing_part("else")})],
     )
     text = Tags(page).text
     assert text.count("same") == text.count("else") == 1
@@ -234,7 +241,7 @@ def test_a_run_without_its_data_or_its_log_is_shown_as_far_as_it_goes(run, tmp_p
     (run / "calibration.json").symlink_to(run / "config.json")
     report(run, "--out", tmp_path / "a.html")
     text = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
-    for said in ("say where they are with --data", "no log.jsonl", "not written by Evaluation", "is a link"):
+    for said in ("give their path with --data", "no log.jsonl", "not written by Evaluation", "is a link"):
         assert said in text
 
 
@@ -290,7 +297,7 @@ def test_an_interrupted_report_leaves_no_half_page(fitted, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--out page.png", "end its name in .html"),
+        ("--out page.png", "end the name in .html"),
         ("--out page.html --samples 0", "--samples is 0; it must be at least 1"),
         ("--out page.html --windows -1", "--windows is -1; it must be at least 0"),
     ],

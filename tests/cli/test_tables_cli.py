@@ -13,7 +13,7 @@ from dvae.cli import main
 from dvae.cli.fitting import DataOptions
 from dvae.cli.tables import is_table
 from dvae.inference.training.options import Training
-from dvae.models.registry import judges, methods
+from dvae.models.registry import methods, metric_models
 from dvae.tables import Cut, PanelData
 
 pd = pytest.importorskip("pandas")
@@ -73,7 +73,7 @@ def tabled(table, tmp_path_factory):
 def test_options_of_data_and_of_methods_have_names_of_their_own():
     data = {field.name for field in fields(DataOptions)}
     assert not data & {field.name for field in fields(Training)}
-    for name, kind in {**methods(), **judges()}.items():
+    for name, kind in {**methods(), **metric_models()}.items():
         assert not data & {field.name for field in fields(kind)}, name
 
 
@@ -92,7 +92,7 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     told = capsys.readouterr().out
     assert 'na_values = ["-999", "?"]' in told
     assert "riders" not in told.partition("a schema")[2].partition("columns")[2]
-    assert "options of columns are about tables" in failure(capsys, "data", "info", "simulated", "--id", "s", code=2)
+    assert "options of columns are for tables" in failure(capsys, "data", "info", "simulated", "--id", "s", code=2)
     assert schema.read_text() in printed
     schema.write_text(schema.read_text().replace('family = "count"', 'family = "overdispersed"'))
     assert main(["data", "info", str(path)]) == 0
@@ -101,7 +101,7 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     assert "riders.toml is no schema of a table: column 'riders' has an entry 'unt' (did you mean 'unit'?)" in failure(
         capsys, "data", "info", path
     )
-    assert "--out takes the schema of one table" in failure(
+    assert "--out writes the schema of one table" in failure(
         capsys, "data", "info", table, table, "--out", schema, code=2
     )
 
@@ -115,7 +115,7 @@ def test_what_is_proposed_of_dates_units_and_row_numbers_is_said(tmp_path, capfd
     assert main(["data", "info", str(path)]) == 0
     out, error = (" ".join(each.split()) for each in capfd.readouterr())
     assert "16 sequences of 12 steps" in out
-    assert "note: each value of shop is taken as a sequence" in out
+    assert "note: each value of shop is read as a separate sequence" in out
     assert "write them as 2024-12-31" in error
     assert "remove '€')" in error
     assert "'Unnamed: 0' (the numbers of the rows" in error
@@ -172,9 +172,9 @@ def test_names_of_files_end_in_what_a_command_writes_of_its_data(tabled, run, tm
     out = ["--out", tmp_path / "f.xlsx"]
     for command in ("forecast", "impute"):
         said = failure(capsys, command, tabled / "vae", *out, code=2)
-        assert said.endswith("end its name in .csv or .parquet or .npz")
-    assert failure(capsys, "forecast", run, *out, code=2).endswith("in .npz or .bvh, or in nothing for a folder")
-    assert failure(capsys, "impute", run, *out, code=2).endswith("end its name in .npz")
+        assert said.endswith("end the name in .csv or .parquet or .npz")
+    assert failure(capsys, "forecast", run, *out, code=2).endswith("in .npz or .bvh, or use no suffix for a folder")
+    assert failure(capsys, "impute", run, *out, code=2).endswith("end the name in .npz")
 
 
 def test_a_table_is_drawn_as_often_as_its_quantiles_need(tabled, tmp_path, capsys):
@@ -186,7 +186,7 @@ def test_a_table_is_drawn_as_often_as_its_quantiles_need(tabled, tmp_path, capsy
         assert main([*run, str(tmp_path / "a.npz"), "--samples", "9"]) == 0
         assert "left out" not in capsys.readouterr().err
         assert main([*run, str(tmp_path / "a.csv"), "--samples", "9"]) == 0
-        said = "left out, as they need more than 9 draws (--samples): q025 (39), q050 (19), q950 (19), q975 (39)"
+        said = "left out, because they need more than 9 draws (--samples): q025 (39), q050 (19), q950 (19), q975 (39)"
         assert said in " ".join(capsys.readouterr().err.split())
         written = [name for name in pd.read_csv(tmp_path / "a.csv") if name.startswith("q")]
         assert written == ["q100", "q250", "q500", "q750", "q900"]
@@ -215,15 +215,15 @@ def test_runs_of_whole_sequences_are_reported_without_futures(table, tmp_path, c
     assert main(["report", run, "--out", str(page), "--particles", "2", "--bound-windows", "2"]) == 0
     text = page.read_text()
     assert "cannot be shown" not in text
-    assert "These runs are of whole sequences. To see futures, fit with --observed and --horizon." in text
-    assert "importance bound" in text
+    assert "These runs were fitted on whole sequences. To see futures, fit with --observed and --horizon." in text
+    assert "IWAE bound" in text
     compared = ["compare", run, "--particles", "2", "--contrasts", "0", "--out", str(tmp_path / "a.json")]
     assert main(compared) == 0
     assert "no forecasts: whole sequences have no future" in capsys.readouterr().out
     assert json.loads((tmp_path / "a.json").read_text())["attributes"]["samples"] == 0
     refused = failure(capsys, "evaluate", run, code=2)
-    assert "fit with --observed and --horizon to forecast, or compare their bounds by `dvae compare`" in refused
-    assert "--stride is between windows" in failure(capsys, *compared, "--stride", "2", code=2)
+    assert "fit with --observed and --horizon to forecast, or compare bounds with `dvae compare`" in refused
+    assert "--stride is for windows" in failure(capsys, *compared, "--stride", "2", code=2)
 
 
 def test_one_sequence_by_its_name(tabled, tmp_path, capsys):
@@ -291,24 +291,24 @@ def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, cap
     assert "--columns is about a table, and motion-latent is fitted on segments of motion" in segments
     for option in ("--observed", "--test"):
         said = failure(capsys, "fit", "vae", *out, option, "0", code=2)
-        assert f"{option} is about tables; name one by --data" in said
+        assert f"{option} is about tables; name one with --data" in said
     assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
-        assert "is about motion" in failure(capsys, "evaluate", tabled / "vae", *option, code=2)
-    assert "--fix is about motion" in failure(capsys, "forecast", tabled / "vae", *out, "--fix", "lower", code=2)
+        assert "is for motion" in failure(capsys, "evaluate", tabled / "vae", *option, code=2)
+    assert "--fix is for motion" in failure(capsys, "forecast", tabled / "vae", *out, "--fix", "lower", code=2)
     own = [*out, "--data", next(tabled.parent.glob("table*/riders.csv")), "--steps", "1"]
     for name in ("gsps", "pose-prior"):
         said = failure(capsys, "fit", name, *own)
         assert "needs to know what poses are, and was given panel, which has none; take a method for any" in said
     said = failure(capsys, "fit", "srnn", *own, "--residual", "1")
-    assert 'leave residual at 0, or give all columns one law that does, by emission="normal"' in said
+    assert 'leave residual at 0, or give all columns one distribution that does, by emission="normal"' in said
     assert not (tmp_path / "run" / "config.json").exists()
 
 
 def test_motion_is_still_motion(people, run, tmp_path, capsys):
     assert not is_table(str(people))
     said = failure(capsys, "forecast", run, "--out", tmp_path / "a.npz", "--beyond", code=2)
-    assert "--beyond is about tables" in said
+    assert "--beyond is for tables" in said
     clip = motion.simulate(clips=1, frames=60).clips[0]
     alone = tmp_path / "alone" / "motion.npz"
     alone.parent.mkdir()

@@ -25,12 +25,12 @@ def test_attributes_are_entries_that_are_no_variables(named):
     assert torch.equal(batch.mask_to_nan().isnan(), ~seen)
     assert (batch.lengths.tolist(), batch.group.tolist()) == ([3, 2, 3, 1], [0, 1, 2, 3])
     plain = Batch(x=X)
-    assert (plain.mask(), plain.lengths, plain.group, plain.log_det, plain.beside) == (None, None, None, None, {})
+    assert (plain.mask(), plain.lengths, plain.group, plain.log_det, plain.view_inputs) == (None, None, None, None, {})
     assert not plain.partial
 
 
 def test_parts_of_a_batch_are_batches_with_the_same_rows_of_every_tensor():
-    batch = Batch(x=X, mask={"x": X > 3}, beside={"turns": X})
+    batch = Batch(x=X, mask={"x": X > 3}, view_inputs={"turns": X})
     for part in (slice(1, 3), [1, 2], torch.tensor([1, 2])):
         found = batch.rows(part)
         assert isinstance(found, Batch)

@@ -10,20 +10,20 @@ import dvae
 from dvae.data.batch import Batch
 from dvae.data.sequences import (
     ArrayWindows,
+    Batched,
     Fingerprinted,
     HeldOutWindows,
-    InBatches,
     Listed,
     Source,
     sequences,
 )
-from dvae.inference.training.objectives import Asking
+from dvae.inference.training.objectives import RequiresDraws
 from dvae.program.protocols import Forecasting, Program
 from dvae.tables import Panel
 
 
 @pytest.mark.parametrize(
-    "protocol", [Source, Listed, InBatches, Fingerprinted, HeldOutWindows, Program, Forecasting, Asking]
+    "protocol", [Source, Listed, Batched, Fingerprinted, HeldOutWindows, Program, Forecasting, RequiresDraws]
 )
 def test_asking_what_something_is_reads_nothing_of_it(protocol):
     read = []
@@ -38,7 +38,7 @@ def test_asking_what_something_is_reads_nothing_of_it(protocol):
 def test_a_past_holds_no_frame_of_the_future_but_of_context(named):
     x, mask, context = torch.randn(2, 7, 3), torch.rand(2, 7, 3) < 0.5, torch.randn(2, 7, 1)
     mask = {"x": mask} if named else mask
-    batch = Batch(x=x, mask=mask, beside={"turns": x}, y=context, w=torch.randn(2, 4))
+    batch = Batch(x=x, mask=mask, view_inputs={"turns": x}, y=context, w=torch.randn(2, 4))
     found, whole = batch.past(5).leaves(), batch.leaves()
     assert found.keys() == whole.keys()
     for name, value in found.items():
@@ -63,7 +63,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def panel():
-    return dvae.tables.PanelData.of(FRAME, dvae.tables.Told(id=("unit",), time="step"), dvae.tables.Cut(4, 2))
+    return dvae.tables.PanelData.of(FRAME, dvae.tables.ColumnHints(id=("unit",), time="step"), dvae.tables.Cut(4, 2))
 
 
 def fitted(model, data, **options):
@@ -83,10 +83,10 @@ ENTRIES = {
     "evaluate": lambda model, data: dvae.evaluate(model, data, samples=2, **QUIET),
     "compare": lambda model, data: dvae.compare({"a": model}, data, particles=2, contrasts=0, **QUIET),
     "checks": lambda model, data: dvae.predictive_checks(model, data, **QUIET),
-    "conformal": lambda model, data: dvae.conformal(model, data, level=0.5, samples=3, **QUIET),
+    "conformal": lambda model, data: dvae.conformal_bands(model, data, level=0.5, samples=3, **QUIET),
     "forecast": lambda model, data: model.forecast(data, 2),
     "impute": lambda model, data: model.impute(data),
-    "bound": dvae.importance_bound,
+    "bound": dvae.iwae_bound,
 }
 
 
@@ -95,7 +95,7 @@ ENTRIES = {
     [*((name, FRAME) for name in ENTRIES), ("fit", FRAME.set_index(["unit", "step"]).to_xarray())],
 )
 def test_a_table_without_roles_is_refused_with_the_call_that_gives_them(model, name, table):
-    with pytest.raises(TypeError, match=r"got (pandas|xarray)\..*PanelData\.of\(frame, dvae.tables.Told\(id="):
+    with pytest.raises(TypeError, match=r"got (pandas|xarray)\..*PanelData\.of\(frame, dvae.tables.ColumnHints\(id="):
         ENTRIES[name](model, table)
 
 

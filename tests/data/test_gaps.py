@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvae.data.sequences import gaps, since_observed
+from dvae.data.sequences import time_since_observed, time_since_previous
 
 
 @given(st.integers(1, 3), st.integers(1, 6), st.integers(0, 100))
@@ -15,7 +15,7 @@ def test_gaps_add_up_to_the_time_since_the_start(batch, steps, seed):
     times = torch.rand(batch, steps, generator=generator, dtype=torch.float64).add(0.01).cumsum(1) + 1e6
     lengths = torch.randint(1, steps + 1, (batch,), generator=generator)
     times[torch.arange(steps) >= lengths[:, None]] = torch.nan  # of padding
-    found = gaps(times, lengths)
+    found = time_since_previous(times, lengths)
     assert found.shape == (batch, steps, 1)
     assert found.dtype == times.dtype
     for row, n in enumerate(lengths.tolist()):
@@ -25,7 +25,7 @@ def test_gaps_add_up_to_the_time_since_the_start(batch, steps, seed):
 
 
 def test_whole_numbers_and_arrays_are_times():
-    found = gaps(np.array([[1950, 1953, 1954]]))
+    found = time_since_previous(np.array([[1950, 1953, 1954]]))
     assert found.dtype == torch.get_default_dtype()
     assert found.flatten().tolist() == [0, 3, 1]
 
@@ -40,7 +40,7 @@ def test_whole_numbers_and_arrays_are_times():
 )
 def test_times_that_do_not_rise_are_refused(times, message):
     with pytest.raises(ValueError, match=message):
-        gaps(torch.tensor(times))
+        time_since_previous(torch.tensor(times))
 
 
 @given(st.integers(1, 3), st.integers(1, 8), st.integers(1, 3), st.integers(0, 100))
@@ -52,12 +52,12 @@ def test_the_time_since_observed_is_that_of_the_recursion(batch, steps, size, se
     expected = [torch.zeros(batch, size, dtype=torch.float64)]
     for t in range(1, steps):
         expected.append(d[:, t] + torch.where(mask[:, t - 1], 0.0, expected[-1]))
-    torch.testing.assert_close(since_observed(mask, d), torch.stack(expected, 1))
+    torch.testing.assert_close(time_since_observed(mask, d), torch.stack(expected, 1))
     ones = torch.ones(batch, steps, 1)
-    torch.testing.assert_close(since_observed(mask), since_observed(mask, ones))
+    torch.testing.assert_close(time_since_observed(mask), time_since_observed(mask, ones))
 
 
 def test_a_short_gap_late_in_a_sequence_is_not_lost():
     d = torch.full((1, 4, 1), 1e-3)
     d[0, 1] = 1e6
-    assert since_observed(torch.ones(1, 4, 1, dtype=torch.bool), d)[0, 3].item() == pytest.approx(1e-3, rel=1e-6)
+    assert time_since_observed(torch.ones(1, 4, 1, dtype=torch.bool), d)[0, 3].item() == pytest.approx(1e-3, rel=1e-6)

@@ -116,7 +116,7 @@ def test_windows_of_mapped_motion_are_those_of_memory(tmp_path, monkeypatch, kin
             found, wanted = found.given(0.5), wanted.given(0.5)
         assert_windows_are_the_same(found, wanted)
         if kind == "missing":
-            some = [each.filled(each.positions(each.all()["x"])).fingerprint() for each in (found, wanted)]
+            some = [each.fill_missing(each.positions(each.all()["x"])).fingerprint() for each in (found, wanted)]
             assert some[0] == some[1]
     assert torch.equal(found.poses(), wanted.poses())
     assert all(is_mapped(clip.positions) for clip in read.divided())
@@ -351,7 +351,7 @@ def test_an_archive_that_is_mapped_may_be_larger_than_memory_and_one_that_is_rea
     positions = motion.simulate(clips=1, frames=30).clips[0].positions
     monkeypatch.setattr("dvae.motion.files.archive.MAPPED", 0)
     monkeypatch.setattr("dvae.motion.files.archive.LARGEST", 3 * positions.nbytes)
-    monkeypatch.setattr("dvae.motion.files.plain.LARGEST", 3 * positions.nbytes)
+    monkeypatch.setattr("dvae.motion.files.arrays.LARGEST", 3 * positions.nbytes)
     single = stored(tmp_path / "a.npz", **{f"train/{n}": positions for n in range(5)})
     assert len(motion.read_motion(single)) == 5
     with pytest.raises(ValueError, match=r"it has more than [\d,]+ bytes of motion that is not mapped as float32"):
@@ -417,10 +417,10 @@ def test_the_command_line_fits_to_a_mapped_file(tmp_path, monkeypatch, capsys):
     method = ["vae", "--latent", "2", "--warm-up", "1"]
     assert main(["fit", *method, "--data", "walks.npy", *cut_as, "--out", "run", "--steps", "2"]) == 0
     assert main(["resume", "run", "--steps", "3"]) == 0
-    monkeypatch.setattr("dvae.cli.judging.MOST_REMEMBERED", 100)
+    monkeypatch.setattr("dvae.cli.assessment.MOST_REMEMBERED", 100)
     assert main(["evaluate", "run", "--samples", "2"]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "no references that know training windows" in said
+    assert "omitted references that use training windows" in said
     saved(tmp_path / "walks.npy", walks((400, 2), seed=1))
     assert main(["resume", "run", "--steps", "4"]) == 1
     assert "has changed since run was fitted on it" in " ".join(capsys.readouterr().err.split())

@@ -49,19 +49,19 @@ def test_units_come_from_values_that_vary(values, said):
 
 
 @pytest.mark.parametrize(
-    ("network", "law"),
+    ("network", "distribution"),
     [
         (Attention(8, heads=2), dvae.distributions.Normal(residual=0.5)),
         (Recurrent(4), dvae.distributions.FixedNormal(0.3, learned=True)),
         (Recurrent(4), dvae.distributions.StudentT()),
     ],
 )
-def test_a_standardised_model_is_the_same_model_of_standardised_data(network, law):
+def test_a_standardised_model_is_the_same_model_of_standardised_data(network, distribution):
     """log p(x) = log p(u) - T D log s for u = (x - m) / s, with the guide's draws the same."""
     torch.manual_seed(0)
-    plain = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": law}).double()
+    plain = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": distribution}).double()
     torch.manual_seed(0)
-    model = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": law}).double()
+    model = dvae.DynamicalVAE(*PAIR, SIZES, network, {"p(x)": distribution}).double()
     units = model.standardise("x").double()
     x = 4 + 0.1 * torch.randn(5, 6, 3, dtype=torch.float64)
     units.fit(x)
@@ -76,7 +76,7 @@ def test_a_standardised_model_is_the_same_model_of_standardised_data(network, la
     found = []
     for each, data in ((model, x), (plain, units(x))):
         z = seeded(lambda e=each, d=data: e.guide({"x": d, "mask": mask})["z"])
-        bound = seeded(lambda e=each, d=data: dvae.particle_bound(e, d, particles=3).bound)
+        bound = seeded(lambda e=each, d=data: dvae.fivo_bound(e, d, particles=3).bound)
         found.append((z, bound, seeded(lambda e=each, d=data: e.forecast(d[:, :3], 4, 2)["x"])))
     (z, bound, future), (same_z, same_bound, same_future) = found
     torch.testing.assert_close(z, same_z)
@@ -85,14 +85,14 @@ def test_a_standardised_model_is_the_same_model_of_standardised_data(network, la
 
 
 def test_a_scale_that_is_given_is_in_the_variables_own_unit():
-    model = dvae.DynamicalVAE(*PAIR, SIZES, laws={"p(x)": dvae.distributions.FixedNormal(0.3)})
+    model = dvae.DynamicalVAE(*PAIR, SIZES, distributions={"p(x)": dvae.distributions.FixedNormal(0.3)})
     x = 4 + 0.1 * torch.randn(5, 6, 3)
     model.standardise("x").fit(x)
     site = poutine.trace(model.model).get_trace(x).nodes["x"]
     assert torch.allclose(site["fn"].steps(x).scale, torch.tensor(0.3))
 
 
-def far(mean, scale, law=None, network=None, **options):
+def far(mean, scale, distribution=None, network=None, **options):
     """A float32 model with the units of its data (B, T, D), of that mean and scale, and the same without the mean."""
     torch.manual_seed(0)
     shift = torch.tensor([mean, -mean, 0.0], dtype=torch.float64)
@@ -101,7 +101,7 @@ def far(mean, scale, law=None, network=None, **options):
     for data in (x, x - shift):
         torch.manual_seed(1)
         model = dvae.DynamicalVAE(
-            *PAIR, SIZES, network or Recurrent(4), {"p(x)": law or dvae.distributions.Normal()}, **options
+            *PAIR, SIZES, network or Recurrent(4), {"p(x)": distribution or dvae.distributions.Normal()}, **options
         )
         model.standardise("x").fit(data)
         found += [model, data]
@@ -112,7 +112,7 @@ NORMAL, LAPLACE = dvae.distributions.Normal(), dvae.distributions.Family("Laplac
 
 
 @pytest.mark.parametrize(
-    ("mean", "scale", "law"),
+    ("mean", "scale", "distribution"),
     [
         (1e6, 1.0, dvae.distributions.Normal(residual=0.5)),
         (1e9, 1.0, dvae.distributions.StudentT()),
@@ -122,8 +122,8 @@ NORMAL, LAPLACE = dvae.distributions.Normal(), dvae.distributions.Family("Laplac
     ],
     ids=str,
 )
-def test_a_large_mean_changes_neither_bound_nor_forecast(mean, scale, law):
-    shift, model, x, plain, y = far(mean, scale, law)
+def test_a_large_mean_changes_neither_bound_nor_forecast(mean, scale, distribution):
+    shift, model, x, plain, y = far(mean, scale, distribution)
     masks = torch.rand(6, 8, 1).expand(6, 8, 3) < 0.8
     for rest in ({}, {"mask": masks}, {"lengths": torch.tensor([8, 3, 5, 8, 1, 2])}):
         ours, theirs = (
@@ -155,12 +155,12 @@ def test_context_and_sites_are_in_their_own_unit(mean):
     torch.testing.assert_close(trace.nodes["x"]["fn"].steps(x).mean / 1e9, x / 1e9, rtol=0, atol=1e-8)
     read = model.read({"x": x, "c": c})
     assert torch.equal(model.read(read)["c"], c)
-    bounds = [dvae.particle_bound(model, {"x": x, "c": c}, particles=3).bound for _ in range(2)]
+    bounds = [dvae.fivo_bound(model, {"x": x, "c": c}, particles=3).bound for _ in range(2)]
     assert all(bound.isfinite().all() and (bound > -100).all() for bound in bounds)
 
 
 def test_scheduled_sampling_and_priors_of_the_data_read_a_large_mean():
-    vamp = {"laws": {"p(w)": dvae.distributions.Vamp(3, steps=2), "p(x)": dvae.distributions.Normal()}}
+    vamp = {"distributions": {"p(w)": dvae.distributions.Vamp(3, steps=2), "p(x)": dvae.distributions.Normal()}}
     pair = ("p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)")
     found = []
     for mean in (0.0, 1e9):
@@ -168,9 +168,11 @@ def test_scheduled_sampling_and_priors_of_the_data_read_a_large_mean():
         x = torch.randn(4, 6, 3, dtype=torch.float64)
         model = dvae.DynamicalVAE(*pair, SIZES, Recurrent(4), **vamp)
         model.standardise("x").fit(mean + x)
-        model.generator["w"].law.start_at(model.read(mean + x[:3]))
-        feeding = dvae.SelfFeeding(0.5)
-        found.append(seeded(lambda m=model, d=mean + x: dvae.SequenceELBO().terms(m, d, self_feeding=feeding).bound))
+        model.generator["w"].head.start_at(model.read(mean + x[:3]))
+        feeding = dvae.ScheduledSampling(0.5)
+        found.append(
+            seeded(lambda m=model, d=mean + x: dvae.SequenceELBO().terms(m, d, scheduled_sampling=feeding).bound)
+        )
     torch.testing.assert_close(*found, rtol=1e-5, atol=1e-3)
 
 

@@ -8,7 +8,7 @@ import dvae
 from dvae.data.batch import Batch
 from dvae.data.views import History, Parts, Past, View, Views
 from dvae.inference.bounds.predictive import predictive_bound
-from dvae.models.motion.trajectories import Rest
+from dvae.models.motion.trajectories import OtherJoints
 from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
 from dvae.networks import Recurrent
 
@@ -23,7 +23,7 @@ VIEWS = {
     "first frame": (Past("s"), D),
     "heading": (Heading(WALKER, 3), D),
     "heading of parts": (Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS})), D),
-    "heading of a first pose": (Views(Past("s"), Rest(True), Heading(WALKER, pose="s", turned=TURNED)), 3 * J),
+    "heading of a first pose": (Views(Past("s"), OtherJoints(True), Heading(WALKER, pose="s", turned=TURNED)), 3 * J),
 }
 
 
@@ -310,15 +310,19 @@ def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
 def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
     torch.manual_seed(0)
     equations = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
-    law = {"p(x)": dvae.distributions.Directions(residual=0.5)}
-    model = dvae.DynamicalVAE(*equations, {"z": 2, "x": D}, Recurrent(4), law, view=Bones(WALKER, 4)).double().eval()
+    distribution = {"p(x)": dvae.distributions.Directions(residual=0.5)}
+    model = (
+        dvae.DynamicalVAE(*equations, {"z": 2, "x": D}, Recurrent(4), distribution, view=Bones(WALKER, 4))
+        .double()
+        .eval()
+    )
     x = rigid(4, D)
     future = seeded(model.forecast, x, 5, 3)["x"]
     torch.testing.assert_close(lengths_of(future), lengths_of(x)[:, :1].expand(3, -1, 5, -1))
     assert not model.likelihood
     assert not dvae.SequenceELBO().terms(model, x).likelihood
     with pytest.raises(ValueError, match="has no likelihood"):
-        dvae.importance_bound(model, x, 2)
+        dvae.iwae_bound(model, x, 2)
 
 
 # --------------------------------------------------------------------------------------------- views that change volume
@@ -330,7 +334,7 @@ MIXING = torch.tensor([[2.0, 1.0, 0.0], [0.0, 0.5, 0.3], [0.1, 0.0, 3.0]], dtype
 class Scaled(View):
     """Each coordinate of x times a number of its own."""
 
-    def __call__(self, data, beside=None):
+    def __call__(self, data, view_inputs=None):
         return {**data, "x": data["x"] * FACTORS} if "x" in data and "log_det" not in data else dict(data)
 
     def inverse(self, seen):
@@ -343,7 +347,7 @@ class Scaled(View):
 class Mixed(Scaled):
     """Frames times a matrix; how much volume changes is known of whole sequences."""
 
-    def __call__(self, data, beside=None):
+    def __call__(self, data, view_inputs=None):
         return {**data, "x": data["x"] @ MIXING} if "x" in data and "log_det" not in data else dict(data)
 
     def inverse(self, seen):
@@ -356,8 +360,8 @@ class Mixed(Scaled):
 SMALL = ("p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3})
 ESTIMATES = {
     "bound": lambda model, batch: dvae.SequenceELBO().terms(model, batch).bound,
-    "importance": lambda model, batch: dvae.importance_bound(model, batch, particles=8, chunk=9).bound,
-    "particles": lambda model, batch: dvae.particle_bound(model, batch, particles=8, chunk=24).bound,
+    "importance": lambda model, batch: dvae.iwae_bound(model, batch, particles=8, chunk=9).bound,
+    "particles": lambda model, batch: dvae.fivo_bound(model, batch, particles=8, chunk=24).bound,
     "joint": lambda model, batch: sum(model.log_joint(batch, {"z": torch.ones(B, T, 2).double()}).values()),
     "Pyro's": lambda model, batch: torch.tensor([-pyro.infer.Trace_ELBO().loss(model, model.guide, batch)]),
 }
@@ -418,13 +422,13 @@ def test_the_log_score_has_the_volume_of_the_future():
 
 
 def test_the_oracle_of_a_scaled_model_is_the_density_of_the_data():
-    model = dvae.twin(*SMALL, T)
+    model = dvae.linear_gaussian_surrogate(*SMALL, T)
     x = people(B, T, 3)
     mean, precision = dvae.Oracle(model, T)._joint()
     scale = FACTORS.repeat(T)
     covariance = precision.inverse()[-3 * T :, -3 * T :] / scale / scale[:, None]
     expected = torch.distributions.MultivariateNormal(mean[-3 * T :] / scale, covariance).log_prob(x.flatten(1))
-    arguments = model.generative, model.inference, model.sizes, model.networks, model.laws
+    arguments = model.generative, model.inference, model.sizes, model.networks, model.distributions
     scaled = dvae.DynamicalVAE(*arguments, view=Scaled()).double()
     scaled.load_state_dict(model.state_dict())
     torch.testing.assert_close(dvae.Oracle(scaled, T).evidence(x), expected)

@@ -15,54 +15,58 @@ SIZES = [(1, 0), (2, 3), (5, 3)]
 
 
 def build(size=3, features=2, steps=2, **options):
-    """A law with parameters that are not those it starts with."""
-    law = ConditionalFlow(steps, (8,), **options).build(Shape(size, features)).double()
+    """A distribution with parameters that are not those it starts with."""
+    distribution = ConditionalFlow(steps, (8,), **options).build(Shape(size, features)).double()
     with torch.no_grad():
-        for parameter in law.parameters():
+        for parameter in distribution.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
-    return law
+    return distribution
 
 
-def given(law, features=2, rows=6):
+def given(distribution, features=2, rows=6):
     """Parameters of some rows."""
-    return law(torch.randn(rows, features, dtype=torch.float64))
+    return distribution(torch.randn(rows, features, dtype=torch.float64))
 
 
 @pytest.mark.parametrize(("size", "features"), SIZES)
 def test_its_determinant_is_that_of_the_jacobian_and_draws_are_the_noise_moved_back(size, features):
-    law = build(size, features, steps=4)
-    parameters, noise = given(law, features), torch.randn(6, size, dtype=torch.float64)
-    flow, x = law.distribution(parameters).flow, torch.randn(6, size, dtype=torch.float64)
+    distribution = build(size, features, steps=4)
+    parameters, noise = given(distribution, features), torch.randn(6, size, dtype=torch.float64)
+    flow, x = distribution.distribution(parameters).flow, torch.randn(6, size, dtype=torch.float64)
     for i, found in enumerate(flow.to_noise(x)[1]):
-        one = law.distribution(tuple(p[i] for p in parameters))
+        one = distribution.distribution(tuple(p[i] for p in parameters))
         jacobian = torch.autograd.functional.jacobian(lambda v, one=one: one.flow.to_noise(v)[0], x[i])
         torch.testing.assert_close(torch.linalg.slogdet(jacobian).logabsdet, found, rtol=0, atol=1e-10)
         density = dist.Normal(0, 1).log_prob(one.flow.to_noise(x[i])[0]).sum() + found
         torch.testing.assert_close(one.log_prob(x[i]), density)
-    x = law.draw(parameters, noise)
+    x = distribution.draw(parameters, noise)
     torch.testing.assert_close(flow.to_noise(x)[0], noise, rtol=0, atol=1e-10)
     torch.testing.assert_close(flow.from_noise(flow.to_noise(noise)[0]), noise, rtol=0, atol=1e-10)
-    torch.testing.assert_close(law.mean(parameters), law.draw(parameters, torch.zeros_like(noise)), rtol=0, atol=0)
+    torch.testing.assert_close(
+        distribution.mean(parameters), distribution.draw(parameters, torch.zeros_like(noise)), rtol=0, atol=0
+    )
     x.sum().backward()
-    read = [p for p in law.parameters() if p.numel()]
+    read = [p for p in distribution.parameters() if p.numel()]
     assert all(p.grad is not None and p.grad.any() for p in read)
 
 
 def test_another_unit_changes_its_density_by_the_unit_alone():
-    law, x = build(3), torch.randn(6, 3, dtype=torch.float64)
+    distribution, x = build(3), torch.randn(6, 3, dtype=torch.float64)
     mean, scale = torch.tensor([5.0, -1.0, 0.0]).double(), torch.tensor([0.1, 2.0, 30.0]).double()
-    parameters = given(law)
-    moved = law.in_units(parameters, mean, scale)
-    expected = law.distribution(parameters).log_prob(x) - scale.log().sum()
-    torch.testing.assert_close(law.distribution(moved).log_prob(mean + scale * x), expected)
+    parameters = given(distribution)
+    moved = distribution.rescale(parameters, mean, scale)
+    expected = distribution.distribution(parameters).log_prob(x) - scale.log().sum()
+    torch.testing.assert_close(distribution.distribution(moved).log_prob(mean + scale * x), expected)
     noise = torch.randn_like(x)
-    torch.testing.assert_close(law.draw(moved, noise), mean + scale * law.draw(parameters, noise))
+    torch.testing.assert_close(distribution.draw(moved, noise), mean + scale * distribution.draw(parameters, noise))
 
 
 def test_its_location_keeps_a_share_of_the_previous_value():
-    law, previous = build(3, residual=0.7), torch.randn(6, 3, dtype=torch.float64)
+    distribution, previous = build(3, residual=0.7), torch.randn(6, 3, dtype=torch.float64)
     features, x = torch.randn(6, 2, dtype=torch.float64), torch.randn(6, 3, dtype=torch.float64)
-    kept, none = (law.distribution(law(features, each)) for each in (previous, torch.zeros_like(previous)))
+    kept, none = (
+        distribution.distribution(distribution(features, each)) for each in (previous, torch.zeros_like(previous))
+    )
     torch.testing.assert_close(kept.log_prob(x + 0.7 * previous), none.log_prob(x))
 
 
@@ -74,8 +78,8 @@ class TestEveryLawAFlow(FactorizationContract):
     def build(self, size):
         pair = "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{t:T}, w)"
         flow = ConditionalFlow(2, (3,))
-        laws = {"p(w)": flow, "p": flow, "q": flow}
-        return dvae.DynamicalVAE(*pair, {"w": size, "z": size, "x": size}, Recurrent(3, hidden=(3,)), laws)
+        distributions = {"p(w)": flow, "p": flow, "q": flow}
+        return dvae.DynamicalVAE(*pair, {"w": size, "z": size, "x": size}, Recurrent(3, hidden=(3,)), distributions)
 
 
 class TestAFlowBesideOtherLaws(FactorizationContract):
@@ -84,8 +88,8 @@ class TestAFlowBesideOtherLaws(FactorizationContract):
     def build(self, size):
         first, second = range(0, size, 2), range(1, size, 2)
         parts = [(tuple(first), ConditionalFlow(2, (3,), residual=0.5)), (tuple(second), Normal())]
-        law = Product(tuple((places, own) for places, own in parts if places))
-        return dvae.DynamicalVAE("p(x_t | x_{t-1})", "", {"x": size}, Linear(), {"p(x)": law})
+        distribution = Product(tuple((places, own) for places, own in parts if places))
+        return dvae.DynamicalVAE("p(x_t | x_{t-1})", "", {"x": size}, Linear(), {"p(x)": distribution})
 
 
 def test_without_zuko_it_says_how_to_get_it(monkeypatch):

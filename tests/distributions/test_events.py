@@ -1,4 +1,4 @@
-"""Laws with one density for all that a step has: normals with full covariance, and classes."""
+"""Distributions with one density for all that a step has: normals with full covariance, and classes."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from pyro import poutine
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, importance_bound, particle_bound
+from dvae import DynamicalVAE, SequenceELBO, fivo_bound, iwae_bound
 from dvae.distributions import Family, FixedNormal, Vamp
 from dvae.inference.bounds.particles import Filter
 from dvae.networks import Recurrent
@@ -72,5 +72,5 @@ def test_particles_weigh_what_the_program_scores(kind, batch):
     log_q = sum(trace.nodes[name]["log_prob"] for name in model.latents)
     expected = sum(model.log_joint(many, latents).values()) - log_q
     torch.testing.assert_close(bound, expected.unflatten(0, (4, -1)).logsumexp(0) - math.log(4))
-    assert torch.isfinite(particle_bound(model, given, 8, resample_below=1.0).bound).all()
-    assert torch.isfinite(importance_bound(model, given, 30).bound).all()
+    assert torch.isfinite(fivo_bound(model, given, 8, resample_below=1.0).bound).all()
+    assert torch.isfinite(iwae_bound(model, given, 30).bound).all()

@@ -29,31 +29,31 @@ ALL = {
 }
 
 
-def built(law, size=2):
-    return dvae.DynamicalVAE(*PAIR, {"z": 2, "x": size}, Recurrent(4), {"p(x)": law})
+def built(distribution, size=2):
+    return dvae.DynamicalVAE(*PAIR, {"z": 2, "x": size}, Recurrent(4), {"p(x)": distribution})
 
 
 class Contract(dvae.testing.FactorizationContract):
-    """Of the families with something of their own; the others are laws of the same class."""
+    """Of the families with something of their own; the others are distributions of the same class."""
 
     missing = None
-    law = None
+    distribution = None
 
     def build(self, size):
-        return built(self.law, size)
+        return built(self.distribution, size)
 
 
 class TestCategorical(Contract):
-    law = Family("OneHotCategorical")
+    distribution = Family("OneHotCategorical")
     # of one class, or of one of which each is seen once, there is nothing to learn
 
 
 class TestNormalMixture(Contract):
-    law = distributions.NormalMixture(3)
+    distribution = distributions.NormalMixture(3)
 
 
 class TestLowRankNormal(Contract):
-    law = distributions.LowRankNormal(1)
+    distribution = distributions.LowRankNormal(1)
 
 
 class TestMixed(Contract):
@@ -89,18 +89,18 @@ class TestSeveralVariables(dvae.testing.FactorizationContract):
 
 @pytest.mark.parametrize("name", ALL)
 def test_draws_have_the_mean_that_the_law_says(name):
-    law = ALL[name].build(Shape(3, 4)).double()
-    parameters = law(torch.randn(2, 4, dtype=torch.float64))
+    distribution = ALL[name].build(Shape(3, 4)).double()
+    parameters = distribution(torch.randn(2, 4, dtype=torch.float64))
     n = 20_000
     many = tuple(p.expand(n, *p.shape) for p in parameters)
-    draws = law.draw(many, law.noise((n, 2, 3), parameters[0]))
+    draws = distribution.draw(many, distribution.noise((n, 2, 3), parameters[0]))
     if name == "cauchy":
-        assert torch.equal(law.mean(parameters), parameters[0])
+        assert torch.equal(distribution.mean(parameters), parameters[0])
     elif name == "angle":
         middle = torch.atan2(draws.sin().mean(0), draws.cos().mean(0))
-        torch.testing.assert_close(middle, law.mean(parameters), atol=0.1, rtol=0)
+        torch.testing.assert_close(middle, distribution.mean(parameters), atol=0.1, rtol=0)
     else:
-        z = (draws.mean(0) - law.mean(parameters)) / (draws.std(0) / n**0.5 + 1e-12)
+        z = (draws.mean(0) - distribution.mean(parameters)) / (draws.std(0) / n**0.5 + 1e-12)
         assert z.abs().max() < 5
 
 
@@ -119,23 +119,23 @@ DENSITIES = {
 
 @pytest.mark.parametrize("name", DENSITIES)
 def test_densities_are_those_of_scipy(name):
-    law = ALL[name].build(Shape(3, 4)).double()
+    distribution = ALL[name].build(Shape(3, 4)).double()
     with torch.no_grad():
-        parameters = law(torch.randn(2, 4, dtype=torch.float64))
-        value = law.draw(parameters, law.noise((2, 3), parameters[0]))
-        found = law.distribution(parameters).log_prob(value)
+        parameters = distribution(torch.randn(2, 4, dtype=torch.float64))
+        value = distribution.draw(parameters, distribution.noise((2, 3), parameters[0]))
+        found = distribution.distribution(parameters).log_prob(value)
     expected = DENSITIES[name]([p.numpy() for p in parameters], value.numpy())
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6 if name == "angle" else 1e-10)
 
 
 def test_angles_have_densities_and_gradients_at_every_concentration_of_single_precision():
-    law, logs = Family("VonMises", project=False).build(Shape(1, 2)), torch.linspace(-80.0, 80.0, 33)
+    distribution, logs = Family("VonMises", project=False).build(Shape(1, 2)), torch.linspace(-80.0, 80.0, 33)
     features = torch.stack([torch.full_like(logs, 0.25), logs], -1).requires_grad_()
     concentration = logs.exp().double().numpy()
     value = (0.25 + torch.exp(-logs / 2).clamp(max=2.0))[:, None]
     apart = (value.double() - 0.25).numpy()[:, 0]
     kernel = -2 * np.sin(apart / 2) ** 2
-    density = law.distribution(law(features)).log_prob(value)[:, 0]
+    density = distribution.distribution(distribution(features)).log_prob(value)[:, 0]
     expected = concentration * kernel - np.log(2 * np.pi * special.i0e(concentration))
     np.testing.assert_allclose(density.detach().numpy(), expected, rtol=1e-5, atol=1e-5)
     (gradient,) = torch.autograd.grad(density.sum(), features)
@@ -144,39 +144,39 @@ def test_angles_have_densities_and_gradients_at_every_concentration_of_single_pr
     slope = concentration * (kernel + 1 - special.i1e(concentration) / special.i0e(concentration))
     np.testing.assert_allclose(gradient[moderate, 1].numpy(), slope[moderate], rtol=1e-3, atol=1e-5)
     assert gradient.isfinite().all()
-    draws = law.draw(law(features), law.noise((33, 1), features))
+    draws = distribution.draw(distribution(features), distribution.noise((33, 1), features))
     assert draws.isfinite().all()
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if ALL[name].build(Shape(3, 4)).location_scale])
 def test_in_units_a_law_is_that_of_the_variable_in_its_unit(name):
-    law = ALL[name].build(Shape(3, 4)).double()
-    parameters = law(torch.randn(2, 4, dtype=torch.float64))
+    distribution = ALL[name].build(Shape(3, 4)).double()
+    parameters = distribution(torch.randn(2, 4, dtype=torch.float64))
     if name == "fixed":
-        assert law.learned  # what is given is in the variable's own unit
+        assert distribution.learned  # what is given is in the variable's own unit
     scale = torch.tensor([0.5, 2.0, 30.0], dtype=torch.float64)
     mean = torch.arange(3.0).double() * (name in REAL)
-    there = law.in_units(parameters, mean, scale)
-    torch.testing.assert_close(law.mean(there), mean + scale * law.mean(parameters))
-    if not law.distribution(parameters).support.is_discrete:
-        value = law.draw(parameters, law.noise((2, 3), parameters[0])).detach()
-        volume = scale.log() if not law.distribution(parameters).event_shape else scale.log().sum()
-        here = law.distribution(parameters).log_prob(value)
-        torch.testing.assert_close(law.distribution(there).log_prob(mean + scale * value), here - volume)
+    there = distribution.rescale(parameters, mean, scale)
+    torch.testing.assert_close(distribution.mean(there), mean + scale * distribution.mean(parameters))
+    if not distribution.distribution(parameters).support.is_discrete:
+        value = distribution.draw(parameters, distribution.noise((2, 3), parameters[0])).detach()
+        volume = scale.log() if not distribution.distribution(parameters).event_shape else scale.log().sum()
+        here = distribution.distribution(parameters).log_prob(value)
+        torch.testing.assert_close(distribution.distribution(there).log_prob(mean + scale * value), here - volume)
 
 
 REAL = ("real", "fixed", "robust", "laplace", "mixture", "correlated", "multivariate", "cauchy")
 
 
 def test_a_product_is_its_parts():
-    law = MIXED.build(Shape(4, 5)).double()
-    parameters = law(torch.randn(2, 3, 5, dtype=torch.float64))
-    value = law.draw(parameters, law.noise((2, 3, 4), parameters[0]))
-    whole, parts = law.distribution(parameters), law.each(parameters)
+    distribution = MIXED.build(Shape(4, 5)).double()
+    parameters = distribution(torch.randn(2, 3, 5, dtype=torch.float64))
+    value = distribution.draw(parameters, distribution.noise((2, 3, 4), parameters[0]))
+    whole, parts = distribution.distribution(parameters), distribution.each(parameters)
     for own, places, theirs in parts:
         expected = own.distribution(theirs).log_prob(value[..., places])
         torch.testing.assert_close(whole.log_prob(value)[..., places], expected)
-        torch.testing.assert_close(law.mean(parameters)[..., places], own.mean(theirs))
+        torch.testing.assert_close(distribution.mean(parameters)[..., places], own.mean(theirs))
     assert whole.support.check(value).all()
     assert not whole.support.check(value - 100)[..., 1:3].any()
     twice = distributions.Product((((0, 1), distributions.Normal()), ((1,), distributions.Normal())))
@@ -205,11 +205,11 @@ T, SIZE, DRAWS = 5, 3, 9
 EDGES = torch.linspace(-5, 5, 402, dtype=torch.float64)
 
 
-def moved(law):
-    """w moves every parameter of the law, in the middle of its range and steadily."""
+def moved(distribution):
+    """w moves every parameter of the distribution, in the middle of its range and steadily."""
     torch.manual_seed(0)
     networks = {"p(x)": Dense((4,)), "default": Dense((2,))}
-    model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w)", {"w": 1, "x": SIZE}, networks, {"p(x)": law}).double()
+    model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w)", {"w": 1, "x": SIZE}, networks, {"p(x)": distribution}).double()
     for name, parameter in model.generator["x"].named_parameters():
         parameter.data *= 2 if name.endswith("weight") else 1
     return model
@@ -222,8 +222,8 @@ def posterior(model):
         x, middles = batch["x"].unflatten(0, (DRAWS, -1))[0], (EDGES[1:] + EDGES[:-1]) / 2  # the others are the same
         w = middles[:, None]
         parameters = model.generator["x"]({"w": w}, len(w), T)
-        law = model.generator["x"].law.distribution(tuple(p[:, None] for p in parameters))  # (G, 1, T, ...)
-        log_likelihood = law.log_prob(x).flatten(2).sum(-1)
+        distribution = model.generator["x"].head.distribution(tuple(p[:, None] for p in parameters))  # (G, 1, T, ...)
+        log_likelihood = distribution.log_prob(x).flatten(2).sum(-1)
         logits = log_likelihood + dist.Normal(0.0, 1.0).log_prob(w)
         chosen = dist.Categorical(logits=logits.T).sample((DRAWS,)).flatten()
         value = middles[chosen] + (torch.rand(len(chosen)) - 0.5).double() * (EDGES[1] - EDGES[0])
@@ -253,7 +253,7 @@ def test_forecasts_of_counts_are_draws_and_of_others_means_unless_told():
 
 
 @pytest.mark.parametrize(
-    ("law", "value", "said"),
+    ("distribution", "value", "said"),
     [
         (Family("Poisson"), 0.5, "coordinate"),
         (Family("Bernoulli"), 2.0, "values are 0 or 1"),
@@ -268,8 +268,8 @@ def test_forecasts_of_counts_are_draws_and_of_others_means_unless_told():
         (Family("OneHotCategorical"), 1.0, "coordinate"),
     ],
 )
-def test_values_that_a_family_does_not_have_are_refused_unless_hidden(law, value, said):
-    model = built(law)
+def test_values_that_a_family_does_not_have_are_refused_unless_hidden(distribution, value, said):
+    model = built(distribution)
     data = model.sample(2, 4)["x"]
     if model.generator["x"].whole:
         data[1, 2] = 1.0
@@ -301,7 +301,7 @@ def test_a_class_of_ones_own_is_a_family():
     class Twice(dist.Poisson):
         """Its own name."""
 
-    assert built(Family(Twice)).generator["x"].law.called == "Twice"
+    assert built(Family(Twice)).generator["x"].head.label == "Twice"
 
 
 # ------------------------------------------------------------------------------------- the family of the docs page

@@ -29,16 +29,16 @@ PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_
 def build(kind, size=2):
     """A model with such a prior, and parameters that are not those it starts with."""
     sizes, network = {"w": size, "z": 2, "x": 2}, Recurrent(4, hidden=(4,))
-    model = DynamicalVAE(*PAIR, sizes, network, laws={"p(w)": PRIORS[kind]}).double()
+    model = DynamicalVAE(*PAIR, sizes, network, distributions={"p(w)": PRIORS[kind]}).double()
     with torch.no_grad():
         for name, parameter in (*model.generator["w"].named_parameters(), *model.encoder["w"].named_parameters()):
             parameter.add_((0.05 if ".nn." in name else 0.2) * torch.randn_like(parameter))  # .nn.: of a coupling
     return model
 
 
-def law(model, batch=1):
+def distribution(model, batch=1):
     conditional = model.generator["w"]
-    return conditional.law.joint(conditional({}, batch, T))
+    return conditional.head.joint(conditional({}, batch, T))
 
 
 def data():
@@ -49,7 +49,7 @@ def grid(model):
     """Points, their density under the prior, and the step between them."""
     axis = torch.linspace(-12, 12, 361 if model.sizes["w"] == 2 else 4_801, dtype=torch.float64)
     points = torch.cartesian_prod(*[axis] * model.sizes["w"]).reshape(-1, model.sizes["w"])
-    density = law(model, len(points)).log_prob(points).exp()
+    density = distribution(model, len(points)).log_prob(points).exp()
     return axis, density.detach().reshape([len(axis)] * model.sizes["w"])
 
 
@@ -79,25 +79,33 @@ def test_where_no_closed_form_is_known_the_kl_is_the_log_ratio_at_the_draw(kind)
     kl = SequenceELBO().terms(model, x).kl["w"]
     torch.manual_seed(1)
     w = model.guide(x)["w"]
-    ours = model.encoder["w"].law.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
-    torch.testing.assert_close(kl, ours.log_prob(w) - law(model, B).log_prob(w))
+    ours = model.encoder["w"].head.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
+    torch.testing.assert_close(kl, ours.log_prob(w) - distribution(model, B).log_prob(w))
 
 
 def test_the_vamp_prior_is_the_mean_of_the_guides_posteriors_at_its_pseudo_sequences():
     model, points = build("vamp"), torch.randn(6, 2, dtype=torch.float64)
-    pseudo = model.generator["w"].law.pseudo["x"]
+    pseudo = model.generator["w"].head.pseudo["x"]
     loc, scale = model.encoder["w"]({"x": pseudo}, 3, 4)
     each = torch.distributions.Normal(loc, scale).log_prob(points[:, None]).sum(-1)
-    torch.testing.assert_close(law(model, 6).log_prob(points), each.logsumexp(1) - math.log(3))
+    torch.testing.assert_close(distribution(model, 6).log_prob(points), each.logsumexp(1) - math.log(3))
     own = [name for name, _ in model.generator["w"].named_parameters()]
-    assert own == ["law.pseudo.x"]  # the guide stays the model's
-    twin = copy.deepcopy(model)
-    assert twin.generator["w"].law.guide is twin.encoder["w"]
+    assert own == ["head.pseudo.x"]  # the guide stays the model's
+    surrogate = copy.deepcopy(model)
+    assert surrogate.generator["w"].head.guide is surrogate.encoder["w"]
 
 
 # ------------------------------------------------------------------------------------------------------- in a run
 
-OPTIONS = {"latent": 2, "static": 2, "width": 4, "heads_count": 1, "decoder": 4, "warm_up": 0, "self_feeding": 0.0}
+OPTIONS = {
+    "latent": 2,
+    "static": 2,
+    "width": 4,
+    "heads_count": 1,
+    "decoder": 4,
+    "warm_up": 0,
+    "scheduled_sampling": 0.0,
+}
 VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6, "heading": False, "pose_prior": 0.0}
 
 
@@ -112,7 +120,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
     starts = []
     for seed, name in ((0, "a"), (0, "b"), (1, "c")):
         dvae.fit(method, data, out=tmp_path / name, **vars(replace(still, seed=seed)))
-        starts.append(dvae.load(tmp_path / name).model.generator["w"].law.pseudo["x"])
+        starts.append(dvae.load(tmp_path / name).model.generator["w"].head.pseudo["x"])
     assert torch.equal(starts[0], starts[1])
     assert not torch.equal(starts[0], starts[2])
     windows = data.windows("train").all(stride=1)["x"][:, :6]

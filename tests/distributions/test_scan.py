@@ -62,7 +62,7 @@ def test_blocks_change_neither_values_nor_gradients(steps, batch, size, block, m
     """With 300 steps there are seven levels. 16 does not divide 65, and 96 are six blocks."""
     monkeypatch.setattr(scan, "BLOCK", block)
     built = chain(steps, batch, size)
-    assert scan.in_blocks(built.transition) == (steps > 2)
+    assert scan.use_blocks(built.transition) == (steps > 2)
     inputs = built, torch.randn_like(built.potential)
     for one, other in zip(with_gradients(*inputs), one_by_one(with_gradients, *inputs), strict=True):
         scale = other.abs().max().item() if other.numel() else 1.0
@@ -74,7 +74,7 @@ def test_a_recursion_has_the_gradient_of_finite_differences(call, monkeypatch):
     monkeypatch.setattr(scan, "BLOCK", 2)
     shape = (13, 1, 2, 2)
     matrix, offset, start = (torch.randn(s, dtype=torch.float64) for s in (shape, shape, shape[1:]))
-    assert scan.in_blocks(matrix)
+    assert scan.use_blocks(matrix)
 
     def run(matrix, offset, start):
         if call is Covariances:

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.studies import domains, engine
 from dvae import tables
-from dvae.inference.evaluation.estimates import Crossed
+from dvae.inference.evaluation.estimates import TwoWayErrors
 from dvae.tables import Column, Columns, Panel, Series, reading
 from dvae.tables.protocol import Cut
 
@@ -70,7 +70,7 @@ def test_bounds_are_by_step_and_their_errors_over_sequences(page, tmp_path):
     steps = np.array([15.0, 16.0])
     assert found[0]["weights"] == steps.tolist()
     bounds = np.array([own["rows"][engine.OURS][domains.BOUND] for own in found])
-    expected = Crossed.of(bounds, steps).estimate()
+    expected = TwoWayErrors.of(bounds, steps).estimate()
     read = engine.read(tmp_path / "tiny", [domains.BASELINE], "validation.json")[domains.BASELINE]
     assert read.of("bounds").estimate(domains.BOUND) == expected
     assert expected.mean == pytest.approx((bounds * steps).sum() / 62)

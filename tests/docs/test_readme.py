@@ -42,7 +42,7 @@ def test_the_commands_on_any_table_run(monkeypatch, tmp_path, capsys):
         assert main([name, *found, *shlex.split(SMALL[name])]) == 0, capsys.readouterr().err
     judged = capsys.readouterr().out
     for said in (
-        "importance bound",
+        "IWAE bound",
         "climatology",
         "CRPS, lifeExp ↓ (years)",
         "CRPS, gdpPercap ↓ ($)",

@@ -184,31 +184,31 @@ def ax():
     plt.close(figure)
 
 
-def arrows(ax):
+def edges(ax):
     return [patch for patch in ax.patches if isinstance(patch, FancyArrowPatch)]
 
 
-def test_no_arrow_hides_behind_a_node(ax):
+def test_no_edge_hides_behind_a_node(ax):
     f = Factorization.parse("p(u_t | u_{<t}) p(z_t | z_{<t}, u_t) p(x_t | x_{<t}, z_t)")
     assert f.draw(4, ax=ax) is ax
-    assert len(arrows(ax)) == f.dag(4).number_of_edges()
+    assert len(edges(ax)) == f.dag(4).number_of_edges()
     nodes = [patch for patch in ax.patches if isinstance(patch, Circle)]
     assert len(nodes) == len(f.dag(4))
     centres, radius = np.array([node.center for node in nodes]), nodes[0].radius
     ax.figure.canvas.draw()  # settles the aspect, and with it the curves
-    for arrow in arrows(ax):
-        on_screen = arrow.get_transform().transform_path(arrow.get_path()).to_polygons(closed_only=False)
+    for edge in edges(ax):
+        on_screen = edge.get_transform().transform_path(edge.get_path()).to_polygons(closed_only=False)
         path = ax.transData.inverted().transform(np.concatenate(on_screen))
         distance = np.linalg.norm(path[:, None] - centres, axis=-1).min(axis=0)
         assert (distance < 1.2 * radius).sum() == 2
 
 
-def test_an_audit_draws_missing_and_redundant_arrows(ax):
+def test_an_audit_draws_missing_and_redundant_edges(ax):
     audit(*FAMILY["VRNN"]).draw(3, ax=ax)
-    assert [arrow.get_linestyle() for arrow in arrows(ax)].count("--") == 3  # x_2, x_3 -> z_1 and x_3 -> z_2
+    assert [edge.get_linestyle() for edge in edges(ax)].count("--") == 3  # x_2, x_3 -> z_1 and x_3 -> z_2
     ax.clear()
     audit(*FAMILY["DKF, bidirectional"]).draw(3, ax=ax)
-    assert [arrow.get_linestyle() for arrow in arrows(ax)].count(":") == 3
+    assert [edge.get_linestyle() for edge in edges(ax)].count(":") == 3
     ax.clear()
     audit("p(z_t | pose, c_t) p(x_t | z_t)", "q(z_t | x_t)").draw(2, ax=ax)  # context that the guide ignores
     assert sum(isinstance(patch, Rectangle) for patch in ax.patches) == 3

@@ -1,4 +1,4 @@
-"""Derived guides: they miss nothing, they need every arrow, and at their best the bound is the evidence."""
+"""Derived guides: they miss nothing, they need every edge, and at their best the bound is the evidence."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ import dvae
 import dvae.factorization.inversion
 from benchmarks.studies.audits import FAMILY
 from dvae.factorization.graph import analytic_kl
-from dvae.factorization.inversion import MarkovBoundaries, faithful, guide, orders, spelled
+from dvae.factorization.inversion import MarkovBoundaries, describe_order, faithful_inverse, guide, orders
 from dvae.factorization.notation import Block, Factorization
 from dvae.factorization.relations import Relation
 from dvae.testing.strategies import factorizations
@@ -54,7 +54,7 @@ def fewer(guide, width):
 def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
     generative = pair[0]
     order = data.draw(st.sampled_from(list(orders(generative))), label="order")
-    found = faithful(generative, order=order)
+    found = faithful_inverse(generative, order=order)
     audit = dvae.audit(generative, found)
     assert audit.exact
     # A lag of 2 alone may make patterns periodic in time, of which relations have no end.
@@ -77,7 +77,7 @@ def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
     ],
 )
 def test_guides_worked_out_by_hand(generative, order, expected):
-    found = faithful(generative, order=order)
+    found = faithful_inverse(generative, order=order)
     assert found == (Factorization.parse(expected) if expected else Factorization("q", ()))
 
 
@@ -101,45 +101,50 @@ def test_alternatives_are_told_by_what_they_cost():
     loops = [bool(each.looped) for each in found.guides]
     assert loops == sorted(loops)
     for each in found.guides:
-        assert each.arrows == each.inference.dag(found.steps).number_of_edges()
+        assert each.edges == each.inference.dag(found.steps).number_of_edges()
         closed = analytic_kl(found.generative, each.inference)
         assert each.sampled == tuple(name for name in closed if not closed[name])
-        assert all(text in str(found) for text in (each.inference.text, spelled(each.order)))
+        assert all(text in str(found) for text in (each.inference.text, describe_order(each.order)))
     assert found[0] == found.guides[0].inference
     assert "<td>" in found._repr_html_()
 
 
-def test_the_price_of_an_arrow_is_that_of_the_guide_without_it():
-    found = dvae.arrow_prices(DKF, steps=3, seeds=2)
-    assert list(found) == sorted(found, key=lambda arrow: -found[arrow].mean())
-    without = dvae.price(DKF, "q(z_t | z_{t-1}, x_{>t})", {"z": 1, "x": 1}, steps=3, seeds=2)
+def test_the_price_of_an_edge_is_that_of_the_guide_without_it():
+    found = dvae.edge_costs(DKF, steps=3, seeds=2)
+    assert list(found) == sorted(found, key=lambda edge: -found[edge].mean())
+    without = dvae.kl_gap(DKF, "q(z_t | z_{t-1}, x_{>t})", {"z": 1, "x": 1}, steps=3, seeds=2)
     torch.testing.assert_close(found["x_t to z_t"], without, atol=1e-8, rtol=0)
     assert all((cost > 1e-6).all() for cost in found.values())  # none of a derived guide is for nothing
-    spare = dvae.arrow_prices(DKF, "q(z_t | z_{t-1}, x_{1:T})", steps=3, seeds=1)
+    spare = dvae.edge_costs(DKF, "q(z_t | z_{t-1}, x_{1:T})", steps=3, seeds=1)
     assert abs(spare["x_{<t} to z_t"]) < 1e-8
 
 
 def test_a_model_takes_the_word():
     model = dvae.DynamicalVAE(DKF, "faithful", {"z": 2, "x": 3})
-    assert model.inference == faithful(DKF)
+    assert model.inference == faithful_inverse(DKF)
     bound = dvae.SequenceELBO().terms(model, {"x": torch.randn(4, 5, 3)}).bound
     assert bound.shape == (4,)
     assert dvae.audit(DKF, "faithful").exact
-    assert guide(Factorization.parse(DKF), "faithful", masks={}) == faithful(DKF)
+    assert guide(Factorization.parse(DKF), "faithful", masks={}) == faithful_inverse(DKF)
 
 
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda: faithful(DKF, order=[Block(("u",), 1)]), "latents"),
-        (lambda: faithful(HIT_DVAE, order=[Block(("w", "z"), 1)]), "mixes static and local"),
+        (lambda: faithful_inverse(DKF, order=[Block(("u",), 1)]), "latents"),
+        (lambda: faithful_inverse(HIT_DVAE, order=[Block(("w", "z"), 1)]), "mixes static and local"),
         (lambda: dvae.alternatives(DKF, steps=0), "at least 1 step"),
         (
-            lambda: faithful(Factorization.parse("p(z_t | z_{own}) p(x_t | z_t)", {"own": Relation.parse("<t").mask})),
+            lambda: faithful_inverse(
+                Factorization.parse("p(z_t | z_{own}) p(x_t | z_t)", {"own": Relation.parse("<t").mask})
+            ),
             "a mask of your own",
         ),
         (lambda: dvae.alternatives("p(x_t | x_{<t})"), "nothing is latent"),
-        (lambda: Factorization.parse(DKF).without("z", faithful(DKF).factors[0].parents[1]), "no arrow from x_"),
+        (
+            lambda: Factorization.parse(DKF).without("z", faithful_inverse(DKF).factors[0].parents[1]),
+            "no edge from x_",
+        ),
     ],
 )
 def test_errors_say_what_is_wrong(call, told):

@@ -60,7 +60,7 @@ def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], se
     """Try examples until the time is over.
 
     Args:
-        check: raises where an example breaks a law.
+        check: raises where an example breaks a distribution.
         examples: where they come from. Their `repr` is printed, and tells them apart.
         seconds: this test's share of the default minute.
     """

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import strategies as st
 
 from dvae.motion import WALKER, Clip, MotionSet, is_forecasts, read_motion, read_paths, save
-from dvae.motion.files.plain import read_arrays
+from dvae.motion.files.arrays import read_arrays
 from dvae.motion.geometry.skeleton import is_name
 
 from .engine import Isolated, fuzz, limited

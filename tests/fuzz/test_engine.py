@@ -26,7 +26,7 @@ def test_what_breaks_a_law_is_told_and_the_next_example_goes_on(tmp_path):
     directory = tmp_path / "inside"
     directory.mkdir()
     (directory / "link").symlink_to(tmp_path / "target")
-    laws = {
+    distributions = {
         "allocates": "MemoryError",
         "dies": "died with exit code -11",
         "is a bug": "KeyError",
@@ -36,10 +36,10 @@ def test_what_breaks_a_law_is_told_and_the_next_example_goes_on(tmp_path):
         "writes through a link": "writes outside",
     }
     with Isolated(faulty, directory) as isolated:
-        for example, law in laws.items():
+        for example, distribution in distributions.items():
             if example == "allocates" and not Path("/proc/self/statm").exists():
                 continue
-            with pytest.raises(AssertionError, match=law):
+            with pytest.raises(AssertionError, match=distribution):
                 isolated(example)
         isolated("refuses")
         isolated("writes here")
@@ -59,9 +59,10 @@ def test_a_failing_example_is_found_and_printed():
 def test_the_same_examples_come_in_the_same_order():
     def drawn():
         seen = []
-        fuzz(seen.append, st.integers(), seconds=0.3)
+        fuzz(seen.append, st.integers(), seconds=2)
         return seen[:20]
 
-    first = drawn()
-    assert drawn()[: len(first)] == first
-    assert len(set(first)) > 3
+    first, second = drawn(), drawn()
+    shared = min(len(first), len(second))  # how many there are depends on the machine
+    assert second[:shared] == first[:shared]
+    assert len(set(first[:shared])) > 3

@@ -1,6 +1,7 @@
 """Random pairs of equations, run in every way that changes what the model reads.
 
-With missing entries, padding, self-feeding and masks of one's own, bound and gradient are those of the dense Gaussian.
+With missing entries, padding, scheduled sampling and masks of one's own, bound and gradient are those of the dense
+Gaussian.
 """
 
 import numpy as np
@@ -8,8 +9,8 @@ import torch
 from dense import exact_bound, library_bound, masked
 from hypothesis import strategies as st
 
-from dvae.program.oracle import twin
-from dvae.program.rollout import SelfFeeding
+from dvae.program.oracle import linear_gaussian_surrogate
+from dvae.program.rollout import ScheduledSampling
 from dvae.testing.strategies import factorizations
 
 from .engine import fuzz, limited
@@ -23,13 +24,13 @@ def check(example):
     rng = np.random.default_rng(seed)
     pair = [masked(text, rng, share) for text in pair]
     names = {name for equations in pair for name in equations.variables}
-    model = twin(*pair, {name: size for name, size in SIZES.items() if name in names}, steps, seed)
+    model = linear_gaussian_surrogate(*pair, {name: size for name, size in SIZES.items() if name in names}, steps, seed)
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(B, steps, SIZES["x"], generator=generator, dtype=torch.float64)
     lengths = [steps, int(rng.integers(1, steps + 1))]
     seen = torch.rand(x.shape, generator=generator) < rng.choice([0.5, 1.0])
     fed = torch.rand(B, steps, generator=generator) < probability
-    feeding = SelfFeeding(probability, gradient=gradient)
+    feeding = ScheduledSampling(probability, gradient=gradient)
     found = library_bound(model, x, lengths=lengths, seen=seen, fed=fed, feeding=feeding)
     expected = torch.stack(
         [exact_bound(model, x[b], length=lengths[b], seen=seen[b], fed=fed[b], detach=not gradient) for b in range(B)]

@@ -36,8 +36,8 @@ observations = st.tuples(
 )
 
 
-SKELETON = bodies.fitted(simulate(clips=1, frames=30, seed=1), bodies.human()).skeleton
-MODEL = MotionLatent(latent=2, widths=(4,)).build(SegmentSchema.under(TimedFrames(SKELETON), bodies.human())).eval()
+SKELETON = bodies.fit_to_body(simulate(clips=1, frames=30, seed=1), bodies.human()).skeleton
+MODEL = MotionLatent(latent=2, widths=(4,)).build(SegmentSchema.from_data(TimedFrames(SKELETON), bodies.human())).eval()
 """Made where a process begins, before its time and memory are watched."""
 
 

@@ -21,7 +21,7 @@ from safetensors.torch import load, save
 
 import dvae
 from dvae import motion
-from dvae.cli import futures, judging, segments
+from dvae.cli import assessment, futures, segments
 from dvae.inference.training.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.segments.dataset import SegmentData
@@ -163,7 +163,7 @@ def mutate(run: Path, kind: str, *arguments: Any) -> None:
 
 
 def clear(place: Path) -> None:
-    """Remove a folder, each file by its path: what `shutil.rmtree` removes has none that the engine could judge."""
+    """Remove a folder file by file, since the engine checks paths and `shutil.rmtree` gives it none."""
     for folder, inner, names in os.walk(place, topdown=False):
         for name in names:
             os.unlink(os.path.join(folder, name))
@@ -210,7 +210,7 @@ def use(call: str, fitted: str, run: Path, data: Path) -> None:
         futures.forecast(run, run / "futures.npz", futures.Paths(), samples=1, horizon=2, data=str(data))
     else:
         few = {} if fitted == "latent" else {"samples": 1}
-        judging.evaluate((run,), judging.Control(), data=str(data), **few)
+        assessment.evaluate((run,), assessment.Control(), data=str(data), **few)
 
 
 @limited(SHARE)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import strategies as st
 
 from dvae.motion import HUMAN36M, WALKER, Clip, MotionSet, Skeleton, read_motion, read_paths, save
-from dvae.motion.files.plain import _read_columns
+from dvae.motion.files.arrays import _read_columns
 from dvae.motion.geometry.skeleton import is_name
 
 from .engine import Isolated, fuzz, limited

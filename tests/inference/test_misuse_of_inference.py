@@ -8,20 +8,20 @@ from pyro import poutine
 from torch import nn
 
 import dvae
-from dvae import DynamicalVAE, SequenceELBO, twin
+from dvae import DynamicalVAE, SequenceELBO, linear_gaussian_surrogate
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.bounds.predictive import predictive_bound
-from dvae.inference.bounds.probe import Redrawn
+from dvae.inference.bounds.probe import RedrawnModel
 from dvae.inference.diagnostics.checks import Statistic, predictive_checks
 from dvae.inference.diagnostics.traversal import traverse
 from dvae.inference.evaluation import metrics
-from dvae.inference.evaluation.conformal import conformal
-from dvae.inference.evaluation.estimates import Crossed
+from dvae.inference.evaluation.conformal import conformal_bands
+from dvae.inference.evaluation.estimates import TwoWayErrors
 from dvae.inference.evaluation.evaluate import evaluate
+from dvae.inference.evaluation.multiple_comparisons import confidence_set, required
 from dvae.inference.evaluation.references import nearest_neighbours, seasonal
 from dvae.inference.evaluation.scores import CRPS, ENERGY, by_column, coverage_at
 from dvae.inference.training.gradnorm import GradNorm
-from dvae.inference.training.many import confidence_set, required
 from dvae.inference.training.objectives import Evidence
 from dvae.inference.training.options import Training
 from dvae.inference.training.schedules import Logistic, Piecewise, Ramp, from_config, schedule, to_config
@@ -29,14 +29,14 @@ from dvae.networks import Linear
 
 T = 4
 DKF = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})")
-MODEL = twin(*DKF, {"z": 1, "x": 1}, T).requires_grad_(False)
+MODEL = linear_gaussian_surrogate(*DKF, {"z": 1, "x": 1}, T).requires_grad_(False)
 SEEN = DynamicalVAE("p(x_t | x_{t-1})", "", {"x": 1}).double()
 SUMMED = DynamicalVAE("p(k_t | k_{t-1}) p(x_t | k_t)", "", {"k": dvae.Discrete(2), "x": 1}).double()
 X = torch.zeros(2, T, 1, dtype=torch.float64)
 RAGGED = {"x": X, "lengths": torch.tensor([T, 2])}
 WINDOWS = ArrayWindows(X, 2)
 SAMPLES, TRUTH = torch.zeros(5, 4, 3), torch.zeros(4, 3)
-ONE = Crossed.of(torch.zeros(1, 4).numpy(), torch.ones(4).numpy())
+ONE = TwoWayErrors.of(torch.zeros(1, 4).numpy(), torch.ones(4).numpy())
 
 
 def fit(model=MODEL, data=X, **options):
@@ -57,7 +57,7 @@ def run(function, *arguments, **options):
 
 def ordered(p, q):
     names = dvae.Factorization.parse(p).variables
-    return dvae.particle_bound(DynamicalVAE(p, q, dict.fromkeys(names, 1), Linear(T)).double(), X)
+    return dvae.fivo_bound(DynamicalVAE(p, q, dict.fromkeys(names, 1), Linear(T)).double(), X)
 
 
 BOUNDS = [
@@ -69,19 +69,19 @@ BOUNDS = [
     (lambda: dvae.annealed_bound(MODEL, X, 2, latents={"z": X[:, :2]}), "shape"),
     (lambda: dvae.annealed_bound(MODEL, X[:0], 2), "no sequences"),
     (lambda: dvae.annealed_bound(SEEN, X, 2), "latent"),
-    (lambda: dvae.importance_bound(MODEL, X, 0), "at least 1"),
-    (lambda: dvae.local_guide(MODEL, X, steps=0), "at least 1"),
-    (lambda: dvae.local_guide(SEEN, X), "latent"),
-    (lambda: dvae.particle_bound(MODEL, X, 0), "at least 1"),
-    (lambda: dvae.particle_bound(MODEL, X, resample_below=1.5), "share"),
-    (lambda: dvae.particle_bound(SUMMED, X), "summed out"),
+    (lambda: dvae.iwae_bound(MODEL, X, 0), "at least 1"),
+    (lambda: dvae.semi_amortized_guide(MODEL, X, steps=0), "at least 1"),
+    (lambda: dvae.semi_amortized_guide(SEEN, X), "latent"),
+    (lambda: dvae.fivo_bound(MODEL, X, 0), "at least 1"),
+    (lambda: dvae.fivo_bound(MODEL, X, resample_below=1.5), "share"),
+    (lambda: dvae.fivo_bound(SUMMED, X), "summed out"),
     (lambda: ordered(DKF[0], "q(z_t | z_{t+1}, x_t)"), "backward"),
     (lambda: ordered("p(z_t) p(x_t | z_{1:T})", "q(z_t | z_{<t}, x_t)"), "reads"),
     (lambda: ordered("p(w) p(z_t | w) p(x_t | z_t)", "q(w | z_{1:T}) q(z_t | x_t)"), "draws after"),
     (lambda: predictive_bound(MODEL, X, 0, 1), "observed"),
     (lambda: predictive_bound(MODEL, RAGGED, 2), "lengths"),
-    (lambda: Redrawn(MODEL, {}), "none"),
-    (lambda: Redrawn(MODEL, {"z": torch.distributions.Normal(0.0, 1.0)}), "follows"),
+    (lambda: RedrawnModel(MODEL, {}), "none"),
+    (lambda: RedrawnModel(MODEL, {"z": torch.distributions.Normal(0.0, 1.0)}), "follows"),
 ]
 DIAGNOSTICS = [
     (lambda: run(dvae.bracket, MODEL, X, particles=0), "at least 1"),
@@ -110,9 +110,9 @@ EVALUATION = [
     (lambda: run(dvae.compare, {"a": 3}, X), "int"),
     (lambda: run(dvae.compare, {"a": nn.Linear(2, 2)}, X), "Linear"),
     (lambda: run(dvae.compare, {"a": MODEL}, X, particles=0), "at least 1"),
-    (lambda: run(dvae.compare, {"a": [MODEL, twin(*DKF, {"z": 2, "x": 1}, T)]}, X), "seed"),
-    (lambda: run(conformal, MODEL, WINDOWS), "clips"),
-    (lambda: run(conformal, MODEL, WINDOWS, 1), "between"),
+    (lambda: run(dvae.compare, {"a": [MODEL, linear_gaussian_surrogate(*DKF, {"z": 2, "x": 1}, T)]}, X), "seed"),
+    (lambda: run(conformal_bands, MODEL, WINDOWS), "clips"),
+    (lambda: run(conformal_bands, MODEL, WINDOWS, 1), "between"),
     (lambda: run(evaluate, {}, WINDOWS, samples=0), "samples"),
     (lambda: run(evaluate, {}, WINDOWS, scores="motion"), "scores"),
     (lambda: run(evaluate, {}, WINDOWS, scores=lambda _: [ENERGY, ENERGY]), "two"),
@@ -166,7 +166,7 @@ TRAINING = [
             {"decay": 1.5},
             {"learning_rate": -1},
             {"learning_rate": "fast"},
-            {"self_feeding": 2},
+            {"scheduled_sampling": 2},
             {"momentum": 0.9},
             {"weight_decay": -1.0},
             {"optimizer": "sgd", "momentum": 1.0},

@@ -116,7 +116,7 @@ class TestHiTDVAEThatReadsItsPast(Contract):
 
 
 class TestStandardised(Contract):
-    """Networks without unit, in a loop and out of it; the laws are those of the variable in its own."""
+    """Networks without unit, in a loop and out of it; the distributions are those of the variable in its own."""
 
     name = "hit-dvae"
     options: ClassVar = {"residual": 0.7}
@@ -206,7 +206,7 @@ OPTIONS = [
     {"warm_up": 2, "warm_up_shape": "cosine"},
     {"warm_up": 2, "warm_up_shape": "logistic"},
     {"free_bits": 0.1},
-    {"self_feeding": 1.0},
+    {"scheduled_sampling": 1.0},
 ]
 
 
@@ -214,9 +214,9 @@ def refusal(name, option):
     """The sentence with which a method's equations refuse an option, if they do."""
     generative = dvae.Factorization.parse(dvae.method(name).generative)
     if "prior" in option and all(factor.local for factor in generative.factors):
-        return f"prior='{option['prior']}' is for a static latent without parents"
+        return f"prior='{option['prior']}' needs a static latent without parents"
     if "residual" in option and "x" not in {parent.name for parent in generative.factor("x").parents}:
-        return "has a residual law, which adds"
+        return "has a residual distribution, which adds"
     return None
 
 
@@ -225,7 +225,7 @@ def refusal(name, option):
     [(name, option) for m, name in enumerate(SMALL) for n, option in enumerate(OPTIONS) if (m + n) % 4 == 0],
 )
 def test_a_method_takes_an_option_or_says_why_not(name, option):
-    method = small(name, **{"warm_up": 2, "self_feeding": 0.0, **option})
+    method = small(name, **{"warm_up": 2, "scheduled_sampling": 0.0, **option})
     if expected := refusal(name, option):
         with pytest.raises(ValueError, match=expected):
             method.build({"x": 3})
@@ -275,7 +275,7 @@ PUBLISHED = {  # parameters of the public implementation at its sizes for motion
 def test_the_default_networks_have_the_published_size(name):
     statics = {"static": 10} if name == "dsae" else {}
     model = dvae.method(name, latent=10, **statics).build({"x": 96})
-    scales = model.generator["x"].law.log_scale.numel()  # one a coordinate: the public code has no likelihood of x
+    scales = model.generator["x"].head.log_scale.numel()  # one a coordinate: the public code has no likelihood of x
     assert sum(parameter.numel() for parameter in model.parameters()) - scales == PUBLISHED[name]
 
 
@@ -394,7 +394,7 @@ def test_a_method_survives_its_configuration(name):
         (lambda: dvae.method("hit_dvae"), "unknown method"),
         (lambda: dvae.method("srnn", latents=3), "option"),
         (lambda: dvae.method("vae", emission="gamma").build({"x": 1}), "emission"),
-        (lambda: configured({"latent": 3}), "configuration names"),
+        (lambda: configured({"latent": 3}), "configuration has no key 'method'"),
     ],
 )
 def test_methods_that_are_not(run, message):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dvae.motion import Skeleton, control
-from dvae.motion.control import bend, smooth_covariance
+from dvae.motion.control import follow_paths, smooth_covariance
 
 POINT = Skeleton(("root", "tip"), (-1, 0))
 LOOSE = torch.full((1,), 1e9, dtype=torch.float64)
@@ -29,7 +29,7 @@ def test_a_linear_decoder_has_a_closed_form():
     known = torch.zeros(steps, size, dtype=torch.float64)
     known[:, 0], known[1, 3:] = 1, 1
 
-    found, corrections = bend(
+    found, corrections = follow_paths(
         lambda z: (z @ weight.T).unflatten(-1, (steps, size)), drawn, scale, paths, known, POINT, LOOSE
     )
     correction = control.CORRECTION**2 * torch.kron(smooth_covariance(steps), torch.eye(size, dtype=torch.float64))
@@ -51,11 +51,11 @@ def test_bones_are_kept_where_the_path_leaves_the_choice():
     known = torch.tensor([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     paths = torch.tensor([[0.0, 0.6, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     one, bones = torch.ones(6, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
-    found = bend(lambda z: z[:, None], drawn, one, paths, known, POINT, bones)[0][0, 0]
+    found = follow_paths(lambda z: z[:, None], drawn, one, paths, known, POINT, bones)[0][0, 0]
     assert torch.allclose(found[:3], paths[0, :3])
     assert abs((found[3:] - found[:3]).norm() - 1) < 0.01
     assert torch.allclose(found[3::2], torch.zeros(2, dtype=torch.float64), atol=1e-3)
-    unmoved, corrections = bend(lambda z: z[:, None], drawn, one, paths, 0 * known, POINT, bones)
+    unmoved, corrections = follow_paths(lambda z: z[:, None], drawn, one, paths, 0 * known, POINT, bones)
     assert torch.allclose(unmoved[:, 0], drawn)
     assert torch.allclose(corrections, torch.zeros(()).double())
 
@@ -66,7 +66,7 @@ def test_corrections_come_and_go():
     known[14, 3:] = 1
     paths = torch.full((30, 6), 0.3, dtype=torch.float64)
     still, one = torch.zeros(1, 30, 6, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
-    made, corrections = bend(lambda z: still, double(1, 2), one, paths, known, POINT, LOOSE)
+    made, corrections = follow_paths(lambda z: still, double(1, 2), one, paths, known, POINT, LOOSE)
     tip = corrections[0, :, 3]
     assert torch.equal(made, corrections)
     assert tip[14] == pytest.approx(0.3)

@@ -1,4 +1,4 @@
-"""Forecasts of every kind of model in chunks: the same law, and no more memory for more samples."""
+"""Forecasts of every kind of model in chunks: the same distribution, and no more memory for more samples."""
 
 from dataclasses import replace
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dvae.factorization.relations import Relation
 from dvae.networks import Attention, Dense, FrameGraph, Input, Linear, NodeGraph, Recurrent, SelfAttention
-from dvae.networks.loop import computing_once, shift
+from dvae.networks.loop import memoizing, shift
 from dvae.networks.recurrent import tie
 
 T = 6
@@ -21,7 +21,7 @@ NETWORKS = {
     "lstm": Recurrent(4, hidden=(5, 3)),
     "lstm, two layers, embedded": Recurrent(4, layers=2, embed=3, hidden=(5,)),
     "lstm, extracted": Recurrent(4, extract={"z": (3, 2), "w": (4,)}, hidden=(5,)),
-    "lstm, separate, apart": Recurrent(4, extract={"c": (3,)}, separate=True, apart=True, hidden=()),
+    "lstm, separate, join_current": Recurrent(4, extract={"c": (3,)}, separate=True, join_current=True, hidden=()),
     "lstm, averaged": Recurrent(
         4, extract=dict.fromkeys([*"zxuvcw", *(f"y{i}" for i in range(6))], (4,)), mean=True, hidden=(5,)
     ),
@@ -288,7 +288,7 @@ def test_a_tied_past_is_evaluated_once_and_learns_from_every_use():
         return first(parents, T).square().sum() + other(parents, T).cos().sum()
 
     memory = list(first.past.parameters())
-    with computing_once():
+    with memoizing():
         together = torch.autograd.grad(outputs(second), memory)
     assert len(calls) == 1
     apart = outputs(untied)

@@ -91,7 +91,7 @@ def test_single_precision_holds_from_the_shortest_gaps_to_the_longest(size):
     decay, whitening = (part[0] for part in rough.over(gaps[None], there[None], "d"))
     expected, root = (part[0] for part in exact.over(gaps[None].double(), there[None], "d"))
     torch.testing.assert_close(decay.double(), expected, rtol=0, atol=2e-6)
-    # of what the exact law makes white, so that a direction of little noise counts as any other
+    # of what the exact distribution makes white, so that a direction of little noise counts as any other
     white = whitening.double() @ torch.linalg.inv(root)
     torch.testing.assert_close(white, torch.eye(size).double().expand_as(white), rtol=0, atol=1e-5)
     assert decay[-1].abs().max() < 1e-6
@@ -114,7 +114,7 @@ def test_steps_without_a_gap_are_refused():
 
 
 class TestModel(FactorizationContract):
-    """All laws of the engine; gaps are positive, and that of the first step is read by no transition."""
+    """All distributions of the engine; gaps are positive, and that of the first step is read by no transition."""
 
     missing: ClassVar = {}
     networks: ClassVar = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense((4,)), "q": Recurrent(4)}
@@ -171,8 +171,8 @@ def irregular(steps=7):
 def test_the_log_joint_is_that_of_the_equation_s_kernel():
     built, times, z, x = model(), irregular(), double(1, 7, 2), double(1, 7, 3)
     found = built.log_joint({"x": x, "d": gaps_of(times)}, {"z": z})["z"]
-    law = MultivariateNormal(torch.zeros(14).double(), kernel(built, times))
-    assert found.item() == pytest.approx(law.log_prob(z.flatten()).item(), abs=1e-8)
+    distribution = MultivariateNormal(torch.zeros(14).double(), kernel(built, times))
+    assert found.item() == pytest.approx(distribution.log_prob(z.flatten()).item(), abs=1e-8)
 
 
 def test_a_forecast_goes_over_the_gaps_that_it_is_given():

@@ -1,4 +1,4 @@
-"""Perceptrons over whole sequences: the laws of every model, one of them for all that is made, what is refused."""
+"""Perceptrons over whole sequences: properties of every model, shared evaluations, refused settings."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ import dvae
 from dvae.distributions import FixedNormal
 from dvae.networks import WholeDecoder, WholeEncoder
 from dvae.networks.base import share_modules
-from dvae.networks.loop import computing_once
+from dvae.networks.loop import memoizing
 from dvae.testing import FactorizationContract
 
 NAMES = ("a", "b", "c")
@@ -21,7 +21,7 @@ def build(size, inference="q(z | a_{1:T}, b_{1:T}, c_{1:T})", length=10):
         inference,
         {**sizes, "z": 3, "s": 2},
         network={**made, "q(z)": WholeEncoder(length, (8,), "tanh")},
-        laws={f"p({name})": FixedNormal(0.1, project=False) for name in NAMES},
+        distributions={f"p({name})": FixedNormal(0.1, project=False) for name in NAMES},
         observed=NAMES,
     )
     share_modules([model.generator[name].network for name in NAMES], "trunk")
@@ -37,7 +37,7 @@ def test_all_that_is_made_of_one_latent_is_made_once():
     model, calls = build(2), []
     model.generator["a"].network.trunk.register_forward_hook(lambda *_: calls.append(1))
     data = {**{name: torch.randn(4, 10, 2) for name in NAMES}, "s": torch.randn(4, 2)}
-    with computing_once():
+    with memoizing():
         dvae.SequenceELBO().terms(model, data)
     assert len(calls) == 1
     assert model.generator["b"].network.trunk is model.generator["a"].network.trunk

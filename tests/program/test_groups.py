@@ -68,13 +68,15 @@ def test_pyros_own_bound_is_ours():
 
 def linear(count, steps, exact=True):
     """A linear-Gaussian panel of one group, and its evidence as one dense normal."""
-    laws = {
+    distributions = {
         "default": FixedNormal(0.7, project=False),
         "p(g)": dvae.distributions.StandardNormal(),
         "q": FixedNormal(1.0, learned=True, project=False),
     }
     pair = "p(g) p(w | g) p(x_t | w)", "q(g | x_{1:T}) q(w | x_{1:T}, g)"
-    model = dvae.DynamicalVAE(*pair, dict.fromkeys("gwx", 1), Linear(steps=steps), laws, grouped=("g",)).double()
+    model = dvae.DynamicalVAE(
+        *pair, dict.fromkeys("gwx", 1), Linear(steps=steps), distributions, grouped=("g",)
+    ).double()
     with torch.no_grad():
         for parameter in model.generator.parameters():
             parameter.copy_(torch.randn_like(parameter) * 0.3 + 0.6)
@@ -115,7 +117,7 @@ def test_the_bound_of_a_group_arrives_at_its_evidence():
         [dvae.SequenceELBO(num_particles=16).terms(model, batch).bound.sum() for _ in range(50)]
     ).detach()
     assert abs(bounds.mean() - evidence) < 5 * bounds.std() / 50**0.5 + 1e-2
-    weighted = dvae.importance_bound(model, batch, particles=2000).bound
+    weighted = dvae.iwae_bound(model, batch, particles=2000).bound
     torch.testing.assert_close(weighted.sum(), evidence, atol=2e-2, rtol=0)
     torch.testing.assert_close(weighted, (weighted.sum() / 3).expand(3))
 

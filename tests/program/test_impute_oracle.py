@@ -36,7 +36,7 @@ def dense(model, sizes):
                 at = places[parent.name, column + 1 if parent.local else None]
                 mean[own] += weight @ mean[at]
                 root[own] += weight @ root[at]
-        root[own, own] += conditional.law.log_scale.exp().diag()
+        root[own, own] += conditional.head.log_scale.exp().diag()
     return mean, root @ root.T, places
 
 
@@ -59,15 +59,15 @@ def scores(draws, mean, covariance):
 def built(generative, inference, scale=0.7, grouped=(), **sizes):
     own = FixedNormal(scale, learned=True, project=False)
     each = FixedNormal(scale, learned=True, project=False, steps=T)
-    laws = {"p": own, **({"q(z)": each} if inference and "z" in sizes else {"q": own})}
-    return dvae.DynamicalVAE(generative, inference, sizes, Linear(T, 0.3), laws, grouped=grouped).double()
+    distributions = {"p": own, **({"q(z)": each} if inference and "z" in sizes else {"q": own})}
+    return dvae.DynamicalVAE(generative, inference, sizes, Linear(T, 0.3), distributions, grouped=grouped).double()
 
 
 @torch.no_grad()
 def exact(model, seen, sizes):
     """Sets the guide q(z_t | z_{t-1}, x_{1:T}) of a chain to its posterior given what is seen (T, D)."""
     mean, covariance, places = dense(model, sizes)
-    network, law = model.encoder["z"].network, model.encoder["z"].law
+    network, distribution = model.encoder["z"].network, model.encoder["z"].head
     observed = [(t, d) for t in range(T) for d in range(sizes["x"]) if seen[t, d]]
     data = [places["x", t + 1].start + d for t, d in observed]
     for weight in network.weights.values():
@@ -76,7 +76,7 @@ def exact(model, seen, sizes):
         before = [places["z", t].start] if t else []
         known, nothing = [*before, *data], torch.zeros(len(before) + len(data)).double()
         offset, rest, gain = conditional(mean, covariance, known, nothing, [places["z", t + 1].start])
-        network.bias[t], law.log_scale[t] = offset, rest[0].sqrt().log()
+        network.bias[t], distribution.log_scale[t] = offset, rest[0].sqrt().log()
         if t:
             network.weights["z"][t, t - 1] = gain[:, :1]
         for (s, d), slope in zip(observed, gain[0, len(before) :], strict=True):

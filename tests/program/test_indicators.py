@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import dvae
-from dvae.data.sequences import Hiding, Sequences
+from dvae.data.sequences import RandomMasking, Sequences
 from dvae.distributions import FixedNormal
 from dvae.networks import Attention, Linear, Recurrent
 from dvae.networks.base import indicator
@@ -15,14 +15,16 @@ SIZES = {"w": 2, "z": 2, "x": 2}
 
 
 def model(network=None, guide=PAIR[1], indicators=("x",), **options):
-    laws = {"p(x)": FixedNormal(0.3), **options.pop("laws", {})}
+    distributions = {"p(x)": FixedNormal(0.3), **options.pop("distributions", {})}
     network = network or Recurrent(5, hidden=(4,))
-    built = dvae.DynamicalVAE(PAIR[0], guide, SIZES, network, laws, indicators=indicators, **options)
+    built = dvae.DynamicalVAE(PAIR[0], guide, SIZES, network, distributions, indicators=indicators, **options)
     return built.double().eval()
 
 
 class TestModel(FactorizationContract):
-    test_its_linear_gaussian_twin_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so = None  # of equations
+    test_its_linear_gaussian_surrogate_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so = (
+        None  # of equations
+    )
 
     def build(self, size):
         pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"
@@ -52,10 +54,10 @@ def test_an_indicator_is_read_where_its_entry_is(network, relation):
 
 def test_as_many_entries_are_hidden_as_was_said_together_where_they_are():
     x, seen = torch.randn(50, 40, 5), torch.rand(50, 40, 5) < 0.9
-    source = Hiding(Sequences({"x": x, "mask": seen}), 0.3, (0, 1, 1, 2, 2))
+    source = RandomMasking(Sequences({"x": x, "mask": seen}), 0.3, (0, 1, 1, 2, 2))
     batch, again = (source.sample(50, torch.Generator().manual_seed(0)) for _ in range(2))
     assert torch.equal(batch["mask"], again["mask"])
-    plain = Hiding(Sequences({"x": x}), 0.3, (0, 1, 1, 2, 2)).sample(50, torch.Generator().manual_seed(0))
+    plain = RandomMasking(Sequences({"x": x}), 0.3, (0, 1, 1, 2, 2)).sample(50, torch.Generator().manual_seed(0))
     hidden = ~plain["mask"]
     assert torch.equal(hidden[..., 1], hidden[..., 2])
     assert torch.equal(hidden[..., 3], hidden[..., 4])

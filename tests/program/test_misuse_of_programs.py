@@ -7,7 +7,7 @@ import torch
 from pyro import poutine
 
 import dvae
-from dvae import Discrete, DynamicalVAE, InputNoise, Oracle, SelfFeeding, model_price, twin
+from dvae import Discrete, DynamicalVAE, InputNoise, Oracle, ScheduledSampling, linear_gaussian_surrogate, model_kl_gap
 from dvae.data import views
 from dvae.data.units import Coordinate
 from dvae.distributions import (
@@ -49,7 +49,7 @@ NOISY = ("p(z_t) p(x_t | z_t, s_t)", "q(z_t | x_t)")
 GROUPED = ("p(g) p(w | g) p(x_t | w, g)", "q(g | x_{1:T}) q(w | x_{1:T}, g)")
 STATES = ("p(k_t | k_{t-1}) p(x_t | k_t, x_{t-1})", "")
 MODEL = DynamicalVAE(*DKF, {"z": 2, "x": 3}).double()
-LINEAR = twin(*DKF, {"z": 1, "x": 1}, T)
+LINEAR = linear_gaussian_surrogate(*DKF, {"z": 1, "x": 1}, T)
 SUMMED = DynamicalVAE(*STATES, {"k": Discrete(3), "x": 2}).double()
 TWO = DynamicalVAE("p(z_t) p(x_t | z_t) p(y_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 3, "y": 1}, observed=("x", "y"))
 X, Y = torch.zeros(3, T, 3, dtype=torch.float64), torch.zeros(3, T, 2, dtype=torch.float64)
@@ -64,12 +64,16 @@ def model(equations=DKF, sizes=(("z", 2), ("x", 3)), **options):
     return DynamicalVAE(*equations, dict(sizes), **options)
 
 
-def prior(law, inference="q(w | x_{1:T}) q(z_t | x_{1:T}, w)", key="p(w)"):
-    return model(("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", inference), {"w": 2, "z": 2, "x": 2}, laws={key: law})
+def prior(distribution, inference="q(w | x_{1:T}) q(z_t | x_{1:T}, w)", key="p(w)"):
+    return model(
+        ("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", inference),
+        {"w": 2, "z": 2, "x": 2},
+        distributions={key: distribution},
+    )
 
 
 def floored():
-    linear = twin(*DKF, {"z": 1, "x": 1}, T)
+    linear = linear_gaussian_surrogate(*DKF, {"z": 1, "x": 1}, T)
     linear.standardise("z", [Coordinate(floor=0.1)])
     return Oracle(linear, T).gap()
 
@@ -119,7 +123,7 @@ DISTRIBUTIONS = [
     (lambda: FixedNormal(steps=2).build(Shape(2, 2, local=False)), "static"),
     (lambda: FixedNormal(steps=2).build(Shape(2, 2))(torch.zeros(2, 3, 2)), "steps"),
     (lambda: Normal(residual=1.1).build(Shape(2, 2)), "share"),
-    (lambda: model(laws={"p(x)": Normal(residual=True)}), "residual"),
+    (lambda: model(distributions={"p(x)": Normal(residual=True)}), "residual"),
     (lambda: prior(Vamp(), "q(w) q(z_t | x_{1:T})"), "guide"),
     (lambda: prior(Mixture(), key="p(z)"), "static latents"),
     (lambda: prior(Mixture(), None), "reparameterised"),
@@ -132,7 +136,7 @@ PROGRAMS = [
     (lambda: model(network=Dense), "class"),
     (lambda: model(network="gru"), "description"),
     (lambda: model(network={"p(y)": Dense()}), "factor"),
-    (lambda: model(laws=StudentT), "class"),
+    (lambda: model(distributions=StudentT), "class"),
     (lambda: model(view=views.View), "class"),
     (lambda: model(("p(keys_t) p(x_t | keys_t)", "q(keys_t | x_t)"), {"keys": 1, "x": 1}), "keys"),
     (lambda: model((DKF[0], "q(u_t | x_t)")), "latent"),
@@ -149,7 +153,7 @@ PROGRAMS = [
     (lambda: MODEL.model({"x": X, "mask": {"y": X == 0}}), "mask of y"),
     (lambda: MODEL.model({"x": X, "lengths": torch.tensor([5, 6, 1])}), "lengths"),
     (lambda: MODEL.model(X / 0), "finite"),
-    (lambda: MODEL.model(X, self_feeding=1.5), "probability"),
+    (lambda: MODEL.model(X, scheduled_sampling=1.5), "probability"),
     (lambda: MODEL.guide({"z": Y}), "reads x"),
     (lambda: MODEL.log_joint(X, {}), "latent"),
     (lambda: MODEL.log_joint(X, {"z": X}), "shape"),
@@ -159,12 +163,15 @@ PROGRAMS = [
     (lambda: TWO.model(X), "mapping"),
     (
         lambda: poutine.condition(
-            twin("p(x_t | x_{t-1}, z_t) p(z_t | x_{t-1})", "q(z_t | x_{1:T})", {"z": 1, "x": 3}, T).model, {"x": X}
+            linear_gaussian_surrogate(
+                "p(x_t | x_{t-1}, z_t) p(z_t | x_{t-1})", "q(z_t | x_{1:T})", {"z": 1, "x": 3}, T
+            ).model,
+            {"x": X},
         )(length=T, size=3),
         "pass x",
     ),
     (lambda: model(GAPS, {"z": 2, "x": 3, "d": 1}).double().guide(X), "context"),
-    (lambda: SelfFeeding(1.0, blocks=(0, 5)), "blocks"),
+    (lambda: ScheduledSampling(1.0, blocks=(0, 5)), "blocks"),
     (lambda: InputNoise(math.nan), "finite"),
     (lambda: model(DKF, indicators=("z",)), "indicators"),
     (lambda: model(GROUPED, {"g": 2, "w": 2, "x": 3}, grouped=("x",)), "groups share"),
@@ -175,15 +182,20 @@ PROGRAMS = [
     (lambda: model(("p(k_t | k_{t-1}) p(x_t | k_{1:T})", ""), {"k": Discrete(3), "x": 2}), "summed out"),
     (lambda: model(("p(k_t | k_{t-9}) p(x_t | k_t)", ""), {"k": Discrete(3), "x": 2}), "summed over"),
     (lambda: model(("p(k_t) p(x_t | k_t)", "q(k_t | x_t)"), {"k": Discrete(3), "x": 2}), "summed out"),
-    (lambda: model(STATES, {"k": Discrete(3), "x": 2}, laws={"p(k)": Normal()}), "categories"),
-    (lambda: dvae.importance_bound(SUMMED, {"x": Y, "mask": Y > 0}, 1), "means"),
+    (lambda: model(STATES, {"k": Discrete(3), "x": 2}, distributions={"p(k)": Normal()}), "categories"),
+    (lambda: dvae.iwae_bound(SUMMED, {"x": Y, "mask": Y > 0}, 1), "means"),
     (lambda: MODEL.states(X), "summed out"),
-    (lambda: model_price(DKF[0], "p(x_t)", {"z": 1, "x": 1}), "variables"),
-    (lambda: model_price(DKF[0], DKF[0], {"z": 1, "x": 1}, steps=0), "at least 1"),
+    (lambda: model_kl_gap(DKF[0], "p(x_t)", {"z": 1, "x": 1}), "variables"),
+    (lambda: model_kl_gap(DKF[0], DKF[0], {"z": 1, "x": 1}, steps=0), "at least 1"),
     (lambda: Oracle(MODEL, T).gap(), "linear-Gaussian"),
     (lambda: Oracle(LINEAR, "4"), "steps"),
     (lambda: Oracle(DynamicalVAE, T), "class"),
-    (lambda: Oracle(twin("p(z_t | c_t) p(x_t | z_t)", "q(z_t | x_t)", dict.fromkeys("zxc", 1), T), T), "context"),
+    (
+        lambda: Oracle(
+            linear_gaussian_surrogate("p(z_t | c_t) p(x_t | z_t)", "q(z_t | x_t)", dict.fromkeys("zxc", 1), T), T
+        ),
+        "context",
+    ),
     (lambda: Oracle(LINEAR, T).evidence(X[:, :3, :1]), "steps"),
     (floored, "logarithms"),
 ]

@@ -14,7 +14,7 @@ from dvae import DynamicalVAE, distributions
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import in_chunks
 from dvae.program.reference import reference
-from dvae.program.rollout import SelfFeeding
+from dvae.program.rollout import ScheduledSampling
 from dvae.testing.strategies import factorizations
 
 B, T = 3, 5
@@ -127,7 +127,9 @@ def per_step(model, data, latents):
 
 @pytest.mark.parametrize(("pair", "network"), CASES)
 def test_the_vectorised_joint_is_that_of_the_per_step_program(pair, network):
-    model = build(pair, network, laws={"p(w)": distributions.FixedNormal(learned=True)} if pair == "dsae" else None)
+    model = build(
+        pair, network, distributions={"p(w)": distributions.FixedNormal(learned=True)} if pair == "dsae" else None
+    )
     data = draw(model)
     latents = {name: value.detach() for name, value in model.guide(data).items()}
     close(per_step(model, data, latents), model.log_joint(data, latents))
@@ -236,21 +238,21 @@ def test_chunks_make_every_sample_of_every_sequence_once_and_no_more_at_once(siz
     assert all(len(set(draws.tolist())) == samples for draws in found["draw"][..., 0].T)
 
 
-# ------------------------------------------------------------------------------------------------ self-feeding
+# ------------------------------------------------------------------------------------------------ scheduled sampling
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("pair", ["srnn", "body parts", "context"])
 @pytest.mark.parametrize("residual", [False, True])
 def test_feeding_on_ones_own_means(pair, network, residual):
-    model = build(pair, network, laws={"p(x)": distributions.Normal(residual=residual)})
+    model = build(pair, network, distributions={"p(x)": distributions.Normal(residual=residual)})
     data = draw(model)
     latents = {name: value.detach() for name, value in model.guide(data).items()}
     program = poutine.condition(model.model, data=latents)
 
     def logs(feeding):
         torch.manual_seed(5)
-        return log_probs(program, data, self_feeding=feeding)[1]
+        return log_probs(program, data, scheduled_sampling=feeding)[1]
 
     close(logs(0.0), model.log_joint(data, latents))
     exact = logs(1.0)
@@ -265,12 +267,12 @@ def test_feeding_on_ones_own_means(pair, network, residual):
         if not model.generative.local(name):
             expected[name] = exact[name]
             continue
-        law = conditional.law.distribution(conditional({**data, **latents, **fed}, B, T))
-        expected[name] = law.log_prob({**data, **latents}[name]).sum((1, 2)).detach()
+        distribution = conditional.head.distribution(conditional({**data, **latents, **fed}, B, T))
+        expected[name] = distribution.log_prob({**data, **latents}[name]).sum((1, 2)).detach()
     close(exact, expected)
-    close(logs(SelfFeeding(1.0, passes=T)), exact)
+    close(logs(ScheduledSampling(1.0, passes=T)), exact)
     some = logs(0.5)
-    close(logs(SelfFeeding(0.5, passes=T)), some)
+    close(logs(ScheduledSampling(0.5, passes=T)), some)
     assert not torch.allclose(some["x"], exact["x"])
 
 
@@ -281,10 +283,10 @@ def test_networks_and_laws_are_chosen_by_factor():
     model = build(
         "dkf",
         {"p": Dense((3,)), "q(z)": Attention(8, heads=2), "default": Recurrent(4)},
-        laws={"p(x)": distributions.StudentT(), "q": distributions.FixedNormal(scale=0.5)},
+        distributions={"p(x)": distributions.StudentT(), "q": distributions.FixedNormal(scale=0.5)},
     )
     assert type(model.generator["z"].network).__name__ == "DenseNetwork"
     assert type(model.encoder["z"].network).__name__ == "AttentionNetwork"
-    assert type(model.generator["x"].law).__name__ == "StudentTLaw"
-    assert type(model.generator["z"].law).__name__ == "NormalLaw"
-    assert type(model.encoder["z"].law).__name__ == "FixedNormalLaw"
+    assert type(model.generator["x"].head).__name__ == "StudentTModule"
+    assert type(model.generator["z"].head).__name__ == "NormalModule"
+    assert type(model.encoder["z"].head).__name__ == "FixedNormalModule"

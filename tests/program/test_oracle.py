@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 from pyro.infer import Trace_ELBO
 from torch.distributions.transforms import ReshapeTransform
 
-from dvae import DynamicalVAE, Oracle, SequenceELBO, audit, model_arrow_prices, model_price, price, twin
+from dvae import (
+    DynamicalVAE,
+    Oracle,
+    SequenceELBO,
+    audit,
+    kl_gap,
+    linear_gaussian_surrogate,
+    model_edge_costs,
+    model_kl_gap,
+)
 from dvae.distributions import FixedNormal, StandardNormal
 from dvae.factorization.notation import Factorization
 from dvae.networks import Linear
@@ -50,7 +59,7 @@ def build(pair, size=1, seed=0, steps=T, scale=0.4):
     pair = PAIRS[pair] if isinstance(pair, str) else pair
     generative, inference = (Factorization.parse(f) if isinstance(f, str) else f for f in pair)
     sizes = dict.fromkeys(generative.variables, size)
-    return twin(generative, inference, sizes, steps, seed, scale=scale)
+    return linear_gaussian_surrogate(generative, inference, sizes, steps, seed, scale=scale)
 
 
 def data(model, n, steps=T):
@@ -89,7 +98,7 @@ def kalman(A, C, b, d, Q, R, x):
 
 
 def test_evidence_and_posterior_are_the_kalman_filters_and_smoothers():
-    model = twin(*PAIRS["dkf"], {"z": 2, "x": 3}, T)
+    model = linear_gaussian_surrogate(*PAIRS["dkf"], {"z": 2, "x": 3}, T)
     x = data(model, 3)
     oracle = Oracle(model, T)
     z_net, x_net = model.generator["z"], model.generator["x"]
@@ -97,7 +106,7 @@ def test_evidence_and_posterior_are_the_kalman_filters_and_smoothers():
     A = np.array([W[t, t - 1] if t else np.zeros((2, 2)) for t in range(T)])
     C = np.array([V[t, t] for t in range(T)])
     b, d = z_net.network.bias.detach().numpy(), x_net.network.bias.detach().numpy()
-    Q, R = (np.array([np.diag(s) for s in c.law.log_scale.exp().square().detach().numpy()]) for c in (z_net, x_net))
+    Q, R = (np.array([np.diag(s) for s in c.head.log_scale.exp().square().detach().numpy()]) for c in (z_net, x_net))
     evidence, (means, covariance) = oracle.evidence(x).detach(), oracle.posterior(x)
     for i in range(3):
         log_evidence, smoothed, covs = kalman(A, C, b, d, Q, R, x[i].numpy())
@@ -227,9 +236,11 @@ def exact_guide(model):
                 here = slice(past.stop, past.stop + math.prod(shape))
                 gain = torch.linalg.solve(covariance[past, past], covariance[past, here])
                 left = covariance[here, here] - covariance[here, past] @ gain
-                law = dist.MultivariateNormal(mean[:, here] + (drawn - mean[:, past]) @ gain, (left + left.t()) / 2)
-                reshape = ReshapeTransform(law.event_shape, shape)
-                value = pyro.sample(name, dist.TransformedDistribution(law, [reshape]))
+                distribution = dist.MultivariateNormal(
+                    mean[:, here] + (drawn - mean[:, past]) @ gain, (left + left.t()) / 2
+                )
+                reshape = ReshapeTransform(distribution.event_shape, shape)
+                value = pyro.sample(name, dist.TransformedDistribution(distribution, [reshape]))
                 drawn = torch.cat([drawn, value.flatten(1)], dim=1)
 
     return guide
@@ -270,11 +281,11 @@ AGAINST = {
 
 
 @pytest.mark.parametrize("pair", AGAINST)
-def test_a_latent_that_the_guide_draws_against_the_arrows_has_no_analytic_kl(pair, monkeypatch):
+def test_a_latent_that_the_guide_draws_against_the_edges_has_no_analytic_kl(pair, monkeypatch):
     *equations, child, parent = AGAINST[pair]
     model = build(tuple(equations))
     with torch.no_grad():
-        model.generator[child].network.weights[parent].fill_(1.0)  # a strong arrow between latents
+        model.generator[child].network.weights[parent].fill_(1.0)  # a strong edge between latents
     oracle = Oracle(model, T)
     assert oracle.fit_guide() < 1e-6  # so the exact bound is the evidence, and draws vary little about it
     x = data(model, 1).repeat(4000, 1, 1)
@@ -287,21 +298,21 @@ def test_a_latent_that_the_guide_draws_against_the_arrows_has_no_analytic_kl(pai
     assert z_score(forced, exact) > 20
 
 
-# ----------------------------------------------------------------------------------------------- price and errors
+# ----------------------------------------------------------------------------------------------- cost and errors
 
 
-def test_the_price_of_a_dropped_arrow():
+def test_the_price_of_a_dropped_edge():
     sizes = {"z": 1, "x": 1}
-    full = price(DKF, "q(z_t | z_{t-1}, x_{t:T})", sizes, steps=T, seeds=2)
-    dropped = price(DKF, "q(z_t | x_{t:T})", sizes, steps=T, seeds=2)
+    full = kl_gap(DKF, "q(z_t | z_{t-1}, x_{t:T})", sizes, steps=T, seeds=2)
+    dropped = kl_gap(DKF, "q(z_t | x_{t:T})", sizes, steps=T, seeds=2)
     assert full.shape == (2,)
     assert full.abs().max() < 1e-6
     assert dropped.min() > 1e-3
 
 
 def spread(generative, sizes, seed, steps):
-    """The covariance of the data under the model that prices of a seed have."""
-    oracle = Oracle(twin(generative, None, sizes, steps, seed), steps)
+    """The covariance of the data under the model that costs of a seed have."""
+    oracle = Oracle(linear_gaussian_surrogate(generative, None, sizes, steps, seed), steps)
     n = sum(map(oracle._size, oracle.model.latents))
     return torch.linalg.inv(oracle._joint()[1].detach())[n:, n:]
 
@@ -324,27 +335,27 @@ INDEPENDENT = {
 @pytest.mark.parametrize("case", INDEPENDENT)
 def test_a_model_without_dependence_loses_all_of_it(case):
     generative, reduced, sizes, steps, size = INDEPENDENT[case]
-    found = model_price(generative, reduced, sizes, steps, seeds=3)
+    found = model_kl_gap(generative, reduced, sizes, steps, seeds=3)
     expected = [dependence(spread(generative, sizes, seed, steps), size) for seed in range(3)]
     assert min(expected) > 1e-6
     assert found.tolist() == pytest.approx(expected, abs=1e-9)
 
 
-def test_what_another_arrow_can_carry_costs_nothing():
-    found = model_arrow_prices("p(z_t | z_{t-1}, x_{<t}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2)
-    assert {arrow for arrow, cost in found.items() if cost.max() < 1e-8} == {"z_{t-1} to z_t", "x_{<t} to z_t"}
+def test_what_another_edge_can_carry_costs_nothing():
+    found = model_edge_costs("p(z_t | z_{t-1}, x_{<t}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2)
+    assert {edge for edge, cost in found.items() if cost.max() < 1e-8} == {"z_{t-1} to z_t", "x_{<t} to z_t"}
     assert found["x_{<t} to x_t"].min() > 1e-3
 
 
-def with_prior(law):
-    parts = {"default": FixedNormal(project=False), "p(w)": law}
+def with_prior(distribution):
+    parts = {"default": FixedNormal(project=False), "p(w)": distribution}
     return DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 1}, Linear(T), parts).double()
 
 
 def test_a_learned_normal_prior_is_part_of_the_evidence():
     model = with_prior(FixedNormal(scale=0.6, learned=True))
     with torch.no_grad():
-        model.generator["w"].law.out.bias.copy_(torch.tensor([1.0, -2.0]))
+        model.generator["w"].head.out.bias.copy_(torch.tensor([1.0, -2.0]))
     network, x = model.generator["x"].network, torch.randn(3, T, 1, dtype=torch.float64)
     slopes = network.weights["w"][:, 0, 0]
     mean = network.bias[:T, 0] + slopes @ torch.tensor([1.0, -2.0], dtype=torch.float64)

@@ -17,10 +17,10 @@ import dvae
 from dvae import DynamicalVAE, SequenceELBO
 from dvae.inference.bounds.particles import Filter
 from dvae.inference.training.fit import Callback
+from dvae.locking import serialized
 from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Recurrent
 from dvae.testing import FactorizationContract
-from dvae.turns import alone
 
 SRNN = ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})")
 
@@ -140,7 +140,7 @@ def test_a_bound_and_the_building_of_a_model_wait_for_their_turn():
         done.append(0.0)
 
     threads = [threading.Thread(target=work) for _ in range(4)]
-    with alone:
+    with serialized:
         for thread in threads:
             thread.start()
         time.sleep(0.2)
@@ -201,7 +201,7 @@ def test_pyros_svi_trains_every_parameter_and_keeps_models_apart():
 def test_mixed_precision_trains(name):
     model = dvae.method(name).build({"x": 3})
     with torch.autocast("cpu", torch.bfloat16):
-        bound = SequenceELBO().terms(model, torch.randn(4, 6, 3), self_feeding=0.5).bound.mean()
+        bound = SequenceELBO().terms(model, torch.randn(4, 6, 3), scheduled_sampling=0.5).bound.mean()
     bound.backward()
     assert torch.isfinite(bound)
     assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)

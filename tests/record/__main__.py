@@ -155,7 +155,7 @@ def options_of(name: str, data: Any) -> list[dict[str, Any]]:
 
     def possible(key: str, value: Any) -> bool:
         try:
-            method = dvae.method(name, **{**first, key: value}).suited(data.windows("train"))
+            method = dvae.method(name, **{**first, key: value}).resolve_defaults(data.windows("train"))
             method.build(data.schema)
             method.train(data.windows("train"), None, 3)
         except (ValueError, TypeError):
@@ -221,7 +221,7 @@ def numbers(name: str, options: Mapping[str, Any], data: Any, whole: bool) -> di
     """What the record keeps of one set of options."""
     found: dict[str, Any] = {}
     train, test = data.windows("train"), data.windows("test")
-    method = dvae.method(name, **options).suited(train)
+    method = dvae.method(name, **options).resolve_defaults(train)
     torch.manual_seed(0)
     model = method.build(data.schema).double()
     found["parameters"] = sum(parameter.numel() for parameter in model.parameters())

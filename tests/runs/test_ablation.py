@@ -1,4 +1,4 @@
-"""Ablations: prices are those of the oracle, every arrow has a run of its own, and a broken ablation is continued."""
+"""Ablations: costs are those of the oracle, every edge has a run of its own, and a broken ablation is continued."""
 
 import json
 import math
@@ -16,7 +16,7 @@ import dvae
 from dvae.cli import main
 from dvae.data.schema import Schema
 from dvae.factorization.notation import Factorization
-from dvae.runs.ablation import FAMILY, WHOLE, Ablation, arrows_of, as_equations
+from dvae.runs.ablation import FAMILY, WHOLE, Ablation, as_equations, edges_of
 from dvae.runs.grid import NAME
 from dvae.testing.strategies import factorizations
 
@@ -28,55 +28,55 @@ PAIR = "p(z_t | z_{t-1}) p(x_t | z_t, x_{t-1})", "q(z_t | x_t)"
 
 @pytest.fixture(scope="module")
 def priced():
-    return dvae.ablate((DKF, SMOOTHER), sizes={"z": 1, "x": 1}, steps=3, twins=2)
+    return dvae.ablate((DKF, SMOOTHER), sizes={"z": 1, "x": 1}, steps=3, surrogates=2)
 
 
 def command(people, out, *more):
     equations = ["--generative", PAIR[0], "--inference", PAIR[1], "--residual", ".5", "--latent", "2", "--width", "4"]
     runs = ["--data", str(people), "--out", str(out), "--seeds", "0", "1", "--steps", "2", "--batch-size", "4"]
-    twins = ["--twins", "1", "--twin-steps", "2", "--bound-particles", "4", "--jobs", "1"]
-    return ["check", "edges", *equations, *runs, *twins, "--warm-up", "1", *more]
+    surrogates = ["--surrogates", "1", "--surrogate-steps", "2", "--bound-particles", "4", "--jobs", "1"]
+    return ["check", "edges", *equations, *runs, *surrogates, "--warm-up", "1", *more]
 
 
 @pytest.fixture(scope="module")
 def fitted(people, tmp_path_factory):
     """An ablation by the command line: its directory."""
     out = tmp_path_factory.mktemp("ablation") / "runs"
-    assert main(command(people, out, "--figure", str(out.with_name("arrows.png")))) == 0
+    assert main(command(people, out, "--figure", str(out.with_name("edges.png")))) == 0
     return out
 
 
 def test_prices_are_those_of_the_guide_and_of_the_model(priced):
     sizes = {"z": 1, "x": 1}
     expected = {
-        "q": dvae.arrow_prices(DKF, SMOOTHER, sizes, steps=3, seeds=2),
-        "p": dvae.model_arrow_prices(DKF, sizes, steps=3, seeds=2),
+        "q": dvae.edge_costs(DKF, SMOOTHER, sizes, steps=3, seeds=2),
+        "p": dvae.model_edge_costs(DKF, sizes, steps=3, seeds=2),
     }
-    assert len(priced.arrows) == sum(map(len, expected.values())) == 6
-    for arrow in priced.arrows:
-        assert priced.prices[arrow.run].tolist() == expected[arrow.kind][arrow.name].tolist()
-    assert {arrow.name for arrow in priced.arrows if max(priced.prices[arrow.run]) < 1e-6} == {"x_{<t} to z_t"}
-    assert priced.notes == {"model-without-z_t-to-x_t": "no data depend on z then"}
+    assert len(priced.edges) == sum(map(len, expected.values())) == 6
+    for edge in priced.edges:
+        assert priced.costs[edge.run].tolist() == expected[edge.kind][edge.name].tolist()
+    assert {edge.name for edge in priced.edges if max(priced.costs[edge.run]) < 1e-6} == {"x_{<t} to z_t"}
+    assert priced.notes == {"model-without-z_t-to-x_t": "without it, no data depend on z"}
 
 
 @settings(max_examples=50)
 @given(factorizations())
-def test_every_arrow_has_a_run_and_an_edge_of_its_own(pair):
+def test_every_edge_has_a_run_and_an_edge_of_its_own(pair):
     parts = [*map(Factorization.parse, pair)]
-    runs = [arrow.run for arrow in arrows_of(*parts)]
+    runs = [edge.run for edge in edges_of(*parts)]
     assert len({*runs, WHOLE}) == len(runs) + 1
     assert all(re.fullmatch(NAME, run) for run in runs)
     for part in parts:
-        edges = [arrow for *_, arrow in part.slice().edges.data("arrow")]
-        assert len(edges) == len(part.arrows)
-        assert all(arrow in part.arrows for arrow in edges)
+        edges = [edge for *_, edge in part.slice().edges.data("edge")]
+        assert len(edges) == len(part.edges)
+        assert all(edge in part.edges for edge in edges)
 
 
-def test_the_thicker_an_arrow_the_higher_its_price(priced):
+def test_the_thicker_an_edge_the_higher_its_price(priced):
     figure = priced.plot()
     for axes, kind in zip(figure.axes, "pq", strict=True):
         widths = {float(patch.get_linewidth()) for patch in axes.patches if isinstance(patch, FancyArrowPatch)}
-        costs = {round(np.mean(priced.prices[arrow.run]), 3) for arrow in priced.arrows if arrow.kind == kind}
+        costs = {round(np.mean(priced.costs[edge.run]), 3) for edge in priced.edges if edge.kind == kind}
         written = sorted(float(text.get_text()) for text in axes.texts if "$" not in text.get_text())
         assert {*written} == costs
         assert len(widths) == len(costs)
@@ -100,14 +100,14 @@ def test_factors_read_the_covariates_of_data_as_those_of_the_method_do():
     theirs = method.build(schema)
     found = as_equations(method, schema).equations()
     assert found == (theirs.generative, theirs.inference)
-    assert ("x", "c_t") in {(child, str(parent)) for child, parent in found[0].arrows}
-    priced = dvae.ablate(as_equations(method, schema), steps=2, twins=1)
-    assert min(priced.prices["model-without-c_t-to-x_t"]) > 1e-3
+    assert ("x", "c_t") in {(child, str(parent)) for child, parent in found[0].edges}
+    priced = dvae.ablate(as_equations(method, schema), steps=2, surrogates=1)
+    assert min(priced.costs["model-without-c_t-to-x_t"]) > 1e-3
 
 
 def test_an_ablation_by_the_command_line(fitted):
     found = dvae.Ablation.load(fitted / "edges.json")
-    runs = {arrow.run for arrow in found.arrows}
+    runs = {edge.run for edge in found.edges}
     left_out = {"model-without-x_t-1-to-x_t"}
     assert found.notes.keys() >= left_out
     assert "residual" in found.notes[left_out.copy().pop()]
@@ -117,14 +117,14 @@ def test_an_ablation_by_the_command_line(fitted):
         *(f"{run}-seed{seed}" for run in runs - left_out | {WHOLE} for seed in (0, 1)),
     }
     for run, estimate in found.differences.items():
-        metric = "importance bound" if run.startswith("model") else "ELBO"  # as on twins: evidence, and its gap
+        metric = "IWAE bound" if run.startswith("model") else "ELBO"  # as on surrogates: evidence, and its gap
         whole, without = (found.comparison[name][metric].mean for name in (WHOLE, run))
         assert estimate.mean == pytest.approx(whole - without, abs=1e-9)
         assert estimate.p_value() <= found.p_values[run] <= 1
     reduced = dvae.load(fitted / "guide-without-x_t-to-z_t-seed1")
     assert (reduced.model.generative.text, reduced.model.inference.text) == (PAIR[0], "q(z_t)")
     assert "not fitted" in str(found)
-    assert fitted.with_name("arrows.png").stat().st_size > 0
+    assert fitted.with_name("edges.png").stat().st_size > 0
 
 
 def test_the_same_command_continues_it(fitted, people, tmp_path):
@@ -150,8 +150,8 @@ def test_it_comes_back_from_json(fitted, priced):
         {"equations": {"generative": "p(z_t | z_{t-99999999}) p(x_t | z_t)", "inference": PAIR[1]}},
         {"equations": {"generative": 3, "inference": PAIR[1]}},
         {"equations": {"generative": PAIR[0], "inference": "q(z_t | "}},
-        {"prices": {}},
-        {"prices": {"model-without-z_t-to-x_t": [1]}},
+        {"costs": {}},
+        {"costs": {"model-without-z_t-to-x_t": [1]}},
         {"notes": {"none": "of these"}},
         {"comparison": {"rows": {}}},
     ],
@@ -164,8 +164,8 @@ def test_what_is_no_ablation_is_refused(priced, damage):
 
 @pytest.mark.parametrize("costs", [[], [0.1], [math.nan, 0.1]])
 def test_prices_that_do_not_belong_together_are_refused(priced, costs):
-    damaged = replace(priced, prices=priced.prices | {"model-without-z_t-to-x_t": np.array(costs)})
-    with pytest.raises(ValueError, match="price"):
+    damaged = replace(priced, costs=priced.costs | {"model-without-z_t-to-x_t": np.array(costs)})
+    with pytest.raises(ValueError, match="cost"):
         damaged.check()
 
 
@@ -181,10 +181,10 @@ def test_a_comparison_of_other_models_is_refused(fitted):
     [
         ([], "give the name of a method, or --generative"),
         (["srnn", "--inference", SMOOTHER], "--inference is the guide of --generative; srnn has its own"),
-        (["hit-dvae"], "an ablation is of vae, dkf, storn"),
+        (["hit-dvae"], "ablate one of vae, dkf, storn"),
         (["srnm"], "did you mean 'srnn'?"),
         (["srnn", "--steps", "3"], "give --out DIR"),
-        (["srnn", "--twins", "0"], "--twins is 0"),
+        (["srnn", "--surrogates", "0"], "--surrogates is 0"),
         (["srnn", "--network", "recurent"], "did you mean 'recurrent'?"),
         (["--generative", "p(z_t"], "expected"),
     ],
@@ -200,4 +200,4 @@ def test_fits_need_data_and_a_directory(tmp_path):
     with pytest.raises(ValueError, match="give both `data` and `out`"):
         dvae.ablate((DKF, SMOOTHER), out=tmp_path)
     with pytest.raises(ValueError, match="the latent k has no factor in the guide"):
-        dvae.ablate(("p(k_t | k_{t-1}) p(x_t | k_t)", ""), twins=1, progress=False)
+        dvae.ablate(("p(k_t | k_{t-1}) p(x_t | k_t)", ""), surrogates=1, progress=False)

@@ -44,7 +44,7 @@ def test_a_grid_is_what_its_file_says(study):
     assert list(grid.methods) == ["filter", "smoother-latent=2", "smoother-latent=3", "vae"]
     assert (grid.seeds, grid.training) == ((0, 1), {"steps": 2, "batch_size": 4})
     assert grid.methods["vae"] == dvae.method("vae", latent=2)
-    assert grid.methods["smoother-latent=3"].equations()[1] == dvae.faithful("p(z_t | z_{t-1}) p(x_t | z_t)")
+    assert grid.methods["smoother-latent=3"].equations()[1] == dvae.faithful_inverse("p(z_t | z_{t-1}) p(x_t | z_t)")
     study.write_text(STUDY + "\n[more]\nmethod = 'srnn'\neach.latent = [1, 2]\neach.width = [3, 4]\n")
     more = [name for name in Grid.read(study).methods if name.startswith("more")]
     assert more == [f"more-latent={latent}-width={width}" for latent in (1, 2) for width in (3, 4)]
@@ -104,22 +104,22 @@ def table(tmp_path):
     [
         ("[a", "is not TOML"),
         ("", "names nothing to fit"),
-        ("seeds = 3\n[a]\nmethod='vae'", "seeds are some whole numbers"),
-        ("seeds = [-1]\n[a]\nmethod='vae'", "each once"),
-        ("training = 3\n[a]\nmethod='vae'", r"\[training\]: it is a table"),
+        ("seeds = 3\n[a]\nmethod='vae'", "seeds is 3; it must list"),
+        ("seeds = [-1]\n[a]\nmethod='vae'", "distinct whole numbers"),
+        ("training = 3\n[a]\nmethod='vae'", r"\[training\]: it must be a table"),
         ("training.stepz = 3\n[a]\nmethod='vae'", r"\[training\]: .* 'stepz' .*did you mean 'steps'"),
-        ("training.seed = 3\n[a]\nmethod='vae'", r"seeds = \[...\] says it"),
-        ("['../a']\nmethod='vae'", "name of run directories"),
-        ("[a]\neach.inference=['faithful', 'q(z_t | x_t)']", "texts a table each"),
+        ("training.seed = 3\n[a]\nmethod='vae'", r"seeds = \[...\] instead"),
+        ("['../a']\nmethod='vae'", "cannot name run directories"),
+        ("[a]\neach.inference=['faithful', 'q(z_t | x_t)']", "each text value its own table"),
         ("[a]\nmethod='vae'\neach.latent=[3]\n['a-latent=3']\nmethod='srnn'", "another table's run"),
         ("[a]\nx=" + "[" * 3000, "is not TOML"),
         ("steps = 3\n[a]\nmethod='vae'", "steps = 3 is in no table"),
         ("[a]\nmethod='srn'", r"\[a\]: unknown method 'srn' \(did you mean 'srnn'\?\)"),
         ("[a]\nmethod='vae'\neach.latent=3", "must be a list of values"),
-        ("[a]\nmethod='vae'\neach=3", "each a table"),
+        ("[a]\nmethod='vae'\neach=3", "`each` a table"),
         ("[a]\nmethod='vae'\neach.latent=[3, 3]", "a value twice"),
         ("[a]\ngenerative='p(z_t'", r"\[a\]:"),
-        (f"[a]\nmethod='vae'\neach.latent={list(range(1, 102))}\neach.warm_up={list(range(100))}", "over 1000"),
+        (f"[a]\nmethod='vae'\neach.latent={list(range(1, 102))}\neach.warm_up={list(range(100))}", "maximum of 1000"),
     ],
 )
 def test_what_is_no_grid_is_refused_by_table(study, text, told):

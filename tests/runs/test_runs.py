@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save
 import dvae
 from dvae import files, motion
 from dvae.cli import main
-from dvae.inference.evaluation.result import reason
+from dvae.inference.evaluation.result import error_message
 from dvae.inference.training import trackers
 from dvae.inference.training.checkpoints import (
     BEST,
@@ -414,7 +414,7 @@ def test_a_full_disk_names_the_file(run, tmp_path, monkeypatch, capsys):
 
     with (
         pytest.raises(OSError, match=f"No space left on device.*{tmp_path}/new/a.txt"),
-        files.written(tmp_path / "new" / "a.txt"),
+        files.atomic_write(tmp_path / "new" / "a.txt"),
     ):
         full()
     walks, new = motion.simulate(clips=2, frames=30), tmp_path / "new"
@@ -446,7 +446,7 @@ def test_what_killed_processes_left_is_removed_by_the_next_one(tmp_path, monkeyp
         path.touch()
     left[0].mkdir()
     (left[0] / "walk.csv").touch()
-    with files.written(tmp_path / "a.txt"):
+    with files.atomic_write(tmp_path / "a.txt"):
         pass
     assert {path.name for path in tmp_path.iterdir()} == {own.name, "a.txt"}
 
@@ -500,7 +500,7 @@ def test_nothing_is_suggested_where_nothing_is_near(capsys):
 )
 def test_a_file_ends_in_what_is_written(fitted, capsys, tmp_path, monkeypatch, arguments, end):
     monkeypatch.chdir(tmp_path)
-    assert f"end its name in {end}" in failure(capsys, *arguments.replace("RUN", str(fitted)).split(), code=2)
+    assert f"end the name in {end}" in failure(capsys, *arguments.replace("RUN", str(fitted)).split(), code=2)
     assert not list(tmp_path.iterdir())
 
 
@@ -517,8 +517,8 @@ def test_pyros_table_of_shapes_is_cut():
     with pytest.raises(ValueError) as caught:
         pyro.poutine.trace(program).get_trace()
     assert "Trace Shapes:" in str(caught.value)
-    assert "parameter scale" in reason(caught.value)
-    assert "Trace Shapes:" not in reason(caught.value)
+    assert "parameter scale" in error_message(caught.value)
+    assert "Trace Shapes:" not in error_message(caught.value)
 
 
 PROGRAM = str(ROOT / "dvae" / "command" / "__init__.py")

@@ -17,7 +17,7 @@ import dvae
 from dvae import motion
 from dvae.cli import main
 from dvae.motion.data.dataset import MotionData
-from dvae.motion.judges.action_classifier import ActionClassifier
+from dvae.motion.metric_models.action_classifier import ActionClassifier
 from dvae.runs import sweep as sweeps
 from dvae.runs.sweep import Outcome, SweepInterrupted, sweep
 
@@ -91,7 +91,7 @@ def test_what_is_finished_is_left_as_it_is(swept, data, capsys):
     ("change", "message"),
     [
         (lambda m, d, t: (replace(m, warm_up=3), d, t), "its warm_up is 4, the sweep's 3"),
-        (lambda m, d, t: (m, d, replace(t, steps=7)), "its steps is 6, the sweep's 7; give the sweep those options"),
+        (lambda m, d, t: (m, d, replace(t, steps=7)), "its steps is 6, the sweep's 7; use the same options"),
         (lambda m, d, t: (m, replace(d, protocol=replace(d.protocol, observed=14)), t), r"protocol\.observed is 15"),
         (lambda m, d, t: (m, replace(d, motion=motion.simulate(14, 90, seed=2)), t), "its data's fingerprint is"),
     ],
@@ -100,7 +100,7 @@ def test_a_run_of_other_options_is_refused_before_any_work(swept, data, change, 
     out, _, _ = swept
     before = written(out)
     method, other, training = change(VAE, data, TRAINING)
-    with pytest.raises(ValueError, match=f"vae-z3-seed0 holds a run of other options.*{message}"):
+    with pytest.raises(ValueError, match=f"vae-z3-seed0 contains a run with other options.*{message}"):
         sweep({"new": VAE, "vae-z3": method}, other, out, seeds=[0], training=training)
     assert written(out) == before
 
@@ -109,9 +109,9 @@ def test_a_sweep_that_makes_no_sense_is_refused(data, tmp_path):
     for methods, seeds, message in (
         ([], [0], "at least one method"),
         ([VAE], [], "at least one method and one seed"),
-        ([VAE], [0, 0], r"each once; seeds are \[0, 0\]"),
+        ([VAE], [0, 0], r"each once, got seeds \[0, 0\]"),
         ([VAE, VAE], [0], "vae is given twice"),
-        ({"a/b": VAE}, [0], "no name for a directory"),
+        ({"a/b": VAE}, [0], "cannot name a directory"),
     ):
         with pytest.raises(ValueError, match=message):
             sweep(methods, data, tmp_path / "out", seeds, TRAINING)
@@ -124,7 +124,7 @@ def test_a_sweep_that_makes_no_sense_is_refused(data, tmp_path):
     with pytest.raises(ValueError, match="name the methods: sweep"):
         sweep(equations, data, tmp_path / "out", [0], TRAINING)
     (tmp_path / "vae-seed0").touch()
-    with pytest.raises(ValueError, match="is a file, where a run is to go"):
+    with pytest.raises(ValueError, match="is a file, not a run directory"):
         sweep([VAE], data, tmp_path, [0], TRAINING)
     assert not (tmp_path / "out").exists()
 
@@ -303,7 +303,7 @@ def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     assert process.returncode == 130, error
-    assert "of 4 runs finished; the same sweep again continues them" in error.splitlines()[-1], error
+    assert "of 4 runs finished; start the same sweep again to continue" in error.splitlines()[-1], error
     assert "Traceback" not in error
     assert "vae-seed0 starts" in error.splitlines()
     stopped = states(tmp_path)

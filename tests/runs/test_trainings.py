@@ -25,10 +25,10 @@ def people():
 
 
 def posed(skeleton):
-    return Poses.under(PROTOCOLS["h36m"], skeleton)
+    return Poses.from_data(PROTOCOLS["h36m"], skeleton)
 
 
-KINDS = {**registry.methods(), **registry.judges()}
+KINDS = {**registry.methods(), **registry.metric_models()}
 
 
 @pytest.mark.parametrize(
@@ -65,4 +65,4 @@ def test_show_says_how_a_method_is_fitted(capsys):
     assert main(["show", "pose-prior"]) == 0
     assert "fitted to human36m in 1225 steps of 33, adam, learning rate 0.01" in capsys.readouterr().out
     assert main(["show", "pose-prior", "--out", "graph.png"]) == 2
-    assert "leave --out out" in capsys.readouterr().err
+    assert "leave out --out" in capsys.readouterr().err

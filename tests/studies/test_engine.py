@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.studies import engine
-from dvae.inference.evaluation.estimates import Crossed
+from dvae.inference.evaluation.estimates import TwoWayErrors
 
 
 def row(*values, clips="aab", weights=(1, 3, 2), **options):
@@ -14,7 +14,7 @@ def row(*values, clips="aab", weights=(1, 3, 2), **options):
 
 def test_sequences_count_by_their_weights_and_errors_are_over_clips():
     found = row([1.0, 5.0, 2.0], [2.0, 6.0, 4.0]).estimate("ADE")
-    assert found == Crossed.of(np.array([[4.0, 2.0], [5.0, 4.0]]), np.array([4.0, 2.0])).estimate()
+    assert found == TwoWayErrors.of(np.array([[4.0, 2.0], [5.0, 4.0]]), np.array([4.0, 2.0])).estimate()
 
 
 def test_a_sequence_that_one_seed_lacks_counts_in_none():

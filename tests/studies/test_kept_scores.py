@@ -34,7 +34,7 @@ def test_scores_name_no_place(of):
         assert clips == len(told["clips"]), name
 
 
-@pytest.mark.parametrize("file", sorted(ranking.SCORES.rglob("judges/*/config.json")), ids=named)
+@pytest.mark.parametrize("file", sorted(ranking.SCORES.rglob("metric models/*/config.json")), ids=named)
 def test_judges_name_no_place(file):
     assert '"/' not in file.read_text(encoding="utf-8")
     assert (file.parent / "best.safetensors").stat().st_size < 2**20
@@ -70,13 +70,13 @@ def test_scores_are_of_the_presets(of, run):
         assert stored["training"][name] == now[name], name
 
 
-@pytest.mark.parametrize("name", ["judges", *tuning.SECTIONS])
+@pytest.mark.parametrize("name", ["metric_models", *tuning.SECTIONS])
 def test_what_was_tuned_stands_on_the_page(name):
     """Every case that was scored, by the name that it has there."""
     page = (ranking.SCORES.parents[1] / "docs" / "results" / "tuning.md").read_text(encoding="utf-8")
     found = tuning.Store(ranking.SCORES / "tuning.json", name).found
     assert found
-    assert found.keys() <= set(tuning.OF_JUDGES if name == "judges" else tuning.SECTIONS[name].cases)
+    assert found.keys() <= set(tuning.OF_METRIC_MODELS if name == "metric_models" else tuning.SECTIONS[name].cases)
     for case in found:
         assert f"| {case} |" in page
 

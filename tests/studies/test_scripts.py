@@ -124,7 +124,7 @@ def patched(monkeypatch, module, **values):
 
 def test_audits(page, monkeypatch):
     monkeypatch.setattr(audits, "FAMILY", {name: audits.FAMILY[name] for name in ("VAE", "DKF", "HiT-DVAE")})
-    marks = [mark.replace("tables", name) for name in ("derived", "arrows") for mark in (pages.BEGIN, pages.END)]
+    marks = [mark.replace("tables", name) for name in ("derived", "edges") for mark in (pages.BEGIN, pages.END)]
     page.write_text(page.read_text() + "".join(marks))
     audits.main(page, steps=2, seeds=1)
     before, derived = page.read_text().split(marks[0])
@@ -243,7 +243,7 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
     monkeypatch.setattr(mix_and_match, "BODY", motion.WALKER.names)
     little = {"STEPS": 2, "EVERY": 20, "SAMPLES": 3, "WATCHED": 3, "FUTURES": 5, "THINNED": 2}
     little |= {"OPTIONS": {"width": 8}, "JUDGED": {"width": 4}, "TUNING": mix_and_match.RAW}
-    little |= {"JUDGE": {**mix_and_match.JUDGE, "examples": 8, "steps": 2}}
+    little |= {"METRIC_MODEL": {**mix_and_match.METRIC_MODEL, "examples": 8, "steps": 2}}
     for name, value in little.items():
         monkeypatch.setattr(mix_and_match, name, value)
     named = {name: mix_and_match.NAMED[name] for name in ("mix", "mix, velocity", "no noise")}
@@ -340,6 +340,7 @@ def test_completion(tmp_path, page, short, monkeypatch):
     small = method("motion-latent", latent=3, widths=(8,), finish=0.0)
     fit(small, dataset.SegmentData.open(), out=tmp_path / "a", **vars(Training(steps=2, batch_size=4, progress=False)))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
+    page.write_text(page.read_text().replace("tables -->", "completion -->"))
     options = {"out": tmp_path / "out", "picture": tmp_path / "a.png", "budget": short, "page": page}
     runs = tmp_path / "a", tmp_path / "b"
     completion.main("simulated", runs, parts=("prediction",), **options)
@@ -350,7 +351,7 @@ def test_completion(tmp_path, page, short, monkeypatch):
     completion.main(None, runs[:1], **options)
     assert page.read_text() == text
     assert [file.stat().st_mtime_ns for file in files] == times
-    page.write_text(text.replace("completion -->", "tables -->").replace("end of completion", "end of tables"))
+    page.write_text(text.replace("completion -->", "tables -->"))
     curves, seen, *_, sure = tables(page)
     assert [row[0] for row in curves[1:4]] == ["ours", "ours, body unknown", "reconstruction"]
     assert curves[-1][0] == "segments"
@@ -500,7 +501,7 @@ def test_ranking(folder, page, monkeypatch):
     methods = {"cvae": {"width": 4, "latent": 2}, "srnn": {"width": 4, "latent": 2, "warm_up": 1}}
     small = {name: {**options, "steps": 2, "batch_size": 4} for name, options in methods.items()}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", small)})
-    monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
+    monkeypatch.setattr(ranking, "fitted_metric_models", lambda *arguments: {})
     monkeypatch.setattr(ranking, "ENOUGH", 2)
     page.write_text(page.read_text().replace("tables", "simulated"))
     runs, scores = folder / "ranked", folder / "scores"
@@ -592,12 +593,12 @@ def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
 
 
 def test_judges_say_nothing_of_their_place_and_are_whole_while_others_use_them(folder, tmp_path, monkeypatch):
-    monkeypatch.setitem(ranking.JUDGES, "prior", ("pose-prior", {}, Training(2, 4, progress=False)))
+    monkeypatch.setitem(ranking.METRIC_MODELS, "prior", ("pose-prior", {}, Training(2, 4, progress=False)))
     data = motion.MotionData.open(folder / "people.npz", motion.PROTOCOLS["simulated"])
-    config = ranking.fitted_judges(data, tmp_path, ["prior"])["prior"] / "config.json"
+    config = ranking.fitted_metric_models(data, tmp_path, ["prior"])["prior"] / "config.json"
     before = config.stat()
     assert Run(config.parent).config["data"]["path"] == "people.npz"
-    ranking.fitted_judges(data, tmp_path, ["prior"])
+    ranking.fitted_metric_models(data, tmp_path, ["prior"])
     assert (config.stat().st_ino, config.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
@@ -635,7 +636,7 @@ def test_a_second_stage_alone_stands_on_the_first_of_its_set(folder, tmp_path, m
     small = {"width": 4, "latent": 2, "batch_size": 4}
     methods = {"cvae": {**small, "steps": 3}, "dlow": {"modes": 2, "steps": 2, "batch_size": 4}}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", methods)})
-    monkeypatch.setattr(ranking, "fitted_judges", lambda *arguments: {})
+    monkeypatch.setattr(ranking, "fitted_metric_models", lambda *arguments: {})
     ranking.main(tmp_path, folder, ("simulated",), ("dlow",), (0,), 2, tmp_path / "scores")
     assert Run(tmp_path / "simulated" / "cvae-seed0").config["training"]["steps"] == 3
     assert not any(name.startswith("cvae-") for name in ranking.archive(tmp_path / "scores", "simulated").names)
@@ -648,7 +649,7 @@ def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, 
     second = replace(first, methods={"srnn": {**small, "steps": 3}}, like="simulated")
     judged = []
     monkeypatch.setattr(ranking, "SETS", {"simulated": first, "longer": second})
-    monkeypatch.setattr(ranking, "fitted_judges", lambda data, path, names: judged.append(path.name) or {})
+    monkeypatch.setattr(ranking, "fitted_metric_models", lambda data, path, names: judged.append(path.name) or {})
     for name in ranking.SETS:
         assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # reference rows alone are no table
         ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=(name,), scores=tmp_path / "scores")
@@ -717,7 +718,7 @@ def test_tuning(folder, page, monkeypatch):
     }
     usual = motion.PROTOCOLS["simulated"]
     patched(monkeypatch, tuning, SECTIONS=sections, TUNING=usual, JOINTS=(), SAMPLES=2)
-    monkeypatch.setattr(tuning, "fitted_judges", lambda *arguments: {})
+    monkeypatch.setattr(tuning, "fitted_metric_models", lambda *arguments: {})
     for name in sections:
         page.write_text(
             "\n".join([page.read_text(), *(mark.replace("tables", name) for mark in (pages.BEGIN, pages.END))])
@@ -748,17 +749,17 @@ def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, page, monkeypa
         TUNING=protocol,
         SECTIONS={"none": tuning.Section("cvae", Training(), {}, protocol=protocol)},
         STEPS={"prior": (1, 30)},
-        OF_JUDGES=["prior 1 steps", "prior 30 steps"],
+        OF_METRIC_MODELS=["prior 1 steps", "prior 30 steps"],
         SEEDS_OF={"prior": (0, 1)},
-        JUDGES={"prior": ("pose-prior", {}, training)},
+        METRIC_MODELS={"prior": ("pose-prior", {}, training)},
     )
-    with marked(page, "judges"):
-        tuning.main(tmp_path, folder / "people.npz", ("judges",), stored=tmp_path / "scores", page=page)
+    with marked(page, "metric_models"):
+        tuning.main(tmp_path, folder / "people.npz", ("metric_models",), stored=tmp_path / "scores", page=page)
     (rows,) = tables(page)
     assert [row[-1] for row in rows[1:]] == ["–", "–"]
-    found = tuning.Store(tmp_path / "scores", "judges").found
+    found = tuning.Store(tmp_path / "scores", "metric_models").found
     assert all(seeds.keys() == {"0", "1"} for seeds in found.values())
-    prior = load(tmp_path / "judges" / "prior-30-steps-seed1").model
+    prior = load(tmp_path / "metric_models" / "prior-30-steps-seed1").model
     told = found["prior 30 steps"]["1"]
     windows = tuning.seen(motion.MotionData.open(folder / "people.npz", protocol)).all()["x"]
     density = prior.log_prob(prior.facing(windows)[:, protocol.observed :]).mean().item()

@@ -28,7 +28,7 @@ def table(told, future=0, lengths=(12, 9, 15, 10), uneven=False):
 
 def test_the_future_is_behind_the_last_target():
     panel = table(PLAIN)
-    schema = PanelSchema.under(panel, CUT)
+    schema = PanelSchema.from_data(panel, CUT)
     windows = ahead(panel, schema)
     batch = windows.all()
     for n, one in enumerate(panel):
@@ -47,7 +47,7 @@ def test_the_past_is_that_of_test_windows():
     panel = table(PLANNED, future=3, uneven=True)
     for one in panel:
         one.values[3:-3, 1:3] = NAN
-    schema = PanelSchema.under(panel, CUT)
+    schema = PanelSchema.from_data(panel, CUT)
     batch = ahead(panel, schema).all()
     shown = Panel([Series(one.name, np.nan_to_num(one.values), one.times) for one in panel], PLANNED)
     for one, other in zip(shown, panel, strict=True):
@@ -61,7 +61,7 @@ def test_the_past_is_that_of_test_windows():
 
 def test_known_covariates_are_those_of_the_rows_behind():
     panel = table(PLANNED, future=3)
-    schema = PanelSchema.under(panel, CUT)
+    schema = PanelSchema.from_data(panel, CUT)
     batch = ahead(panel, schema).all()
     for n, one in enumerate(panel):
         plan = (one.values[-7:, 2] - schema.means["plan"]) / schema.scales["plan"]
@@ -77,19 +77,19 @@ def test_a_future_that_lacks_them_says_which_and_of_which_sequence(future):
         match=f"forecast of 3 steps needs plan, holiday, known in the future too, and sequence 's0' has {future} rows "
         "after its last target at row 11; append rows with these",
     ):
-        ahead(panel, PanelSchema.under(panel, CUT))
+        ahead(panel, PanelSchema.from_data(panel, CUT))
     panel = table(PLANNED, 3)
     panel.series[2].values[-1, 3] = NAN
     with pytest.warns(UserWarning, match=r"1 of 4 .* needs holiday, known .* 's2' has 3 rows .* append rows with it"):
-        windows = ahead(panel, PanelSchema.under(panel, CUT))
+        windows = ahead(panel, PanelSchema.from_data(panel, CUT))
     assert [name for _, name, _ in windows.keys] == ["s0", "s1", "s3"]
 
 
 def test_what_cannot_be_forecast_is_said_and_the_rest_is_forecast():
     panel = table(PLAIN)
     with pytest.raises(ValueError, match="whole sequences have no horizon"):
-        ahead(panel, PanelSchema.under(panel, Cut()))
-    schema = PanelSchema.under(panel, CUT)
+        ahead(panel, PanelSchema.from_data(panel, Cut()))
+    schema = PanelSchema.from_data(panel, CUT)
     panel.series[1].values[3:, 0] = NAN
     said = "sequence 's1' has 3 steps up to its last target, and 4 are to be observed"
     with pytest.warns(UserWarning, match=f"1 of 4 sequences have no forecast: {said}"):

@@ -10,7 +10,7 @@ import torch
 import dvae
 from dvae.data.schema import SchemaError
 from dvae.data.units import Coordinate, Units
-from dvae.data.views import Offered
+from dvae.data.views import ContextView
 from dvae.factorization.notation import Factorization
 from dvae.models.registry import methods
 from dvae.tables import Column, Columns, Panel, Series
@@ -46,7 +46,7 @@ def test_methods_read_covariates_where_data_have_them_and_only_then(name):
         for factor in part.factors if part else ():
             read = {parent.name for parent in factor.parents} & {"c", "d", "s"}
             assert not read or read == {"c", "d", "s"}
-            if f"{factor.kind}({factor.child})" in method.apart or not (factor.local or factor.parents):
+            if f"{factor.kind}({factor.child})" in method.without_covariates or not (factor.local or factor.parents):
                 assert not read
     transition = next(factor for factor in model.generative.factors if factor.child in (*model.latents, "x"))
     reads = {parent.name for parent in transition.parents} >= {"c", "d", "s"}
@@ -61,7 +61,7 @@ def test_methods_read_covariates_where_data_have_them_and_only_then(name):
 def test_methods_have_guides_with_indicators_where_training_data_have_gaps(name):
     """Or are to have some; a mask that hides nothing then changes nothing, and one that does is seen."""
     x, seen = torch.randn(3, 5, 1), torch.rand(3, 5, 1) < 0.5
-    for schema, options in ((replace(SCHEMA, lacking=("y",)), {}), (SCHEMA, {"hide": 0.3})):
+    for schema, options in ((replace(SCHEMA, with_missing=("y",)), {}), (SCHEMA, {"hide": 0.3})):
         model = dvae.method(name, latent=2, **options).build(schema)
         assert model.indicators == ("x",)
         batch = {"x": x, "c": torch.zeros(3, 5, 1), "s": torch.zeros(3, 1), "d": torch.ones(3, 5, 1)}
@@ -77,12 +77,12 @@ def test_methods_have_guides_with_indicators_where_training_data_have_gaps(name)
 def test_what_is_hidden_in_training_is_told_where_nobody_knows_what_goes_together():
     with pytest.raises(SchemaError, match="dkf needs to know what sequences are, and was given object"):
         dvae.method("dkf", hide=0.2).train(object(), None, 10)
-    with pytest.raises(ValueError, match="hit-dvae has no hide"):
+    with pytest.raises(ValueError, match="leave hide at 0"):
         dvae.method("hit-dvae", hide=0.2)
 
 
 def test_context_that_a_model_does_not_read_may_be_there_and_does_not_come_back():
-    view = Offered(("c", "s"))
+    view = ContextView(("c", "s"))
     batch = {"x": torch.randn(2, 3, 1), "c": torch.randn(2, 3, 4), "s": torch.randn(2, 1)}
     assert view(batch) == batch
     assert view.inverse(batch).keys() == {"x"}
@@ -113,9 +113,9 @@ def test_the_unit_of_a_column_changes_its_density_by_the_unit_alone(family, name
     for unit in (1.0, scale):
         columns = Columns((Column("y", family=family),))
         panel = Panel([Series(f"s{n}", unit * own) for n, own in enumerate(values)], columns)
-        schema = PanelSchema.under(panel, Cut())
+        schema = PanelSchema.from_data(panel, Cut())
         torch.manual_seed(0)
         model = dvae.method(name, **({} if name == "autoregressive" else {"latent": 2})).build(schema).double()
         torch.manual_seed(1)
-        found.append(dvae.importance_bound(model, torch.tensor(unit * values), particles=3).bound)
+        found.append(dvae.iwae_bound(model, torch.tensor(unit * values), particles=3).bound)
     torch.testing.assert_close(found[1], found[0] - 9 * math.log(scale), rtol=1e-5, atol=0)  # units are single

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dvae.tables import Column, Columns, Panel, Series
-from dvae.tables.dataset import suited
+from dvae.tables.dataset import default_cut
 from dvae.tables.protocol import Cut
 
 TOLD = Columns((Column("y"),))
@@ -113,9 +113,9 @@ def test_cuts_that_make_no_sense_are_refused(told, said):
 
 @pytest.mark.parametrize("count", [1, 9, 12])
 def test_what_suits_a_panel_leaves_windows_in_every_part(count):
-    assert suited(panel([50] * 3, splits=PARTS)).split == "sequence"  # which says its part
+    assert default_cut(panel([50] * 3, splits=PARTS)).split == "sequence"  # which says its part
     for length in (*range(9, 60, 5), 95, 500):
         of = panel([length] * count)
-        cut = suited(of)
+        cut = default_cut(of)
         assert cut.split == ("time" if count < 10 else "sequence")
         assert all(cut.starts(of, part) for part in PARTS)

@@ -86,7 +86,7 @@ def test_a_setting_that_comes_again_in_another_key_or_with_a_repeat_is_left_out(
 
 
 def test_a_cache_of_something_else_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("dvae.tables.domains.chorales.folder", lambda *_: tmp_path)
+    monkeypatch.setattr("dvae.tables.domains.chorales.package_folder", lambda *_: tmp_path)
     monkeypatch.setattr("dvae.tables.domains.chorales.version", lambda _: "1")
     for content in ("[1]", '{"a": [[1, 2]]}', '{"a": [[300, 50, 50, 50]]}', "{", '{"a": 1e999}'):
         (tmp_path / "chorales-1.json").write_text(content)

@@ -65,7 +65,7 @@ def test_logarithms_of_a_column_are_read_as_they_vary_and_stand_for_what_is_miss
     values = np.stack([rng.lognormal(1, 2, 9), 3 + 1e-15 * rng.normal(size=9)], 1)
     values[0, 0], values[1, 0] = 0, NAN
     panel = Panel([Series(f"s{n}", values) for n in range(4)], columns)
-    flow, flat = PanelSchema.under(panel, Cut()).units["x"]
+    flow, flat = PanelSchema.from_data(panel, Cut()).units["x"]
     least = values[2:, 0].min()
     logarithms = np.log([least, *values[2:, 0]])
     assert (flow.floor, flow.level, flow.spread) == pytest.approx((least, logarithms.mean(), logarithms.std()))
@@ -78,7 +78,7 @@ def test_a_column_far_from_zero_has_its_own_units():
     noise = np.random.default_rng(0).normal(size=(4, 9, 3))
     values = np.array([1e9, 101325, 0.1]) + np.array([1.0, 0.01, 1e-17]) * noise
     columns = Columns(tuple(map(Column, "abc")))
-    schema = PanelSchema.under(Panel([Series(f"s{n}", one) for n, one in enumerate(values)], columns), Cut())
+    schema = PanelSchema.from_data(Panel([Series(f"s{n}", one) for n, one in enumerate(values)], columns), Cut())
     scales = [schema.scales[name] for name in "abc"]
     assert scales == pytest.approx([*(noise[:, :, :2].std((0, 1)) * [1, 0.01]), 1.0], rel=0.2)
     assert len(np.unique(PanelWindows(Panel([Series("s", values[0])], columns), schema, "all").all()["x"][..., 1])) == 9
@@ -94,7 +94,7 @@ def test_a_column_far_from_zero_has_its_own_units():
 def test_targets_that_float32_does_not_resolve_are_refused(family, values, said):
     panel = Panel([Series(f"s{n}", values[:, None]) for n in range(4)], Columns((Column("x", family=family),)))
     with pytest.raises(ValueError, match=said):
-        PanelSchema.under(panel, Cut())
+        PanelSchema.from_data(panel, Cut())
 
 
 @pytest.mark.parametrize(("family", "center", "count"), [("real", "6000000", 3), ("positive", "0", 4)])
@@ -105,12 +105,12 @@ def test_levels_of_sequences_that_float32_loses_are_named(family, center, count)
     values[4][:, 0] = levels[4]  # a constant loses nothing
     series = [Series(f"s{n}", own, split="train") for n, own in enumerate(values)]
     with pytest.warns(UserWarning, match=rf"column 'x' varies .* from {center}.* in {count} of 5 .* such as 's0'; sub"):
-        PanelSchema.under(Panel(series, columns), Cut())
+        PanelSchema.from_data(Panel(series, columns), Cut())
 
 
 def test_units_are_those_of_the_training_sequences():
     panel = table()
-    schema = PanelSchema.under(panel, CUT)
+    schema = PanelSchema.from_data(panel, CUT)
     parts = [place for place, _, _ in CUT.starts(panel, "train")]
     assert 0 < len(parts) < len(panel)
     for name in ("plan", "temp", "price", "height"):
@@ -129,15 +129,15 @@ def test_units_are_those_of_the_training_sequences():
     assert (means[-1], scales[-1]) == (share, pytest.approx((share * (1 - share)) ** 0.5))
     assert schema.coordinates == ["riders", "kind=u", "kind=v", "kind=w", "temp", "open"]
     assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2}
-    assert schema.lacking == FREE
+    assert schema.with_missing == FREE
 
 
 def test_guides_read_indicators_where_training_data_lack_targets():
-    schema = PanelSchema.under(table(), CUT)
+    schema = PanelSchema.from_data(table(), CUT)
     assert schema.indicators == ("x",)
     assert schema.together == [0, 1, 1, 1, 2, 3]
-    assert PanelSchema.under(table(missing=False), CUT).indicators == ()
-    assert replace(schema, lacking=("plan", "weather", "price")).indicators == ()  # as an older run has it
+    assert PanelSchema.from_data(table(missing=False), CUT).indicators == ()
+    assert replace(schema, with_missing=("plan", "weather", "price")).indicators == ()  # as an older run has it
     correlated = (Column("a", family="correlated"), Column("b", family="correlated"))
     assert PanelSchema(columns=Columns(correlated), means={}, scales={}).together == [0, 0]
 
@@ -165,8 +165,8 @@ def test_nothing_of_what_is_tested_is_in_what_is_trained_on(cut, missing):
     panel = table(t=40, missing=missing, times=np.arange(40.0))
     other = altered(panel, "train", cut)
     assert other.fingerprint() != panel.fingerprint()
-    schema = PanelSchema.under(panel, cut)
-    assert PanelSchema.under(other, cut) == schema
+    schema = PanelSchema.from_data(panel, cut)
+    assert PanelSchema.from_data(other, cut) == schema
     windows, others = (PanelWindows(each, schema, "train") for each in (panel, other))
     assert windows.keys == others.keys
     batch, again = windows.all(), others.all()
@@ -187,7 +187,7 @@ def by_hand(one, schema):
                 found += [float(held == n) for n in range(len(told.classes))]
             else:
                 found.append(np.nan_to_num((held - schema.means[told.name]) / schema.scales[told.name]))
-            if told.name in schema.lacking:
+            if told.name in schema.with_missing:
                 found.append(float(not np.isnan(value)))
         rows.append(found)
     return np.array(rows)
@@ -197,7 +197,7 @@ def test_covariates_have_their_last_value_or_before_any_the_mean_and_classes_are
     panel = table(seed=3)
     for place in (0, 1):  # nothing at first, and nothing at all
         panel.series[place].values[: (4, 12)[place], [1, 3, 5]] = NAN
-    schema = PanelSchema.under(panel, CUT)
+    schema = PanelSchema.from_data(panel, CUT)
     for one in panel:
         np.testing.assert_allclose(schema.context(one), by_hand(one, schema), rtol=1e-12, atol=1e-12)
         kinds, x = one.values[:, 2], schema.targets(one)
@@ -210,7 +210,7 @@ def test_what_is_static_is_of_the_sequence():
     height, town = TOLD.names.index("height"), TOLD.names.index("town")
     panel.series[0].values[:5, height] = NAN
     panel.series[1].values[:, [height, town]] = NAN
-    schema = replace(PanelSchema.under(panel, CUT), lacking=("weather", "price", "plan", "height"))
+    schema = replace(PanelSchema.from_data(panel, CUT), with_missing=("weather", "price", "plan", "height"))
     mean, scale = schema.means["height"], schema.scales["height"]
     np.testing.assert_allclose(
         schema.static(panel.series[0]), [(panel.series[0].values[-1, height] - mean) / scale, 1, 1, 0]
@@ -233,7 +233,7 @@ def test_what_is_static_is_of_the_sequence():
 )
 def test_gaps_are_there_where_steps_are_uneven(times, step):
     panel = table(t=24, times=times)
-    schema = PanelSchema.under(panel, CUT)
+    schema = PanelSchema.from_data(panel, CUT)
     assert schema.step == step
     assert ("d" in schema.sizes) == bool(step)
     if step:
@@ -251,13 +251,13 @@ def test_gaps_are_there_where_steps_are_uneven(times, step):
             {"scales": dict.fromkeys(("plan", "height", "price"), 0.0)},
             r"scales\['plan'\] is 0.0; it must be finite and",
         ),
-        ({"lacking": ()}, "no indicator of price, weather"),
+        ({"with_missing": ()}, "no indicator of price, weather"),
         ({"step": -1.0}, "step is -1.0"),
     ],
 )
 def test_a_schema_that_lacks_what_it_needs_is_refused(change, said):
     with pytest.raises(ValueError, match=said):
-        replace(PanelSchema.under(table(), CUT), **change)
+        replace(PanelSchema.from_data(table(), CUT), **change)
 
 
 def test_columns_of_a_family_have_one_law_and_categories_one_each():
@@ -270,10 +270,10 @@ def test_columns_of_a_family_have_one_law_and_categories_one_each():
             Column("l", family="category", classes=("u", "v")),
         )
     )
-    law = PanelSchema(columns=told).emission
-    assert isinstance(law, Product)
+    distribution = PanelSchema(columns=told).emission
+    assert isinstance(distribution, Product)
     places = {(0, 1, 2): "category", (3, 5): "real", (4,): "count", (6, 7): "category"}
-    assert dict(law.parts) == {place: FAMILIES[name] for place, name in places.items()}
+    assert dict(distribution.parts) == {place: FAMILIES[name] for place, name in places.items()}
     for family, spec in FAMILIES.items():
         classes = ("u", "v") if family == "category" else ()
         assert PanelSchema(columns=Columns((Column("y", family=family, classes=classes),))).emission == spec
@@ -284,6 +284,6 @@ def test_training_parts_without_values_or_windows_are_refused():
     for place, _, _ in CUT.starts(panel, "train"):
         panel.series[place].values[:, TOLD.names.index("temp")] = NAN
     with pytest.raises(ValueError, match="column 'temp' has no value in the training part"):
-        PanelSchema.under(panel, CUT)
+        PanelSchema.from_data(panel, CUT)
     with pytest.raises(ValueError, match=r"no training window of 50 \+ 3 steps: its sequences have 12 to 12 steps"):
-        PanelSchema.under(panel, Cut(50, 3))
+        PanelSchema.from_data(panel, Cut(50, 3))

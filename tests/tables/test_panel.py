@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvae.distributions.family import FAMILIES
-from dvae.tables import Column, Columns, Cut, Panel, PanelData, Series, Told, proposed
+from dvae.tables import Column, ColumnHints, Columns, Cut, Panel, PanelData, Series, infer_columns
 
 pd = pytest.importorskip("pandas")
 xr = pytest.importorskip("xarray")
@@ -75,14 +75,14 @@ DAYS = pd.to_datetime(["2024-01-01", "2024-01-02", "2024-01-05", "2024-01-06"])
 )
 def test_dates_in_an_index_are_times(days, name):
     frame = pd.DataFrame({"x": [1.0, 2.0, 3.0, 4.0], "time": [0.5, 0.5, 0.25, 0.5]}, index=days.rename(name))[::-1]
-    told = Told(columns=("x",))
+    told = ColumnHints(columns=("x",))
     panel = Panel.of(frame[["x"]], told)
     assert panel.columns.time == (name or "time")
     assert panel.calendar.kind == "dates"
     np.testing.assert_array_equal(panel.series[0].values[:, 0], [1, 2, 3, 4])
     np.testing.assert_array_equal(np.diff(panel.series[0].times) / 86400, [1, 3, 1])
     assert Panel.of(frame, told).series[0].times.tolist() == panel.series[0].times.tolist()
-    assert proposed(frame[["x"]]) == told.of(frame[["x"]]) == panel.columns
+    assert infer_columns(frame[["x"]]) == told.of(frame[["x"]]) == panel.columns
     assert Panel.of(frame["x"]).fingerprint() == panel.fingerprint()
 
 
@@ -92,11 +92,11 @@ def test_an_index_of_stations_and_days_is_that_of_their_columns():
     frame = pd.DataFrame({"y": np.random.default_rng(0).normal(size=160)}, index=index)
     panel = Panel.of(frame.sample(frac=1, random_state=0))
     assert [len(one) for one in panel] == [40] * 4
-    told = Told(id=("station",), time="day")
+    told = ColumnHints(id=("station",), time="day")
     for other in (Panel.of(frame.reset_index(), told), Panel.of(frame, told), Panel.of(frame.reset_index("day"))):
         assert other.fingerprint() == panel.fingerprint()
     data = PanelData.of(frame, told, Cut(6, 2, split="time"))
-    assert data.on(frame.reset_index()).fingerprint == data.fingerprint == panel.fingerprint()
+    assert data.with_data(frame.reset_index()).fingerprint == data.fingerprint == panel.fingerprint()
     joined = pd.concat({key: part.droplevel("station") for key, part in frame.groupby("station")})
     joined.index.names = [None, None]
     same(values(Panel.of(joined)), values(panel))

@@ -75,7 +75,7 @@ def test_every_method_that_is_not_of_motion_is_tested():
 def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_missing(data, name):
     windows = data.windows("train")
     assert windows.schema.sizes == {"x": 7, "c": 1 + 1 + 2 + 1, "s": 1, "d": 1}
-    method = dvae.method(name, **options(name)).suited(windows)
+    method = dvae.method(name, **options(name)).resolve_defaults(windows)
     model = method.build(data.schema)
     recipe = method.train(windows, data.windows("validation"), 2)
     dvae.fit(model, recipe, steps=2, batch_size=4, validate_every=2, progress=False)
@@ -94,7 +94,7 @@ def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_mis
     for other in (0.0, 1.0):  # in the support of all families but one, whose entries do not count either
         x = torch.where(double["mask"], double["x"], other)
         torch.manual_seed(0)
-        bounds.append(dvae.importance_bound(model, {**double, "x": x}, particles=3).bound)
+        bounds.append(dvae.iwae_bound(model, {**double, "x": x}, particles=3).bound)
     assert (~double["mask"]).any()
     torch.testing.assert_close(*bounds, rtol=0, atol=0)
 
@@ -110,7 +110,7 @@ def test_the_mean_of_a_column_changes_neither_fit_nor_forecasts_nor_scores(name,
         data = PanelData.of(table, TOLD, Cut(5, 3))
         windows, test = data.windows("train"), data.windows("test")
         torch.manual_seed(0)
-        method = dvae.method(name, **options(name)).suited(windows)
+        method = dvae.method(name, **options(name)).resolve_defaults(windows)
         model = method.build(data.schema)
         dvae.fit(model, method.train(windows, None, 2), steps=2, batch_size=4, progress=False)
         forecasts = test.forecast(model, samples=4)
@@ -137,7 +137,7 @@ def test_equations_read_covariates_and_gaps_where_they_name_them(data):
 
     def bound(model, batch):
         torch.manual_seed(0)
-        return dvae.importance_bound(model, batch, particles=2).bound
+        return dvae.iwae_bound(model, batch, particles=2).bound
 
     assert not plain.context
     for name in ("c", "d", "s"):
@@ -282,11 +282,11 @@ def test_forecasts_are_what_the_model_draws(data, model):
 def test_every_missing_entry_of_a_table_is_filled(data, model, tmp_path):
     whole = data.whole()
     found, batch = whole.impute(model, 39), whole.all()
-    np.testing.assert_array_equal(found.lacking, ~batch["mask"])
+    np.testing.assert_array_equal(found.missing, ~batch["mask"])
     for draw in found.draws:
-        np.testing.assert_array_equal(draw[~found.lacking], batch["x"][batch["mask"]])
+        np.testing.assert_array_equal(draw[~found.missing], batch["x"][batch["mask"]])
     table = found.table()
-    assert len(table) == found.lacking.sum() == sum(np.isnan(data.schema.targets(one)).sum() for one in data.panel)
+    assert len(table) == found.missing.sum() == sum(np.isnan(data.schema.targets(one)).sum() for one in data.panel)
     series = {one.name: one for one in data.panel}
     for _, row in table.iterrows():
         one, place = series[row["sequence"]], data.schema.coordinates.index(row["column"])
@@ -300,9 +300,9 @@ def test_every_missing_entry_of_a_table_is_filled(data, model, tmp_path):
 
 def test_padding_and_what_is_complete_are_not_filled(model, data):
     ragged = frame().drop(index=[10, 11, 12, 13]).reset_index(drop=True)
-    found = data.on(ragged).whole().impute(model, 2)
-    assert not found.lacking[0, 10:].any()
-    assert found.lacking[0, :10].any()
+    found = data.with_data(ragged).whole().impute(model, 2)
+    assert not found.missing[0, 10:].any()
+    assert found.missing[0, :10].any()
     full = PanelData.of(np.random.default_rng(0).normal(size=(6, 12, 1)), ["y"], Cut(5, 3))
     with pytest.raises(ValueError, match="nothing is missing in panel"):
         full.whole().impute(model)

@@ -56,9 +56,9 @@ def test_errors_are_over_groups_whose_sequences_share_what_is_drawn(data):
     assert "windows of 3 groups" in str(found)
     assert "clustered by group" in str(found)
     groups = np.unique([group for _, group, _ in test.clusters], return_inverse=True)[1]
-    bounds = found.rows["ours"].bounds["importance bound"][0]
+    bounds = found.rows["ours"].bounds["IWAE bound"][0]
     means = np.bincount(groups, bounds) / np.bincount(groups) / test.length
-    assert found["ours"]["importance bound"].sequences == pytest.approx(means.std(ddof=1) / 3**0.5, rel=1e-6)
+    assert found["ours"]["IWAE bound"].sequences == pytest.approx(means.std(ddof=1) / 3**0.5, rel=1e-6)
     whole = panel(Cut(None, split="group", validation=0.2, test=0.3)).windows("test")
     bounds = str(dvae.compare({"ours": model}, whole, particles=5, contrasts=0, samples=0, progress=False))
     assert "9 whole sequences of 3 groups" in bounds
@@ -75,6 +75,6 @@ def test_what_a_group_shares_is_learned_and_told_by_its_sequences(data):
     recipe = method.train(data.windows("train"), data.windows("validation"), 150)
     dvae.fit(model, recipe, batch_size=32, learning_rate=1e-2, progress=False)
     batch = data.windows("test").all()
-    together = dvae.importance_bound(model, batch, particles=200).bound.mean()
-    apart = dvae.importance_bound(model, {"x": batch["x"]}, particles=200).bound.mean()
+    together = dvae.iwae_bound(model, batch, particles=200).bound.mean()
+    apart = dvae.iwae_bound(model, {"x": batch["x"]}, particles=200).bound.mean()
     assert together > apart + 0.1  # one latent to pay for, in place of several

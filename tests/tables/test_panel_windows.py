@@ -8,7 +8,7 @@ import torch
 
 import dvae
 from dvae.data.sequences import HeldOutWindows, Source
-from dvae.inference.evaluation.held import hold
+from dvae.inference.evaluation.evaluation_windows import prepare_windows
 from dvae.tables import Column, Columns, Panel, PanelData, Series
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
@@ -80,7 +80,7 @@ CUTS = {"sequences": Cut(5, 3), "time": Cut(5, 3, split="time"), "stride": Cut(4
 )
 def test_listed_windows_hold_the_table_at_their_keys(which, split):
     panel, cut = table(), CUTS[which]
-    schema = PanelSchema.under(panel, cut)
+    schema = PanelSchema.from_data(panel, cut)
     windows = PanelWindows(panel, schema, split)
     batch, keys = windows.all(), windows.keys
     assert len(windows) == len(keys) == len(set(keys)) == len(batch["x"])
@@ -94,7 +94,7 @@ def test_listed_windows_hold_the_table_at_their_keys(which, split):
 @pytest.mark.parametrize("which", ["sequences", "time"])
 def test_drawn_windows_are_all_of_them_and_each_alike(which):
     panel, cut = table(), CUTS[which]
-    schema = PanelSchema.under(panel, cut)
+    schema = PanelSchema.from_data(panel, cut)
     windows = PanelWindows(panel, schema, "train")
     every = {}
     for place, low, last in cut.starts(panel, "train"):
@@ -116,7 +116,7 @@ def test_drawn_windows_are_all_of_them_and_each_alike(which):
 
 def test_whole_sequences_are_padded():
     panel = table()
-    schema = PanelSchema.under(panel, Cut())
+    schema = PanelSchema.from_data(panel, Cut())
     windows = PanelWindows(panel, schema, "all")
     batch = windows.all()
     assert batch["lengths"].tolist() == [len(one) for one in panel]
@@ -128,7 +128,7 @@ def test_whole_sequences_are_padded():
     some = PanelWindows(panel, schema, "train").sample(4, torch.Generator().manual_seed(0))
     assert some["x"].shape[:2] == (4, some["lengths"].max())
     even = table((9, 9, 9, 9))
-    assert "lengths" not in PanelWindows(even, PanelSchema.under(even, Cut()), "all").all()
+    assert "lengths" not in PanelWindows(even, PanelSchema.from_data(even, Cut()), "all").all()
 
 
 def test_what_ends_with_the_present_changes_nothing_after_it_and_what_is_known_does():
@@ -138,7 +138,7 @@ def test_what_ends_with_the_present_changes_nothing_after_it_and_what_is_known_d
             one.values[rows, place] = 1 - one.values[rows, place]
         return PanelWindows(panel, schema, "all").all()
 
-    schema = PanelSchema.under(table((8, 8, 8, 8), missing=False), Cut(5, 3))
+    schema = PanelSchema.from_data(table((8, 8, 8, 8), missing=False), Cut(5, 3))
     before = batch()
     for place, column in enumerate(TOLD.columns):
         if column.role in ("known", "past"):
@@ -150,7 +150,7 @@ def test_what_ends_with_the_present_changes_nothing_after_it_and_what_is_known_d
 
 def test_there_is_a_mask_where_something_of_these_windows_is_missing():
     panel = table((20,) * 5, missing=False)
-    schema = PanelSchema.under(panel, Cut(5, 3, split="time"))
+    schema = PanelSchema.from_data(panel, Cut(5, 3, split="time"))
     assert "mask" not in PanelWindows(panel, schema, "train").all()
     panel.series[0].values[18, 1] = NAN
     assert "mask" not in PanelWindows(panel, schema, "train").all()
@@ -162,7 +162,7 @@ def test_there_is_a_mask_where_something_of_these_windows_is_missing():
 def test_a_gap_of_which_training_knows_nothing_is_warned_of():
     """No indicator tells models of it; a static value that is missing here and there is known."""
     panel, places = table(missing=False), {name: place for place, name in enumerate(TOLD.names)}
-    schema = PanelSchema.under(panel, Cut(5, 3))
+    schema = PanelSchema.from_data(panel, Cut(5, 3))
     held = {name for _, name, _ in PanelWindows(panel, schema, "test").keys}
     for one in panel:
         if one.name in held:
@@ -175,7 +175,7 @@ def test_a_gap_of_which_training_knows_nothing_is_warned_of():
 def test_columns_that_are_one_event_are_observed_whole_or_not():
     told = Columns((Column("a", family="correlated"), Column("b", family="correlated"), *TOLD.columns[2:]))
     panel = table(told=told)
-    windows = PanelWindows(panel, PanelSchema.under(panel, Cut(5, 3)), "train")
+    windows = PanelWindows(panel, PanelSchema.from_data(panel, Cut(5, 3)), "train")
     mask = windows.all()["mask"]
     assert torch.equal(mask[..., 0], mask[..., 1])
     assert not mask.all()
@@ -183,7 +183,7 @@ def test_columns_that_are_one_event_are_observed_whole_or_not():
 
 def test_held_out_windows_are_a_stride_apart():
     panel = table((30,) * 10)
-    schema = PanelSchema.under(panel, Cut(5, 4))
+    schema = PanelSchema.from_data(panel, Cut(5, 4))
     starts = [[start for _, _, start in PanelWindows(panel, schema, split).keys] for split in ("test", "train")]
     assert starts[0][:6] == [0, 4, 8, 12, 16, 20]
     assert starts[1][:4] == [0, 2, 4, 6]
@@ -191,9 +191,9 @@ def test_held_out_windows_are_a_stride_apart():
 
 def test_windows_are_told_apart_by_their_fingerprint():
     panel, other = table(), table(seed=1)
-    schema = PanelSchema.under(panel, Cut(5, 3))
+    schema = PanelSchema.from_data(panel, Cut(5, 3))
     made = [(panel, schema, "train"), (panel, schema, "test"), (other, schema, "train")]
-    made.append((panel, PanelSchema.under(panel, Cut(5, 2)), "train"))
+    made.append((panel, PanelSchema.from_data(panel, Cut(5, 2)), "train"))
     assert len({PanelWindows(*each).fingerprint for each in made}) == 4
     assert PanelWindows(*made[0]).fingerprint == PanelWindows(table(), schema, "train").fingerprint
 
@@ -207,8 +207,8 @@ def test_rows_behind_the_last_target_are_of_no_part(split):
         future[:, 2], future[:, 5] = 4.0, one.values[0, 5]  # its plan is known, and what is static
         times = np.concatenate([one.times, one.times[-1] + np.arange(1.0, 8)])
         series.append(replace(one, values=np.concatenate([one.values, future]), times=times))
-    grown, schema = Panel(series, TOLD), PanelSchema.under(panel, cut)
-    assert PanelSchema.under(grown, cut) == schema
+    grown, schema = Panel(series, TOLD), PanelSchema.from_data(panel, cut)
+    assert PanelSchema.from_data(grown, cut) == schema
     for part in ("train", "validation", "test", "all"):
         windows, others = (PanelWindows(each, schema, part) for each in (panel, grown))
         assert windows.keys == others.keys
@@ -217,7 +217,7 @@ def test_rows_behind_the_last_target_are_of_no_part(split):
 
 def test_windows_of_whose_future_nothing_is_known_are_not_listed():
     panel = table((40,) * 6)
-    schema = PanelSchema.under(panel, Cut(5, 4))
+    schema = PanelSchema.from_data(panel, Cut(5, 4))
     before = PanelWindows(panel, schema, "test").keys
     (one,) = panel.only([before[2][1]])
     start = before[2][2]
@@ -228,8 +228,8 @@ def test_windows_of_whose_future_nothing_is_known_are_not_listed():
     one.values[start + 4 : start + 9, :2] = NAN  # the past of the next one, which begins at + 4
     windows = PanelWindows(panel, schema, "test")
     assert windows.keys == before[:2] + before[4:]
-    assert windows.untold == 2
-    hold(windows)  # which refuses such windows
+    assert windows.n_unobserved == 2
+    prepare_windows(windows)  # which refuses such windows
     for one in panel:
         one.values[5:-1, :2] = NAN
     with pytest.raises(ValueError, match=r"no test window of 5 \+ 4 steps"):
@@ -237,7 +237,7 @@ def test_windows_of_whose_future_nothing_is_known_are_not_listed():
 
 
 def test_sequences_that_are_too_short_are_listed():
-    data = PanelData("a", table(), PanelSchema.under(table(), Cut(4, 3, split="time")))
+    data = PanelData("a", table(), PanelSchema.from_data(table(), Cut(4, 3, split="time")))
     steps = {one.name: round(0.7 * data.panel.present(one)) for one in data.panel}
     short = [name for name, count in steps.items() if count < 7]
     assert [*data.windows("train").skipped] == short
@@ -278,7 +278,7 @@ def test_whole_sequences_end_with_their_last_target():
         (lambda data: data.ahead().forecast("run"), "the model is 'run'; expected a fitted model"),
         (lambda data: data.recut(validation=0).windows("validation"), "no validation .* its 1 .* has a share of 0"),
         (
-            lambda data: data.on(Panel([Series("s", np.ones((9, 1)))], Columns((Column("b"),)))),
+            lambda data: data.with_data(Panel([Series("s", np.ones((9, 1)))], Columns((Column("b"),)))),
             "of b, whose columns are",
         ),
     ],

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from dvae.tables import Column, Columns, Panel, PanelData
-from dvae.tables.proposing import Told, proposed
+from dvae.tables.column_inference import ColumnHints, infer_columns
 from dvae.tables.reading import read_frame, read_panel
 
 pd = pytest.importorskip("pandas")
 
 
 def families(frame):
-    return {column.name: (column.role, column.family) for column in proposed(frame).columns}
+    return {column.name: (column.role, column.family) for column in infer_columns(frame).columns}
 
 
 def test_families_are_those_that_the_values_have():
@@ -67,7 +67,7 @@ def panel(**more):
 
 @pytest.mark.parametrize("ids", [[7, 8, 9], ["a", "b", "c"], [7.0, 8.0, 9.0]])
 def test_ids_are_what_leaves_one_row_at_a_time(ids):
-    found = proposed(panel(station=np.repeat(ids, 7), height=np.repeat([1.5, 2.5, 3.5], 7)))
+    found = infer_columns(panel(station=np.repeat(ids, 7), height=np.repeat([1.5, 2.5, 3.5], 7)))
     assert (found.id, found.time) == (("station",), "day")
     assert [column.role for column in found.columns] == ["target", "static"]
 
@@ -76,19 +76,19 @@ def test_what_repeats_but_is_not_needed_to_tell_rows_apart_is_no_id():
     weather = np.random.default_rng(1).choice(["rain", "sun", "fog"], 21)
     frame = panel(weather=weather, place=np.repeat(["a", "b", "c"], 7))
     assert frame.duplicated(["day", "weather"]).any()
-    found = proposed(frame)
+    found = infer_columns(frame)
     assert found.id == ("place",)
     assert [column.name for column in found.columns] == ["riders", "weather"]
 
 
 def test_two_columns_are_the_id_where_one_is_not_enough():
     frame = panel(region=np.repeat(["n", "n", "s"], 7), line=np.repeat(["a", "b", "a"], 7))
-    assert set(proposed(frame).id) == {"region", "line"}
+    assert set(infer_columns(frame).id) == {"region", "line"}
 
 
 def test_a_table_of_one_sequence_has_its_id_too():
     frame = panel(station_id=5).iloc[:7]
-    found = proposed(frame)
+    found = infer_columns(frame)
     assert found.id == ("station_id",)
     assert [column.name for column in found.columns] == ["riders"]
     assert Panel.of(frame).series[0].name == "5"
@@ -117,24 +117,24 @@ def test_one_day_above_12_tells_days_from_months(format):
 def test_dates_whose_day_and_month_cannot_be_told_apart_are_said_to_be(format, freq):
     frame = shops(pd.date_range("2024-01-01", periods=12, freq=freq), format)
     with pytest.warns(UserWarning, match=r"'date' \(perhaps the time: dates such as '01.01.(20)?24', .* as 2024-12-31"):
-        found = proposed(frame)
+        found = infer_columns(frame)
     assert (found.id, found.time) == (("shop",), None)  # and they tell rows apart
     assert "date" not in found.names
     with pytest.warns(UserWarning, match="perhaps the time"):
-        Told(columns=("sold",)).of(frame)
+        ColumnHints(columns=("sold",)).of(frame)
     with pytest.raises(ValueError, match=r"column 'date' holds dates such as '01.01.(20)?24'"):
-        Panel.of(frame, Told(time="date"))
+        Panel.of(frame, ColumnHints(time="date"))
     with pytest.raises(ValueError, match=r"dates such as '01.01.(20)?24'"):
         Panel.wide(frame.pivot(index="date", columns="shop", values="sold"))
-    Told(columns=("sold",), past=("date:category",), id=("shop",)).of(frame)  # what is named is not left out
+    ColumnHints(columns=("sold",), past=("date:category",), id=("shop",)).of(frame)  # what is named is not left out
 
 
 def test_a_constant_column_is_a_target_only_where_it_is_named():
     frame = pd.DataFrame({"y": [1.5, 2.5, -1.0], "rate": [3.5, 3.5, 3.5]})
     with pytest.warns(UserWarning, match=r"left out of what is proposed: 'rate' \(constant: '3.5'\)"):
-        assert proposed(frame).names == ["y"]
+        assert infer_columns(frame).names == ["y"]
     with pytest.warns(UserWarning, match="column 'rate' is constant, '3.5', and a target as it is named"):
-        assert Told(columns=("y", "rate")).of(frame).names == ["y", "rate"]
+        assert ColumnHints(columns=("y", "rate")).of(frame).names == ["y", "rate"]
 
 
 @pytest.mark.parametrize("freq", ["W", "2W", "Q", "D"])
@@ -147,47 +147,47 @@ def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
     frame = panel(station=np.repeat(["a", "b", "c"], 7))
     written = frame.reset_index(names="Unnamed: 0")
     with pytest.warns(UserWarning, match=r"'Unnamed: 0' \(the numbers of the rows, without a name\)"):
-        assert proposed(written) == proposed(frame)
+        assert infer_columns(written) == infer_columns(frame)
     measured = written.assign(**{"Unnamed: 0": frame.riders})
-    assert "Unnamed: 0" in proposed(measured).names
-    assert Told(columns=("riders",), past=("Unnamed: 0",)).of(written).names == ["riders", "Unnamed: 0"]
+    assert "Unnamed: 0" in infer_columns(measured).names
+    assert ColumnHints(columns=("riders",), past=("Unnamed: 0",)).of(written).names == ["riders", "Unnamed: 0"]
 
 
 def test_numbers_that_are_written_as_texts_are_named():
     prices = [f"{n},234.50 €" for n in range(10, 31)]
     with pytest.warns(UserWarning, match="left out of what is proposed: 'price' .*, such as '10,234.50 €'; remove '€'"):
-        assert "price" not in proposed(panel(price=prices)).names
+        assert "price" not in infer_columns(panel(price=prices)).names
 
 
 def test_texts_of_which_one_is_a_date_are_no_dates():
     frame = panel(said=["1/2/2024", *(f"{n}th of them" for n in range(20))])
     with pytest.warns(UserWarning, match=r"'said' \(neither numbers nor 2 to 20 classes, such as '1/2/2024'\)"):
-        proposed(frame.drop(columns="day"))
+        infer_columns(frame.drop(columns="day"))
 
 
 def test_dates_with_offsets_that_change_are_a_time():
     frame = pd.DataFrame({"when": ["2020-03-28T00:00+01:00", "2020-03-30T00:00+02:00"], "y": [1.5, 2.5]})
-    assert proposed(frame).time == "when"
+    assert infer_columns(frame).time == "when"
 
 
 def test_numbers_with_the_name_of_a_time_are_one():
     frame = pd.DataFrame({"y": [0.5, 1.5, 2.5], "year": [2001, 2002, 2003]})
-    assert proposed(frame).time == "year"
-    assert proposed(frame.rename(columns={"year": "yearly"})).time is None
+    assert infer_columns(frame).time == "year"
+    assert infer_columns(frame.rename(columns={"year": "yearly"})).time is None
 
 
 def test_what_is_told_goes_before_what_is_proposed():
     frame = panel(
         station=np.repeat([7, 8, 9], 7), plan=np.arange(21.0), temp=np.arange(21) % 5, mood=["u", "v", "w"] * 7
     )
-    found = Told(covariates=("plan",), past=("temp", "mood:category")).of(frame)
+    found = ColumnHints(covariates=("plan",), past=("temp", "mood:category")).of(frame)
     assert [(c.name, c.role, c.family) for c in found.columns] == [
         ("riders", "target", "count"),
         ("plan", "known", "real"),
         ("temp", "past", "real"),
         ("mood", "past", "category"),
     ]
-    named = Told(columns=("riders:overdispersed:people",), static=("station",)).of(
+    named = ColumnHints(columns=("riders:overdispersed:people",), static=("station",)).of(
         frame.assign(a=np.repeat([1, 2, 3], 7))
     )
     assert next((c.name, c.family, c.unit) for c in named.columns) == ("riders", "overdispersed", "people")
@@ -196,8 +196,8 @@ def test_what_is_told_goes_before_what_is_proposed():
 
 def test_a_name_may_have_colons():
     frame = pd.DataFrame({"a:b": [0.5, 1.5], "c": [0.5, 1.0]})
-    assert Told(columns=("a:b", "c:positive:m:s")).of(frame).columns[1].unit == "m:s"
-    (only,) = Told(columns=("a:laplace:b",)).of(frame.set_axis(["a", "c"], axis=1)).columns
+    assert ColumnHints(columns=("a:b", "c:positive:m:s")).of(frame).columns[1].unit == "m:s"
+    (only,) = ColumnHints(columns=("a:laplace:b",)).of(frame.set_axis(["a", "c"], axis=1)).columns
     assert (only.name, only.family, only.unit) == ("a", "laplace", "b")
 
 
@@ -216,7 +216,7 @@ def test_a_name_may_have_colons():
 )
 def test_what_is_told_wrongly_is_refused(told, said):
     with pytest.raises(ValueError, match=said):
-        Told(**told).of(panel().iloc[:7])
+        ColumnHints(**told).of(panel().iloc[:7])
 
 
 def hourly(days=14):
@@ -253,8 +253,8 @@ def test_columns_that_are_one_time_are_joined(how, shops):
         parts = pd.concat([parts.assign(shop="b"), parts.assign(shop="a")]).sort_index(kind="stable").drop(columns="No")
     else:
         with pytest.warns(UserWarning, match=r"'No' \(the numbers of the rows\)"):
-            proposed(parts)
-    found = proposed(parts.drop(columns="No", errors="ignore"))
+            infer_columns(parts)
+    found = infer_columns(parts.drop(columns="No", errors="ignore"))
     assert len(found.times) > 1
     assert found.id == (("shop",) if shops > 1 else ())
     assert found.names == ["sky", "load"]
@@ -268,18 +268,18 @@ def test_columns_that_are_one_time_are_joined(how, shops):
 
 def test_a_clock_is_not_joined_where_the_date_suffices():
     frame = panel(station=np.repeat(["a", "b", "c"], 7), opened=["09:30"] * 20 + ["10:00"])
-    found = proposed(frame)
+    found = infer_columns(frame)
     assert (found.id, found.time) == (("station",), "day")
     days = pd.DataFrame({"day": np.repeat([1, 2], 24), "hour": np.tile(np.arange(24), 2), "y": np.arange(48) / 8})
-    assert proposed(days).time == ("day", "hour")
+    assert infer_columns(days).time == ("day", "hour")
     np.testing.assert_array_equal(Panel.of(days).series[0].times, np.arange(24, 72))
     weeks = pd.DataFrame({"year": np.repeat([2020, 2021], 52), "week": [*range(1, 53)] * 2, "y": np.arange(104) / 8})
     moments = Panel.of(weeks).series[0].times
-    assert proposed(weeks).time == ("year", "week")
+    assert infer_columns(weeks).time == ("year", "week")
     assert (moments[0], moments[52]) == (pd.Timestamp("2019-12-30").timestamp(), pd.Timestamp("2021-01-04").timestamp())
     quarters = pd.DataFrame({"year": np.repeat([2020, 2021], 4), "quarter": [f"Q{n}" for n in (1, 2, 3, 4)] * 2})
     quarters["y"] = np.arange(8) / 8
-    assert proposed(quarters).time == ("year", "quarter")
+    assert infer_columns(quarters).time == ("year", "quarter")
     assert Panel.of(quarters).series[0].times[4] == pd.Timestamp("2021").timestamp()
 
 
@@ -293,7 +293,7 @@ def test_parts_that_are_no_time_are_named():
         (("year", "y"), "row 0 of column 'y' is 0.5; expected months from 1 to 12"),
     ]:
         with pytest.raises(ValueError, match=said):
-            Panel.of(frame, Told(columns=("y",) if "y" not in parts else ("hour",), time=parts))
+            Panel.of(frame, ColumnHints(columns=("y",) if "y" not in parts else ("hour",), time=parts))
 
 
 def test_what_merely_makes_rows_unique_is_no_id():
@@ -303,7 +303,7 @@ def test_what_merely_makes_rows_unique_is_no_id():
         sky=frame.sky.where(frame.index != 5, "rain").where(frame.index != 20, "sun"), y=np.arange(42.0)
     )
     assert not frame.duplicated(["day", "sky"]).any()
-    assert proposed(frame).id == ()
+    assert infer_columns(frame).id == ()
     with pytest.raises(ValueError, match="two rows at day 2024-01-06 00:00:00, 5 and 40; name the id columns"):
         Panel.of(frame)
 
@@ -324,7 +324,7 @@ def test_levels_of_an_index_are_ids_and_time(names):
 def test_ids_and_classes_are_text(tmp_path, ids):
     rows = [f"{one},{t},{t}.5,{ids[t % 2]}" for one in ids for t in range(4)]
     (tmp_path / "a.csv").write_text("\n".join(["station,t,y,sky", *rows]) + "\n")
-    read = read_panel(tmp_path / "a.csv", Told(columns=("y", "sky:category")))
+    read = read_panel(tmp_path / "a.csv", ColumnHints(columns=("y", "sky:category")))
     assert {one.name for one in read} == {*ids}
     assert read.columns.columns[1].classes == tuple(sorted(ids))
     for one in read:
@@ -376,10 +376,10 @@ def test_cells_that_are_no_numbers_are_named_with_what_settles_them():
     for columns in (None, Columns((Column("power"),), time="day"), ["power"]):
         with pytest.raises(ValueError, match=r"'power': 58 of 60 values are numbers; row 20 is 'off', .* na_values"):
             Panel.of(texted("off", "on"), columns)
-    settled = Panel.of(texted("off", "on"), Told(na_values=("off", "on", "3.25")))
+    settled = Panel.of(texted("off", "on"), ColumnHints(na_values=("off", "on", "3.25")))
     assert np.flatnonzero(np.isnan(settled.series[0].values[:, 0])).tolist() == [3, 20, 21]
     assert Columns.from_toml(settled.columns.to_toml()) == settled.columns
-    assert Panel.of(texted("off"), Told(columns=("power:category",))).columns.columns[0].family == "category"
+    assert Panel.of(texted("off"), ColumnHints(columns=("power:category",))).columns.columns[0].family == "category"
 
 
 def test_declared_marks_and_signs_are_read(tmp_path):
@@ -387,7 +387,7 @@ def test_declared_marks_and_signs_are_read(tmp_path):
     (tmp_path / "a.csv").write_text("t,y,sky\n" + "".join(rows))
     (tmp_path / "a.toml").write_text('time = "t"\nna_values = ["-999", "?"]\ndecimal = ","\n')
     with pytest.raises(ValueError, match="'y' holds '1,234', which may be 1234 or a fraction; give the decimal sign"):
-        read_panel(tmp_path / "a.csv", Told(na_values=("-999",)))
+        read_panel(tmp_path / "a.csv", ColumnHints(na_values=("-999",)))
     data = PanelData.open(tmp_path / "a.csv")  # a schema without columns: they are proposed
     assert data.panel.columns.columns[1].classes == ("rain", "sun")
     np.testing.assert_array_equal(data.panel.series[0].values[:3], [[1.234, np.nan], [np.nan, 1], [5.678, 0]])
@@ -409,13 +409,13 @@ def test_thousands_are_not_divided(tmp_path, sign, separator):
         return read_panel(tmp_path / "a.csv", told)
 
     said = f"'{{}}' holds '1{sign}000', which may be 1000 or a fraction; give the decimal sign"
-    for told in (None, Told(columns=("sales:real",))):
+    for told in (None, ColumnHints(columns=("sales:real",))):
         with pytest.raises(ValueError, match=said.format("sales")):
             read(told, sales=grouped)
     with pytest.raises(ValueError, match=said.format("step")):
         read(Columns((Column("y"),), time="step"), step=[f"1{sign}{n:03}" for n in range(60)], y=["1"] * 60)
     prices = [f"1{sign}000{other}5", *(f"{n}{other}25" for n in range(59))]
-    for told in (Told(decimal=other), None) if sign == "," else (Told(decimal=other),):
+    for told in (ColumnHints(decimal=other), None) if sign == "," else (ColumnHints(decimal=other),):
         panel = read(told, sales=grouped, price=prices)
         np.testing.assert_array_equal(panel.series[0].values[:, 0], np.arange(700, 2500, 30))
 
@@ -445,15 +445,15 @@ def test_classes_that_may_be_numbers_are_named(cells):
     with pytest.warns(
         UserWarning, match="'y' is proposed as a category, and some of its classes may be numbers"
     ) as said:
-        assert proposed(frame).columns[0].family == "category"
+        assert infer_columns(frame).columns[0].family == "category"
     unit = next((unit for unit in ("kg", "%", "$") if unit in cells[0]), None)
     assert (f"remove '{unit}'" in str(said[0].message)) == (unit is not None)
-    Panel.of(frame, Told(columns=("y:category",)))  # what is declared is not named
+    Panel.of(frame, ColumnHints(columns=("y:category",)))  # what is declared is not named
 
 
 def test_classes_that_only_contain_digits_are_no_numbers():
     for cells in (["07", "12"], ["09:30", "10:00"], ["20-30", "30-40"], ["sun", "4 by 4", "rain"]):
-        proposed(pd.DataFrame({"t": range(12), "y": (cells * 12)[:12]}))
+        infer_columns(pd.DataFrame({"t": range(12), "y": (cells * 12)[:12]}))
 
 
 @pytest.mark.parametrize(
@@ -470,9 +470,9 @@ def test_classes_that_only_contain_digits_are_no_numbers():
 def test_every_column_has_the_reason_why_it_is_no_target(cells, said):
     frame = pd.DataFrame({"t": cells, "y": np.arange(90) / 8})
     with pytest.warns(UserWarning, match=rf"left out .*'t' \(.*{said}"):
-        proposed(frame)
+        infer_columns(frame)
     with pytest.raises(ValueError, match=rf"no column can be a target: 't' \(.*{said}.*, 'u' \(constant"):
-        proposed(pd.DataFrame({"t": cells, "u": "same"}))
+        infer_columns(pd.DataFrame({"t": cells, "u": "same"}))
 
 
 def test_separators_that_are_not_found_are_named(tmp_path):
@@ -486,11 +486,11 @@ def test_separators_that_are_not_found_are_named(tmp_path):
 def test_steps_in_columns_are_named():
     wide = pd.DataFrame({f"d_{n}": np.arange(5) + n / 8 for n in range(60)})
     with pytest.warns(UserWarning, match=r"60 columns, 'd_0' to 'd_59', are numbered; .* frame.melt\(\[\], var_name"):
-        proposed(wide)
+        infer_columns(wide)
     labelled = wide[[f"d_{n}" for n in range(5)]].assign(country=list("abcde"))
     with pytest.warns(UserWarning, match=r"5 columns, .* frame.melt\(\['country'\]"):
-        proposed(labelled)
-    proposed(wide.assign(t=range(5)))
+        infer_columns(labelled)
+    infer_columns(wide.assign(t=range(5)))
 
 
 LAYOUTS = {

@@ -15,7 +15,7 @@ from dvae import motion
 from dvae.data.batch import Batch
 from dvae.distributions.chain import gaussian_chain
 from dvae.distributions.kalman import LinearGaussianChain
-from dvae.inference.evaluation.held import on_device_of
+from dvae.inference.evaluation.evaluation_windows import on_device_of
 from dvae.models.motion.motion_latent import MotionLatent
 from dvae.models.motion.trajectories import TrajectoryMethod
 from dvae.models.registry import METHODS
@@ -43,7 +43,7 @@ SMALL = {
     **{n: {**DENSE, "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)} for n in ("dlow", "dsf")},
 }
 STEP = {
-    "program/batch.py": 1,  # one verdict on the whole batch: finite, in the laws' supports, of lengths that there are
+    "program/batch.py": 1,  # one verdict on the whole batch: values finite and in the support, lengths valid
     "training/svi.py": 1,  # loss and norm of the gradient, by which a step is taken, clipped or refused
 }
 """For what any step waits, and how often."""
@@ -70,7 +70,7 @@ def people():
 
 @pytest.fixture(scope="module")
 def segments():
-    return Segments(motion.gait_cycles(bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())))
+    return Segments(motion.gait_cycles(bodies.fit_to_body(motion.simulate(clips=4, frames=90, seed=1), bodies.human())))
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def trained(request, people):
         cut |= {"representation": "quaternion"} if name == "mix-and-match" else {}
         data = motion.MotionData("simulated", people, replace(protocol, **cut))
         train = data.windows("train")
-        method = dvae.method(name, **SMALL.get(name, {"latent": 4, "warm_up": 1})).suited(train)
+        method = dvae.method(name, **SMALL.get(name, {"latent": 4, "warm_up": 1})).resolve_defaults(train)
         model, recipe = method.build(data.schema), method.train(train, None, 4)
         recipe.prepare(model)
         return model, recipe, train, data.windows("test")
@@ -98,7 +98,7 @@ def trained(request, people):
 
 def two_steps(model, recipe, before_the_second=lambda: None, accelerator="cpu"):
     """The terms of two steps of the recipe, the number of tensors of the batch, and what took them."""
-    options = {"steps": 4, "self_feeding": recipe.feeding, "accelerator": accelerator, "progress": False}
+    options = {"steps": 4, "scheduled_sampling": recipe.feeding, "accelerator": accelerator, "progress": False}
     svi = dvae.SVI(model, stages=recipe.stages, **options)
     svi.init()
     batch = recipe.batches.sample(3, torch.Generator().manual_seed(1))
@@ -279,7 +279,7 @@ class TestOnDevice:
         [lambda x: x + torch.ones(3), lambda x: torch.cat([x, torch.zeros(2, 3)])],
     )
     def test_it_refuses_what_is_on_both_sides(self, run):
-        with on_device(), pytest.raises(RuntimeError, match=r"on cuda:127 and others on the processor, \("):
+        with on_device(), pytest.raises(RuntimeError, match=r"on cuda:127 and on the CPU \("):
             run(self.here.to("cuda"))
 
     def test_gradients_are_those_of_the_processor(self):
@@ -308,7 +308,7 @@ class TestOnDevice:
     def test_it_is_there_within_alone(self):
         with on_device():
             x = self.here.to("cuda")
-        with pytest.raises(RuntimeError, match="a device only within on_device"):
+        with pytest.raises(RuntimeError, match="exists only in a block of on_device"):
             x + 1
-        with on_device(), pytest.raises(TypeError, match="has no array; bring it to the processor first"):
+        with on_device(), pytest.raises(TypeError, match="has no array; move it to the CPU first"):
             x.numpy()

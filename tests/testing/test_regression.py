@@ -16,7 +16,7 @@ import torch
 from scipy import stats
 
 import dvae
-from dvae import DynamicalVAE, Oracle, networks, twin
+from dvae import DynamicalVAE, Oracle, linear_gaussian_surrogate, networks
 from dvae.testing.regression import Change, ElboRegression, Record, measure
 
 pytest_plugins = ["pytester"]
@@ -28,7 +28,7 @@ PAIR = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_t)")
 @pytest.fixture(scope="module")
 def exact():
     """A linear-Gaussian model, data, and its oracle."""
-    model = twin(*PAIR, {"z": 1, "x": 1}, 3)
+    model = linear_gaussian_surrogate(*PAIR, {"z": 1, "x": 1}, 3)
     torch.manual_seed(7)
     return model, model.sample(4, 3)["x"], Oracle(model, 3)
 
@@ -46,10 +46,10 @@ def repeated(model, x, times, particles, seed):
 
 def worsen(model, by):
     """The model with a guide whose scales are exp(by) times as large."""
-    other = twin(*PAIR, {"z": 1, "x": 1}, 3)
+    other = linear_gaussian_surrogate(*PAIR, {"z": 1, "x": 1}, 3)
     other.load_state_dict(model.state_dict())
     with torch.no_grad():
-        other.encoder["z"].law.log_scale += by
+        other.encoder["z"].head.log_scale += by
     return other
 
 
@@ -214,7 +214,7 @@ def test_small_sequences_are_known_beside_large_ones(tmp_path, exact):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("[]", "TypeError"), ("{}", "KeyError"), ("<<<<<<< HEAD\n{}", "no record of bounds")],
+    [("[]", "TypeError"), ("{}", "KeyError"), ("<<<<<<< HEAD\n{}", "not a record of bounds")],
 )
 def test_a_damaged_record_is_refused_and_can_be_renewed(tmp_path, exact, text, message):
     model, x, _ = exact
@@ -228,11 +228,11 @@ def test_a_damaged_record_is_refused_and_can_be_renewed(tmp_path, exact, text, m
 def test_what_cannot_be_compared_is_refused(tmp_path, exact):
     model, x, _ = exact
     check = regression(tmp_path).check
-    with pytest.raises(ValueError, match="particles is at least 2"):
+    with pytest.raises(ValueError, match="particles must be at least 2"):
         check(model.model, model.guide, x, particles=1)
-    with pytest.raises(ValueError, match=r"between 0 and 0.5; got 0.7"):
+    with pytest.raises(ValueError, match=r"between 0 and 0.5, got 0.7"):
         check(model.model, model.guide, x, alpha=0.7)
-    with pytest.raises(AssertionError, match=r"there is no record .*run without --elbo-strict"):
+    with pytest.raises(AssertionError, match=r"record .* is missing; run without --elbo-strict"):
         regression(tmp_path, strict=True).check(model.model, model.guide, x)
     assert not list(tmp_path.iterdir())
     check(model.model, model.guide, x, particles=5)
@@ -270,12 +270,12 @@ def normal(location, scale, dim=-1):
 
 def test_another_bound_is_held_by_its_own_draws(tmp_path):
     """With particles there is less to lose by a guide that is too wide than the ELBO loses, and it is found as well."""
-    model = twin(*PAIR, {"z": 1, "x": 1}, 3)
+    model = linear_gaussian_surrogate(*PAIR, {"z": 1, "x": 1}, 3)
     Oracle(model, 3).fit_guide()
     x = model.sample(4, 3)["x"]
 
     def weighted(data, seed):
-        return dvae.importance_bound(model, data, 4).bound
+        return dvae.iwae_bound(model, data, 4).bound
 
     regression(tmp_path).check(model.model, model.guide, x, particles=20, bound=weighted)
     record = (tmp_path / "test_it.json").read_text()
@@ -401,7 +401,7 @@ def test_pytest_finds_the_plugin_and_does_not_wait_for_torch():
 
 def test_the_price_of_a_mean_field_guide(elbo_regression):
     """The best mean-field guide of a fixed model: its bound is the same wherever it is computed."""
-    model = twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 6)
+    model = linear_gaussian_surrogate("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 6)
     with torch.no_grad():
         for parameter in model.generator.parameters():
             parameter.copy_(torch.linspace(-0.5, 0.7, parameter.numel()).view_as(parameter))

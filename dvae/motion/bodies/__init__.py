@@ -3,12 +3,12 @@
 >>> person = dvae.motion.bodies.human()
 >>> unturned = torch.eye(3).expand(2, 5, person.joints, 3, 3)
 >>> vertices, joints = person(torch.zeros(2, person.parameters_of_shape), unturned, torch.zeros(2, 5, 3))
->>> people = dvae.motion.bodies.fitted(dvae.motion.simulate(clips=2, frames=5), person)
+>>> people = dvae.motion.bodies.fit_to_body(dvae.motion.simulate(clips=2, frames=5), person)
 >>> dvae.motion.bodies.shapes_of(people, person).shape
 torch.Size([2, 8])
 """
 
-from .fitting import betas, fitted, retargeted, shapes_of
+from .fitting import betas, fit_to_body, retarget, shapes_of
 from .lofted import MARKERS, SHAPE, human
 from .measures import enclosed_volume, vertex_error
 from .skinning import Body
@@ -20,10 +20,10 @@ __all__ = [
     "Body",
     "betas",
     "enclosed_volume",
-    "fitted",
+    "fit_to_body",
     "human",
     "read_body",
-    "retargeted",
+    "retarget",
     "shapes_of",
     "vertex_error",
 ]

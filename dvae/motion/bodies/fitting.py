@@ -68,7 +68,7 @@ _LIMBS = {"hip knee ankle": (1.0, 0.0, 0.0), "shoulder elbow wrist": (0.0, -1.0,
 _NEEDED = ["pelvis", *(f"{side} {part}" for limb in _LIMBS for part in limb.split() for side in "lr")]
 
 
-def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> MotionSet:
+def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> MotionSet:
     """Fit motion to the joints of a body; the documentation of this module describes how.
 
     Motion on these joints, with rotations from a similar rest pose (e.g. from AMASS), keeps its rotations.
@@ -122,7 +122,7 @@ def fitted(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> Motio
 
 
 def shapes_of(motion: MotionSet, body: Body) -> Tensor:
-    """Return shape parameters (N, S) of clips from `fitted`, `retargeted` or `TimedFrames.back`.
+    """Return shape parameters (N, S) of clips from `fit_to_body`, `retarget` or `TimedFrames.back`.
 
     They are computed from the offsets of joints by `Body.shape_of`. For other motion they are meaningless.
 
@@ -133,14 +133,14 @@ def shapes_of(motion: MotionSet, body: Body) -> Tensor:
     return body.shape_of(resting_offsets(motion))
 
 
-def retargeted(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
+def retarget(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
     """Return the same rotations on other bodies, with positions scaled about the origin.
 
     The scale is the ratio of the heights of the root above the soles at rest. Speeds in leg lengths are therefore
     preserved, and people who stand on a floor at height 0 still do.
 
     Args:
-        motion: motion on the body's joints, e.g. from `fitted`.
+        motion: motion on the body's joints, e.g. from `fit_to_body`.
         body: body of the motion.
         shapes: new shape parameters, (S,) for all clips or (N, S).
 
@@ -149,7 +149,7 @@ def retargeted(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
     """
     _check(motion, body)
     each = _shapes(shapes, motion, body)
-    scales = standing(body, each) / standing(body, shapes_of(motion, body))
+    scales = standing_heights(body, each) / standing_heights(body, shapes_of(motion, body))
     turns = (_turns(clip, motion.skeleton) for clip in motion)
     return _made(
         motion, body, each, ((local, scale * place) for scale, (local, place) in zip(scales, turns, strict=True))
@@ -373,7 +373,7 @@ def _joints(body: Body, shapes: Tensor) -> Tensor:
     return resting(body.parents, body.offsets(shapes))
 
 
-def standing(body: Body, shapes: Tensor) -> Tensor:
+def standing_heights(body: Body, shapes: Tensor) -> Tensor:
     """Return heights (N,) of the root above the soles of bodies (N, S) at rest, in metres, float64."""
     found = []
     for some in shapes.to(body.template).split(256):
@@ -426,7 +426,7 @@ def _check(motion: MotionSet, body: Body) -> None:
     if not _turned_alike(motion, body):
         raise ValueError(
             f"{motion.name or 'this motion'} is not on the joints of the body, or not turned from its rest pose; "
-            "dvae.motion.bodies.fitted puts it there"
+            "dvae.motion.bodies.fit_to_body puts it there"
         )
 
 
@@ -456,4 +456,6 @@ def _made(motion: MotionSet, body: Body, shapes: Tensor, turns: Iterable[tuple[T
     own = motion.skeleton
     rest = tuple(offsets.mean(0).flatten().tolist())
     skeleton = Skeleton(body.names, body.parents, *sides(body.names), "y", own.fps, own.name, rest=rest)
-    return MotionSet(clips, skeleton, motion.name, copy=False, skipped=motion.skipped, said=motion.said)
+    return MotionSet(
+        clips, skeleton, motion.name, copy=False, skipped=motion.skipped, interpretation=motion.interpretation
+    )

@@ -206,7 +206,7 @@ class MotionSet:
         copy: False keeps float32 arrays without copying them; the caller must not use them any more.
         skip_bad: leave out unusable clips, and list them in `skipped`.
         skipped: clips that were left out earlier, as (split, name, reason).
-        said: how the units and axes of the files were interpreted, for people to check.
+        interpretation: how the units and axes of the files were interpreted, for people to check.
         missing: joints may be NaN where they were not observed; a joint with one NaN coordinate counts as missing.
             Windows then contain a mask of observed values.
 
@@ -219,7 +219,7 @@ class MotionSet:
     skeleton: Skeleton
     name: str
     skipped: Sequence[tuple[str, str, str]]
-    said: str
+    interpretation: str
     missing: bool
 
     def __init__(
@@ -231,7 +231,7 @@ class MotionSet:
         skip_bad: bool = False,
         *,
         skipped: Iterable[tuple[str, str, str]] = (),
-        said: str = "",
+        interpretation: str = "",
         missing: bool = False,
     ) -> None:
         single, left_out, what = [], list(skipped), name or "motion set"
@@ -256,7 +256,9 @@ class MotionSet:
         if twice:
             raise ValueError(f"{what}: clip {'/'.join(twice[0])} is there twice")
         fields = {"clips": tuple(single), "skeleton": skeleton, "name": name, "skipped": tuple(left_out)}
-        vars(self).update(fields, said=said, missing=missing, _index={clip.key: clip for clip in single})
+        vars(self).update(
+            fields, interpretation=interpretation, missing=missing, _index={clip.key: clip for clip in single}
+        )
 
     @override
     def __repr__(self) -> str:
@@ -310,7 +312,14 @@ class MotionSet:
                         clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
                     yield clip
 
-            found = MotionSet(turned(), skeleton, self.name, skipped=self.skipped, said=self.said, missing=self.missing)
+            found = MotionSet(
+                turned(),
+                skeleton,
+                self.name,
+                skipped=self.skipped,
+                interpretation=self.interpretation,
+                missing=self.missing,
+            )
             object.__setattr__(self, "_turned", found)
         return found
 
@@ -344,7 +353,7 @@ class MotionSet:
                     places.append(joint)
         loose = replace(skeleton, names=tuple(names), parents=tuple(parents), lengths=())
         clips = [replace(clip, positions=clip.positions[:, places], rotations=None) for clip in self]
-        return MotionSet(clips, loose, self.name, copy=False, skipped=self.skipped, said=self.said)
+        return MotionSet(clips, loose, self.name, copy=False, skipped=self.skipped, interpretation=self.interpretation)
 
     def _rigid(self, joints: Sequence[int]) -> list[list[int]]:
         """Group joints whose mutual distances are constant, the largest group first."""
@@ -458,8 +467,8 @@ class MotionSet:
         fact("skeleton", f"{self.skeleton.name}: {self.skeleton.joints} joints, {self.skeleton.up} up")
         fact("frames per second", f"{self.skeleton.fps:g}")
         fact("vertical extent", f"{extent:.2f} m (median)")
-        if self.said:
-            fact("read as", self.said)
+        if self.interpretation:
+            fact("read as", self.interpretation)
         if sum(clip.rotations is not None for clip in self):
             fact("rotations", "of every joint")
         if any(lacking):

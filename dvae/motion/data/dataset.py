@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 from ...options import check
 from ..files import read_motion
-from ..files.reading import chosen
+from ..files.reading import select_joints
 from .clips import MotionSet
 from .protocols import PROTOCOLS, Poses, Protocol, Representation, Windows, named_protocol, windows
 from .simulator import simulate
@@ -41,7 +41,7 @@ def default_protocol(motion: MotionSet) -> Protocol:
     return Protocol(f"{fps:g} Hz", frames(0.5), frames(2), fps, train_stride=frames(1 / 6), test_stride=frames(0.5))
 
 
-def divided(motion: MotionSet, protocol: Protocol) -> MotionSet:
+def apply_splits(motion: MotionSet, protocol: Protocol) -> MotionSet:
     """Split undivided motion into "train" and "test" if the protocol needs these splits."""
     asks = (protocol.split_by, protocol.train, protocol.test) == ("split", ("train",), ("test",))
     return motion.divided(shortest=protocol.length) if asks and not {"train", "test"} & {*motion.splits} else motion
@@ -81,7 +81,7 @@ class MotionData:
     """
 
     kind: ClassVar[str] = "motion"
-    described: ClassVar[str] = Poses.kind
+    schema_kind: ClassVar[str] = Poses.kind
     source: ClassVar[type[Recordings]] = Recordings
 
     path: str
@@ -120,7 +120,7 @@ class MotionData:
             protocol = named_protocol(protocol)
         protocol = protocol or default_protocol(clips)
         protocol = replace(protocol, representation=representation or protocol.representation)
-        split = divided(clips, protocol)
+        split = apply_splits(clips, protocol)
         tested = {clip.name for clip in split if clip.split == "test"}
         partly = len(split) > len(clips) > 1  # otherwise whole clips form the test split
         whole = tuple(clip.name for clip in split if partly and clip.name not in tested)
@@ -162,7 +162,7 @@ class MotionData:
     def schema(self) -> Poses:
         """Schema of the windows."""
         turned = self.protocol.representation != "positions"
-        return Poses.under(self.protocol, (self.motion.with_rotations() if turned else self.motion).skeleton)
+        return Poses.from_data(self.protocol, (self.motion.with_rotations() if turned else self.motion).skeleton)
 
     def recorded(self) -> Recordings:
         """Return the record of these data that `reopened` reads."""
@@ -195,9 +195,16 @@ class MotionData:
                 f"`dvae data convert {found.path} --fps {known.fps:g} --out FILE` resamples it"
             )
         try:
-            put = chosen(motion, onto=known)
+            put = select_joints(motion, onto=known)
         except ValueError:  # the caller compares the schemas and reports the difference
             return found
         clips = [replace(clip, rotations=None) for clip in put]
-        put = MotionSet(clips, known, motion.name, skipped=motion.skipped, said=motion.said, missing=motion.missing)
+        put = MotionSet(
+            clips,
+            known,
+            motion.name,
+            skipped=motion.skipped,
+            interpretation=motion.interpretation,
+            missing=motion.missing,
+        )
         return replace(found, motion=put, onto=True)

@@ -18,7 +18,7 @@ from torch import Tensor
 from .protocols import Windows
 
 
-class Exchanged:
+class ExchangedWindows:
     """Windows that begin with the pose of another window, for `dvae.evaluate`.
 
     Window n keeps its frames and paths, except that its first frame is the one of a partner. The given joints of a

@@ -30,14 +30,14 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import Batch
-from ...data.blocks import blocks, cut, hash_list, hash_values
+from ...data.blocks import blocks, cut_windows, hash_list, hash_values
 from ...data.schema import Schema, SchemaError
-from ...data.sequences import bridged, tensor_of
+from ...data.sequences import interpolate_missing, tensor_of
 from ...data.views import View
 from ...options import Amount, Frames, Range, check, nearest, tuples
 from ..geometry.rotations import continuous, from_matrix, to_matrix
 from ..geometry.skeleton import Skeleton, rotate_about_up
-from ..geometry.views import TURNS, Rotations
+from ..geometry.views import ROTATIONS, Rotations
 from .clips import Clip, MotionSet
 
 Representation = Literal["positions", "6d", "quaternion", "vector"]
@@ -164,7 +164,7 @@ class Poses(Schema):
     protocol: Protocol = field(kw_only=True)
 
     @classmethod
-    def under(cls, protocol: Protocol, skeleton: Skeleton, length: int | None = None) -> Self:
+    def from_data(cls, protocol: Protocol, skeleton: Skeleton, length: int | None = None) -> Self:
         """Return the schema of windows that a protocol cuts, optionally with another length."""
         view = cls._view(protocol, skeleton)
         size = view.size if isinstance(view, Rotations) else 3 * (skeleton.joints - (protocol.root == "drop"))
@@ -207,7 +207,7 @@ class Poses(Schema):
     @override
     def windows(self) -> Poses:
         protocol, skeleton = replace(self.protocol, representation="positions"), replace(self.skeleton, rest=())
-        return self.under(protocol, skeleton, self.length)
+        return self.from_data(protocol, skeleton, self.length)
 
     @property
     def frames(self) -> int:
@@ -221,7 +221,7 @@ class Poses(Schema):
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Return the schema from the result of `config`."""
-        return cls.under(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
+        return cls.from_data(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
 
 
 def _said(representation: str) -> str:
@@ -384,7 +384,7 @@ class Windows:
     @property
     def schema(self) -> Poses:
         """Schema of these windows."""
-        return Poses.under(self.protocol, self.skeleton, self.length)
+        return Poses.from_data(self.protocol, self.skeleton, self.length)
 
     @property
     def size(self) -> int:
@@ -407,7 +407,7 @@ class Windows:
             x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
         batch = self._batch(x, clips, generator)
         if self._turns is not None:
-            batch["beside"] = {TURNS: self._turned(clips, starts, angle if self.protocol.rotate else None)}
+            batch["view_inputs"] = {ROTATIONS: self._turned(clips, starts, angle if self.protocol.rotate else None)}
         return batch
 
     def all(self, stride: int | None = None) -> Batch:
@@ -433,7 +433,7 @@ class Windows:
             x[block] = self._cut(clips[block], starts[block])
         batch = self._batch(x, clips, generator)
         if self._turns is not None:
-            batch["beside"] = {TURNS: self._turned(clips, starts)}
+            batch["view_inputs"] = {ROTATIONS: self._turned(clips, starts)}
         return batch
 
     def poses(self) -> Tensor:
@@ -491,7 +491,7 @@ class Windows:
             )
         return self.skeleton.with_root(x.unflatten(-1, (-1, 3)))
 
-    def filled(self, positions: Tensor) -> MotionSet:
+    def fill_missing(self, positions: Tensor) -> MotionSet:
         """Return the original clips, with missing joints filled from the listed windows.
 
         Windows are moved and rotated back to the place where they were cut. A missing root is interpolated linearly. If
@@ -518,14 +518,14 @@ class Windows:
             chosen: indices of the N windows in `keys`; default: all.
         """
         clips, starts = (each[chosen] for each in self._list(self.stride))
-        joints, root = cut(self._frames, clips, starts, self.length), self.skeleton.root
+        joints, root = cut_windows(self._frames, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, self.protocol.observed - 1)[:, None, None]
             positions = rotate_about_up(positions, heading, self.skeleton.up)
         places = joints[:, :, root : root + 1]
         seen = places.isfinite()
         if self.protocol.root == "drop":
-            return positions + bridged(places.flatten(2), seen.flatten(2))[:, :, None]
+            return positions + interpolate_missing(places.flatten(2), seen.flatten(2))[:, :, None]
         return positions + places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
 
     def given(self, joints: Sequence[str] | float) -> Windows:
@@ -645,7 +645,7 @@ class Windows:
 
     def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
         """Return copied windows (B, T, D) in the protocol's representation, for clips (B,) and first frames (B,)."""
-        return self._represented(cut(self._frames, clips, starts, self.length), self.protocol.observed - 1)
+        return self._represented(cut_windows(self._frames, clips, starts, self.length), self.protocol.observed - 1)
 
     def _represented(self, joints: Tensor, now: int) -> Tensor:
         """Return frames (B, T, D) of joints (B, T, J, 3); a fixed heading is zero in frame `now`."""
@@ -664,9 +664,11 @@ class Windows:
     def _turned(self, clips: Tensor, starts: Tensor, angle: Tensor | None = None) -> Tensor:
         """Return rotations (B, T, 4 J) of the joints in windows; the root is rotated together with its window."""
         assert self._turns is not None
-        turns, root = cut(self._turns, clips, starts, self.length), self.skeleton.root
+        turns, root = cut_windows(self._turns, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
-            angle = -self.skeleton.heading(cut(self._frames, clips, starts + self.protocol.observed - 1, 1)[:, 0])
+            angle = -self.skeleton.heading(
+                cut_windows(self._frames, clips, starts + self.protocol.observed - 1, 1)[:, 0]
+            )
         if angle is not None:
             axes = rotate_about_up(torch.eye(3).expand(len(turns), 3, 3), angle.reshape(-1, 1), self.skeleton.up).mT
             world = to_matrix(turns[:, :, root], "quaternion")

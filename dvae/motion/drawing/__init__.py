@@ -1,4 +1,4 @@
-"""Pictures, players and films of motion."""
+"""Pictures and a player of motion."""
 
 from typing import TYPE_CHECKING
 

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 from ... import files
 from ..geometry.skeleton import Skeleton
-from .plot import FIXED, PAST, Scene, staged
+from .plot import FIXED, PAST, Scene, make_scene
 
 SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
 """Script that animates all players of a page."""
@@ -55,8 +55,8 @@ def player(scenes: Mapping[str, Scene]) -> Markup:
 
 def _scene(stage: Scene) -> dict[str, Any]:
     """Return a scene in the format of the script, with packed coordinates."""
-    motion = stage.motion[:, stage.shown]
-    observed = sum(frame <= stage.now for frame in stage.shown)
+    motion = stage.motion[:, stage.frames]
+    observed = sum(frame <= stage.now for frame in stage.frames)
     low, high = stage.low, stage.high
     unit = max(MILLIMETRE, np.abs([low, high]).max() / 32767)
     past, future = np.split(np.nan_to_num(np.round(motion / unit), nan=MISSING), [observed], axis=1)
@@ -69,7 +69,7 @@ def _scene(stage: Scene) -> dict[str, Any]:
         "joints": stage.skeleton.joints,
         "bones": stage.skeleton.edges,
         "observed": observed,
-        "frames": len(stage.shown),
+        "frames": len(stage.frames),
         "milliseconds": stage.milliseconds,
         "people": [
             {"name": name, "colour": colour, "frames": len(ahead), "fixed": sorted(stage.shared(k))}
@@ -114,13 +114,13 @@ class Animation:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the page to a file."""
-        with files.written(path) as file:
+        with files.atomic_write(path) as file:
             file.write(self.to_html().encode())
 
     def still(self) -> Figure:
         """Draw the last frame, seen from the front."""
         scene = self.scene
-        motion = scene.motion[:, scene.shown[-1]] + scene.places[:, None]
+        motion = scene.motion[:, scene.frames[-1]] + scene.places[:, None]
         low, high = (find(motion[..., [0, 2]], axis=(0, 1)) for find in (np.nanmin, np.nanmax))
         figure = Figure(
             figsize=(9, float(np.clip(9 * (high - low)[1] / (high - low)[0], 1.5, 6))), dpi=72, layout="constrained"
@@ -204,5 +204,5 @@ def animate(
         ValueError: the shapes do not match each other or the skeleton, an array is empty, a position is not finite, or
             names, fixed or every do not match the motion.
     """
-    scene = staged(skeleton, observed, samples, truth, names=names, fixed=fixed, every=every, view=view)
+    scene = make_scene(skeleton, observed, samples, truth, names=names, fixed=fixed, every=every, view=view)
     return Animation(scene, title)

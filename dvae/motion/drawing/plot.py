@@ -55,7 +55,7 @@ def pose(
     ax.add_collection(LineCollection(bones, **{"capstyle": "round", **line}))
 
 
-def bare(ax: Axes) -> None:
+def hide_axes(ax: Axes) -> None:
     """Set an equal aspect ratio, and remove frame and ticks."""
     ax.autoscale_view()
     ax.set_aspect("equal")
@@ -99,7 +99,7 @@ def futures(
     """
     past, future, real = _checked(skeleton, observed, samples, truth)
     crosses = _given(paths or {}, skeleton, future.shape[1])
-    azimuth = view - facing(skeleton, torch.from_numpy(past))
+    azimuth = view - final_heading(skeleton, torch.from_numpy(past))
     now, horizon = len(past) - 1, future.shape[1]
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
     shown = [*sorted({0, now}), *(now + ahead)]
@@ -127,7 +127,7 @@ def futures(
             seen = rotate_about_up(places, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
             ax.plot(column * SPACING + seen[:, 0], seen[:, skeleton.vertical], "x", color=GIVEN, zorder=3)
 
-    bare(ax)
+    hide_axes(ax)
     seconds = [(frame - now) / skeleton.fps for frame in shown]
     ax.set_xticks(SPACING * np.arange(len(shown)), [f"{s:+.1f} s" if s else "0 s" for s in seconds])
     _key(ax, len(future), real is not None, len(crosses) > 0)
@@ -154,7 +154,7 @@ class Scene:
     colours: list[str]
     motion: np.ndarray
     now: int
-    shown: range
+    frames: range
     fixed: frozenset[int]
     truth: bool
 
@@ -176,7 +176,7 @@ class Scene:
     @property
     def milliseconds(self) -> float:
         """Time between shown frames, at original speed."""
-        return 1000 * self.shown.step / self.skeleton.fps
+        return 1000 * self.frames.step / self.skeleton.fps
 
     def seconds(self, frame: int) -> float:
         """Return the time of a frame relative to the last observed frame."""
@@ -187,7 +187,7 @@ class Scene:
         return frozenset() if self.truth and person == 0 else self.fixed
 
 
-def staged(
+def make_scene(
     skeleton: Skeleton,
     observed: Any,
     samples: Any = None,
@@ -253,7 +253,7 @@ def _seen(skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], h
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
     for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which is not drawn
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
-    turn = torch.tensor(view - facing(skeleton, torch.from_numpy(past)), dtype=torch.float64)
+    turn = torch.tensor(view - final_heading(skeleton, torch.from_numpy(past)), dtype=torch.float64)
     motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
     return motion if skeleton.up == "z" else motion[..., [0, 2, 1]] * [1, -1, 1]
 
@@ -271,7 +271,7 @@ def _colours(samples: int) -> np.ndarray:
     return plt.get_cmap("turbo")(np.linspace(0.05, 0.95, samples))
 
 
-def facing(skeleton: Skeleton, positions: Tensor) -> float:
+def final_heading(skeleton: Skeleton, positions: Tensor) -> float:
     """Return the heading at the end of motion (F, J, 3); zero if the skeleton does not define left and right."""
     return float(skeleton.heading_near(positions, len(positions) - 1)) if skeleton.left and skeleton.right else 0.0
 

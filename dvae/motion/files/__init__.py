@@ -1,6 +1,6 @@
 """Motion files: one reader per format that returns a `Recording`, and writers for formats of other programs."""
 
-from .plain import read_paths, save
+from .arrays import read_paths, save
 from .reading import read_motion
 from .writing import write_motion
 

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ...data.npy import LONGEST, Refused, check_bytes, dtype_of, header
+from ...data.npy import LONGEST, NpyError, check_bytes, dtype_of, header
 from ..geometry.skeleton import is_name
 
 LARGEST = 4 * 2**30
@@ -62,7 +62,7 @@ def archive(path: str | Path, mapping: bool = False) -> Iterator[dict[str, Membe
             yield _members(file, path.stat().st_size, mapping)
     except MemoryError:
         raise ValueError(f"{path}: there is not enough memory to read it") from None
-    except Refused as error:
+    except NpyError as error:
         # removes terminal control characters
         text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(error))
         raise ValueError(f"{path}: {text}") from error
@@ -79,14 +79,14 @@ def holds(path: str | Path, *names: str) -> bool:
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Convert the errors that the zip library raises on damaged bytes, which can be almost any, to `Refused`."""
+    """Convert the errors that the zip library raises on damaged bytes, which can be almost any, to `NpyError`."""
     try:
         yield
-    except (Refused, MemoryError, FileNotFoundError, PermissionError):
+    except (NpyError, MemoryError, FileNotFoundError, PermissionError):
         raise
     except Exception as error:
         what = str(error)[:200] or type(error).__name__
-        raise Refused(f"damaged, truncated or not an npz archive ({what})") from error
+        raise NpyError(f"damaged, truncated or not an npz archive ({what})") from error
 
 
 def _limit(size: int) -> int:
@@ -131,25 +131,25 @@ def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Membe
     unpacked, limit = sum(info.file_size for info in infos if info.filename not in placed), _limit(size)
     if unpacked > limit:
         mapped = f" beside {len(placed)} arrays that are mapped" if placed else ""
-        raise Refused(f"it would unpack to {unpacked:,} bytes{mapped}, at most {limit:,} are read from {size:,}")
+        raise NpyError(f"it would unpack to {unpacked:,} bytes{mapped}, at most {limit:,} are read from {size:,}")
     if sum(info.compress_size for info in infos) > size:
-        raise Refused("damaged: its members take more bytes than it has")
+        raise NpyError("damaged: its members take more bytes than it has")
     members = {}
     for info in infos:
         name = info.filename.removesuffix(".npy")
         if info.flag_bits & 1:
-            raise Refused(f"{name} is encrypted; write the archive without a password")
+            raise NpyError(f"{name} is encrypted; write the archive without a password")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             method = {9: "deflate64", 12: "bzip2", 14: "LZMA", 93: "zstd", 95: "xz"}.get(
                 info.compress_type, "another way"
             )
-            raise Refused(
+            raise NpyError(
                 f"{name} is compressed by {method}, expected deflate or none; write it with np.savez_compressed"
             )
         if not is_name(name):
-            raise Refused(f"{name[:40]!r} is no name for a split and a clip")
+            raise NpyError(f"{name[:40]!r} is no name for a split and a clip")
         if name in members:
-            raise Refused(f"{name} is there twice")
+            raise NpyError(f"{name} is there twice")
         members[name] = Member(name, file, info, placed.get(info.filename))
     return members
 
@@ -168,7 +168,7 @@ def _placed(content: np.ndarray, info: zipfile.ZipInfo) -> np.ndarray | None:
         dtype, shape, order = header(head.read)
         own = own[head.tell() :]
         check_bytes(dtype, shape, len(own))
-    except Refused:
+    except NpyError:
         return None
     return own.view(dtype).reshape(shape) if dtype.str == "<f4" and order == "C" and len(own) else None
 
@@ -245,14 +245,14 @@ class Member:
         with self._open() as stream:
             dtype, shape, order = header(stream.some)
             if dtype.hasobject:
-                raise Refused("holds pickled objects, which only a member called positions_3d may")
+                raise NpyError("holds pickled objects, which only a member called positions_3d may")
             check_bytes(dtype, shape, stream.left)
             array = np.empty(shape, dtype, order)
             stream.readinto(array)
         if dtype.kind == "U":
             points = array.reshape(-1).view(f"{dtype.str[0]}u4")
             if ((points > 0x10FFFF) | (points >> 11 == 0xD800 >> 11)).any():
-                raise Refused(f"{self.name}: damaged: its text has characters that are none")
+                raise NpyError(f"{self.name}: damaged: its text has characters that are none")
         return array
 
     def clips(self) -> list[tuple[str, str, np.ndarray]]:
@@ -264,25 +264,25 @@ class Member:
         with self._open() as stream:
             dtype, shape, _ = header(stream.some)
             if not dtype.hasobject or shape != ():
-                raise Refused(
+                raise NpyError(
                     f"has shape {shape} and dtype {dtype}, expected one pickled dictionary (shape () and dtype object)"
                 )
             nested = _Interpreter(2 * stream.left + SMALL).run(stream)
             if stream.left:
-                raise Refused(f"damaged pickle: {stream.left:,} bytes follow its end")
+                raise NpyError(f"damaged pickle: {stream.left:,} bytes follow its end")
         if isinstance(nested, _Array):  # numpy pickles the 0-dimensional array, not its item
             nested = nested.item()
         if not isinstance(nested, dict) or not all(isinstance(clips, dict) for clips in nested.values()):
-            raise Refused(f"{self.name} is no dictionary of dictionaries (split -> clip -> positions)")
+            raise NpyError(f"{self.name} is no dictionary of dictionaries (split -> clip -> positions)")
         found, room = [], self._info.file_size + SMALL
         for split, clips in nested.items():
             for name, array in clips.items():
                 if not isinstance(array, _Array):
-                    raise Refused(f"clip {split}/{name} is a {_said(array)}, expected a numpy array")
+                    raise NpyError(f"clip {split}/{name} is a {_said(array)}, expected a numpy array")
                 found.append((split, name, array.numbers()))
                 room -= array.numbers().nbytes
                 if room < 0:
-                    raise Refused(f"{self.name}: its clips are one array many times over, more than the file holds")
+                    raise NpyError(f"{self.name}: its clips are one array many times over, more than the file holds")
         return found
 
     @contextmanager
@@ -290,8 +290,8 @@ class Member:
         try:
             with _damage(), self._archive.open(self._info) as file:
                 yield _Stream(file, self._info.file_size)
-        except Refused as error:
-            raise Refused(f"{self.name}: {error}") from error
+        except NpyError as error:
+            raise NpyError(f"{self.name}: {error}") from error
 
 
 class _Global:
@@ -310,9 +310,9 @@ class _Type:
     def build(self, state: Any) -> None:
         plain = isinstance(state, tuple) and len(state) == 8 and all(field is None for field in state[2:5])
         if not plain or state[1] not in ("<", ">", "|", "="):
-            raise Refused("refused a dtype of fields or of its own making: expected numbers")
+            raise NpyError("refused a dtype of fields or of its own making: expected numbers")
         if not _is_int(state[5]) or state[5] not in (-1, self.dtype.itemsize):
-            raise Refused(f"refused a {self.dtype} that declares another size")
+            raise NpyError(f"refused a {self.dtype} that declares another size")
         self.dtype = self.dtype.newbyteorder(state[1])
 
 
@@ -325,15 +325,15 @@ class _Array:
 
     def build(self, state: Any) -> None:
         if self._array is not None or not isinstance(state, tuple) or len(state) != 5:
-            raise Refused("refused an array that is not made as numpy makes it")
+            raise NpyError("refused an array that is not made as numpy makes it")
         _, shape, kind, fortran, content = state
         if not isinstance(kind, _Type):
-            raise Refused(f"refused an array whose dtype is a {_said(kind)}")
+            raise NpyError(f"refused an array whose dtype is a {_said(kind)}")
         if not kind.dtype.hasobject:
             self._array = _of_bytes(content, kind.dtype, shape, "F" if fortran is True or fortran == 1 else "C")
             return
         if not isinstance(content, list) or len(content) != prod(_shape(shape)):
-            raise Refused(f"refused an array of objects of shape {_shape(shape)} that is not made of as many")
+            raise NpyError(f"refused an array of objects of shape {_shape(shape)} that is not made of as many")
         self._array, self._objects = np.empty((), object), content
 
     def item(self) -> Any:
@@ -343,7 +343,7 @@ class _Array:
     def numbers(self) -> np.ndarray:
         """Return the array, or an empty one for objects, which are not used."""
         if self._array is None:
-            raise Refused("damaged pickle: an array has no content")
+            raise NpyError("damaged pickle: an array has no content")
         return self._array
 
 
@@ -358,7 +358,7 @@ def _is_int(value: Any) -> bool:
 
 def _shape(shape: Any) -> tuple[int, ...]:
     if not isinstance(shape, tuple) or len(shape) > 32 or not all(_is_int(n) and n >= 0 for n in shape):
-        raise Refused("refused an array whose shape is none")
+        raise NpyError("refused an array whose shape is none")
     return shape
 
 
@@ -366,7 +366,7 @@ def _bytes(content: Any) -> bytes | bytearray:
     if isinstance(content, str):  # bytes of Python 2
         return content.encode("latin1")
     if not isinstance(content, bytes | bytearray):
-        raise Refused(f"refused an array of a {_said(content)}: expected bytes")
+        raise NpyError(f"refused an array of a {_said(content)}: expected bytes")
     return content
 
 
@@ -399,20 +399,20 @@ class _Interpreter:
         try:
             for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):  # type: ignore[arg-type]
                 if count == INSTRUCTIONS:
-                    raise Refused(f"refused a pickle of more than {INSTRUCTIONS:,} instructions")
+                    raise NpyError(f"refused a pickle of more than {INSTRUCTIONS:,} instructions")
                 if opcode.name in _PUSHED:
                     if type(argument) is int and argument.bit_length() > 64:
-                        raise Refused(f"refused a number of {argument.bit_length():,} bits")
+                        raise NpyError(f"refused a number of {argument.bit_length():,} bits")
                     self.stack.append(argument)
                 elif opcode.name in _RULES:
                     _RULES[opcode.name](self, argument)
                 else:
-                    raise Refused(f"refused the instruction {opcode.name}: {_ALLOWED}")
+                    raise NpyError(f"refused the instruction {opcode.name}: {_ALLOWED}")
             return self.stack.pop()
-        except (Refused, MemoryError):
+        except (NpyError, MemoryError):
             raise
         except Exception as error:  # a damaged pickle can raise almost anything
-            raise Refused(f"damaged pickle ({type(error).__name__}: {str(error)[:200]})") from error
+            raise NpyError(f"damaged pickle ({type(error).__name__}: {str(error)[:200]})") from error
 
     def push(self, value: Any) -> None:
         self.stack.append(value)
@@ -441,18 +441,18 @@ class _Interpreter:
     def extend(self, values: list[Any]) -> None:
         target = self.stack[-1]
         if not isinstance(target, list):
-            raise Refused(f"refused to append to a {_said(target)}")
+            raise NpyError(f"refused to append to a {_said(target)}")
         target.extend(values)
 
     def fill(self, items: list[Any]) -> None:
         target = self.stack[-1]
         if not isinstance(target, dict):
-            raise Refused(f"refused to set items of a {_said(target)}")
+            raise NpyError(f"refused to set items of a {_said(target)}")
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, str):  # only text is hashed or compared; other values could take forever
-                raise Refused(f"refused a {_said(key)} as a key: splits and clips have names")
+                raise NpyError(f"refused a {_said(key)} as a key: splits and clips have names")
             if not is_name(key):
-                raise Refused(f"refused the key {key[:40]!r}: splits and clips have names")
+                raise NpyError(f"refused the key {key[:40]!r}: splits and clips have names")
             target[key] = value
 
     def dictionary(self, _: Any) -> None:
@@ -463,19 +463,19 @@ class _Interpreter:
     def find(self, name: str) -> None:
         home = name.replace("numpy._core.", "numpy.core.")  # numpy 2 renamed its core
         if home not in _GLOBALS:
-            raise Refused(f"refused {name[:200]}: {_ALLOWED}")
+            raise NpyError(f"refused {name[:200]}: {_ALLOWED}")
         self.push(_Global(home, _GLOBALS[home]))
 
     def find_on_stack(self, _: Any) -> None:
         module, name = self.last(2)
         if not isinstance(module, str) or not isinstance(name, str):
-            raise Refused("refused a function whose name is none")
+            raise NpyError("refused a function whose name is none")
         self.find(f"{module}.{name}")
 
     def reduce(self, _: Any) -> None:
         function, arguments = self.last(2)
         if not isinstance(function, _Global) or function.call is None or not isinstance(arguments, tuple):
-            raise Refused(f"refused to call a {_said(function)}")
+            raise NpyError(f"refused to call a {_said(function)}")
         self.spend(arguments)
         self.push(function.call(*arguments))
 
@@ -483,33 +483,33 @@ class _Interpreter:
         if isinstance(given, tuple) and len(given) <= 8:
             self.room -= sum(len(value) for value in given if isinstance(value, str | bytes | bytearray))
         if self.room < 0 or not isinstance(given, tuple) or len(given) > 8:
-            raise Refused("refused an array that is not made as numpy makes it")
+            raise NpyError("refused an array that is not made as numpy makes it")
 
     def build(self, _: Any) -> None:
         state, target = self.stack.pop(), self.stack[-1]
         if not isinstance(target, _Array | _Type):
-            raise Refused(f"refused to set the state of a {_said(target)}")
+            raise NpyError(f"refused to set the state of a {_said(target)}")
         self.spend(state)
         target.build(state)
 
 
 def _reconstruct(subtype: Any, shape: Any, _code: Any) -> _Array:
     if not isinstance(subtype, _Global) or subtype.name != "numpy.ndarray":
-        raise Refused(f"refused an array of the class {_said(subtype)}")
+        raise NpyError(f"refused an array of the class {_said(subtype)}")
     if _shape(shape) != (0,):  # numpy creates every array empty and fills it afterwards
-        raise Refused(f"refused an array declared with shape {shape} before its content")
+        raise NpyError(f"refused an array declared with shape {shape} before its content")
     return _Array()
 
 
 def _scalar(kind: Any, content: Any) -> Any:
     if not isinstance(kind, _Type) or kind.dtype.hasobject:
-        raise Refused("refused a number that is none")
+        raise NpyError("refused a number that is none")
     return _of_bytes(content, kind.dtype, (), "C").item()
 
 
 def _from_buffer(content: Any, kind: Any, shape: Any, order: Any, axes: Any = None) -> _Array:
     if not isinstance(kind, _Type) or kind.dtype.hasobject or order not in ("C", "F", "K"):
-        raise Refused("refused an array that is not made as numpy makes it")
+        raise NpyError("refused an array that is not made as numpy makes it")
     array = _of_bytes(content, kind.dtype, shape, "F" if order == "F" else "C")
     if order == "K" and axes is not None:
         array = array.transpose(_shape(axes))
@@ -518,7 +518,7 @@ def _from_buffer(content: Any, kind: Any, shape: Any, order: Any, axes: Any = No
 
 def _encode(text: Any, encoding: Any) -> bytes:  # protocols 0 to 2 encode bytes in this way
     if encoding != "latin1":
-        raise Refused(f"refused the codec {str(encoding)[:40] if isinstance(encoding, str) else ''}: expected latin1")
+        raise NpyError(f"refused the codec {str(encoding)[:40] if isinstance(encoding, str) else ''}: expected latin1")
     return bytes(_bytes(text if isinstance(text, str) else None))
 
 

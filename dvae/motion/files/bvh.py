@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...files import written
+from ...files import atomic_write
 from ..geometry.rotations import from_matrix, to_matrix
 from .recording import END, Recording, check_joints, check_size, numbers, read_lines
 
@@ -133,7 +133,7 @@ def write_bvh(
     angles = from_matrix(to_matrix(torch.from_numpy(rotations).double(), "quaternion"), f"euler-{order}").numpy()
     rows = np.concatenate([100 * root, np.rad2deg(angles[:, turning]).reshape(len(root), -1)], 1)
     lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / fps:.8f}"]
-    with written(path) as file:
+    with atomic_write(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
         np.savetxt(file, rows, fmt="%.6f")
 

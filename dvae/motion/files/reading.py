@@ -17,12 +17,12 @@ from ..naming import sides
 from ..scoring.matching import RIGID, Kept
 from .amc import read_amc, read_expmap
 from .archive import LARGEST, holds
+from .arrays import LABELS, check_key, companion, read_archive, read_labels, read_table
 from .bvh import read_bvh
 from .markers import read_c3d
-from .plain import LABELS, check_key, companion, read_archive, read_labels, read_table
 from .recording import Recording
-from .settled import World, doubt, settle, turned, understand
 from .smpl import read_amass
+from .world import World, infer_world, orientation_warning, rotate_recording, to_world
 
 READERS: dict[str, Callable[[Path], Recording]] = {
     ".bvh": read_bvh,
@@ -124,10 +124,10 @@ def read_motion(
     if not files:
         places = [joint for joint in joints or () if isinstance(joint, int)] if onto is None else []
         found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps, missing)
-        return found if places or (joints is None and onto is None) else chosen(found, joints, onto)
+        return found if places or (joints is None and onto is None) else select_joints(found, joints, onto)
     some = sampled(files, skip_bad)
     given = metres is not None, up is not None
-    reader = FileReader(understand(some, metres, up), *given, fps, skeleton, joints, onto, missing=missing)
+    reader = FileReader(infer_world(some, metres, up), *given, fps, skeleton, joints, onto, missing=missing)
     collected = Collected(path.stem)
     clips, unread, size = [], [], 0
     for file in files:
@@ -150,7 +150,7 @@ def read_motion(
     if not clips:
         raise ValueError(f"{path}: no file of it can be read; the first: {unread[0][2]}")
     return collected.motion(
-        clips, skip_bad=skip_bad, skipped=unread, said=collected.said(reader.world), missing=missing
+        clips, skip_bad=skip_bad, skipped=unread, interpretation=collected.interpretation(reader.world), missing=missing
     )
 
 
@@ -267,9 +267,9 @@ class FileReader:
             world = replace(world, unit="as the file says", metres=recording.metres)
         if recording.up is not None and not self.up:
             world = replace(world, axis=recording.up, upwards=True)
-        settled = settle(recording, world)
+        settled = to_world(recording, world)
         if settled.up != self.world.up:
-            settled = upwards(settled, self.world.up)
+            settled = rotate_up(settled, self.world.up)
         fps = self.fps or settled.fps
         if fps is None:
             raise ValueError("it does not say its frames per second; give fps=")
@@ -287,7 +287,7 @@ class FileReader:
         if reason := defect(clip, own, self.missing):
             raise ValueError(reason)
         notes = [*recording.notes, *([BENDS] if settled.rotations is not None and clip.rotations is None else [])]
-        notes += [lying] if (lying := doubt(settled.names, settled.positions, self.world.up)) else []
+        notes += [lying] if (lying := orientation_warning(settled.names, settled.positions, self.world.up)) else []
         return clip, own, notes
 
 
@@ -308,7 +308,7 @@ def clip_of(
         known: skeleton of the recording, if known.
         joints, onto: same as in `read_motion`.
     """
-    recording = kept(recording, joints, onto)
+    recording = select_recording_joints(recording, joints, onto)
     known = onto or (known if joints is None else None)
     left, right = (known.left, known.right) if known else sides(recording.names)
     positions, rotations = recording.positions.astype(np.float32), None
@@ -321,7 +321,7 @@ def clip_of(
     return replace(clip, positions=positions, labels=labels, rotations=rotations), own
 
 
-def kept(
+def select_recording_joints(
     recording: Recording, joints: Sequence[int | str] | Mapping[str, str] | None, onto: Skeleton | None
 ) -> Recording:
     """Return a recording in metres with some of its joints, or with the joints and the up axis of a known skeleton."""
@@ -336,13 +336,13 @@ def kept(
     made = replace(
         recording, names=found.names, parents=found.parents, positions=positions, rotations=rotations, offsets=offsets
     )
-    return upwards(made, onto.up) if onto is not None and onto.up != recording.up else made
+    return rotate_up(made, onto.up) if onto is not None and onto.up != recording.up else made
 
 
-def upwards(recording: Recording, up: str) -> Recording:
+def rotate_up(recording: Recording, up: str) -> Recording:
     """Return a recording rotated about x so that the other axis is up."""
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
-    return replace(turned(recording, turn if up == "z" else turn.T), up=up)
+    return replace(rotate_recording(recording, turn if up == "z" else turn.T), up=up)
 
 
 class Collected:
@@ -409,7 +409,7 @@ class Collected:
         clips = clips if self.skeleton.rest else [replace(clip, rotations=None) for clip in clips]
         return MotionSet(clips, self.skeleton, self._name, copy=False, **known)
 
-    def said(self, world: World) -> str:
+    def interpretation(self, world: World) -> str:
         """Return a description of how the files were interpreted."""
         found = [f"{world}, a person of {np.median(self._extents):.2f} m"]
         if not self._alike and BENDS not in self._notes:
@@ -440,7 +440,7 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
     return collected.motion(clips, skipped=skipped, missing=any(motion.missing for _, motion in sets))
 
 
-def chosen(
+def select_joints(
     motion: MotionSet, joints: Sequence[int | str] | Mapping[str, str] | None = None, onto: Skeleton | None = None
 ) -> MotionSet:
     """Return clips with some of their joints, or with the joints of a known skeleton, as in `read_motion`."""
@@ -453,4 +453,4 @@ def chosen(
         if reason := collected.add(Path("/".join(clip.key)), made, own):
             raise ValueError(f"{motion.name}: {reason}")
         clips.append(made)
-    return collected.motion(clips, skipped=motion.skipped, said=motion.said, missing=motion.missing)
+    return collected.motion(clips, skipped=motion.skipped, interpretation=motion.interpretation, missing=motion.missing)

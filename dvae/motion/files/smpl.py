@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ... import files
-from ...data.npy import Refused
+from ...data.npy import NpyError
 from ..data.clips import Clip, MotionSet
 from ..geometry.kinematics import inverse
 from ..geometry.rotations import from_matrix, to_matrix
@@ -73,7 +73,7 @@ def read_amass(path: str | Path) -> Recording:
     path = Path(path)
     with archive(path) as members:
         if not {"poses", "trans"} <= members.keys():
-            raise Refused(
+            raise NpyError(
                 f"it holds {', '.join(sorted(members)[:6]) or 'nothing'}, expected AMASS's poses and trans; "
                 "other npz files of clips are read one by one, not as a folder; "
                 f"`dvae data convert {path.parent}/*.npz --out ALL.npz` joins those that it wrote"
@@ -157,7 +157,7 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     betas = np.array([float(value) for value in clip.labels.get("betas", "").split()] or [0.0] * 16)
     arrays = {"poses": poses, "trans": places.numpy(), "betas": betas, "offsets": all_offsets}
     arrays |= {"mocap_framerate": np.array(skeleton.fps), "gender": np.array("neutral")}
-    with files.written(path) as file:
+    with files.atomic_write(path) as file:
         write_arrays(file, arrays.items())
 
 

@@ -17,12 +17,12 @@ from ... import files
 from ...inference.evaluation.result import progress_bar
 from ..data.clips import Clip, MotionSet
 from ..geometry.skeleton import Skeleton, brief
+from .arrays import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
 from .bvh import write_bvh
-from .plain import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
-from .reading import Collected, File, FileReader, find_files, joined_motion, read_motion, sampled, upwards
+from .reading import Collected, File, FileReader, find_files, joined_motion, read_motion, rotate_up, sampled
 from .recording import Recording
-from .settled import understand
 from .smpl import write_amass
+from .world import infer_world
 
 FORMATS = {"npz": ".npz", "bvh": ".bvh", "csv": ".csv", "amass": ".npz"}
 """Formats and their file name endings. Only `npz` stores many clips in one file."""
@@ -89,11 +89,11 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
 def _staged(out: Path) -> Iterator[Path]:
     """Yield a temporary path for a file or folder; its files are moved to their final place once all are complete."""
     folder = out.parent if out.suffix else out
-    with files.made(folder):
+    with files.create_folder(folder):
         files.remove_leftovers(folder)
         with TemporaryDirectory(prefix=files.temporary(), dir=folder, ignore_cleanup_errors=True) as name:
             stage = Path(name)
-            with files.naming(folder, stage):
+            with files.with_path(folder, stage):
                 yield stage / out.name if out.suffix else stage
                 for file in [file for file in stage.rglob("*") if file.is_file()]:
                     place = folder / file.relative_to(stage)
@@ -120,7 +120,7 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
         return
     recording = Recording(skeleton.names, skeleton.parents, clip.positions, clip.rotations, up=skeleton.up)
     if skeleton.up != "y":  # animation programs expect y up
-        recording = upwards(recording, "y")
+        recording = rotate_up(recording, "y")
     assert recording.rotations is not None
     names: list[str] = []
     for name in skeleton.names:
@@ -197,7 +197,7 @@ def convert(
     if len(set(keys)) < len(keys):
         twice = next(key for key in keys if keys.count(key) > 1)
         raise ValueError(f"two files are clip {'/'.join(twice)}; put them into folders of different names")
-    world = understand(sampled(files, skip_bad), metres, up)
+    world = infer_world(sampled(files, skip_bad), metres, up)
     reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, resampled=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
 
@@ -228,7 +228,7 @@ def convert(
             if not out.suffix:
                 write_labels(stage / LABELS, known, out / LABELS)
     left = f"; {len(skipped)} skipped, the first: {skipped[0]}" if skipped else ""
-    return f"{len(files) - len(skipped)} clips; read as {collected.said(world)}{left}"
+    return f"{len(files) - len(skipped)} clips; read as {collected.interpretation(world)}{left}"
 
 
 def _told(source: Path, several: bool) -> list[File]:

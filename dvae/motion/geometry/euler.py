@@ -43,13 +43,13 @@ from ...data.views import Views
 from ...inference.evaluation.evaluate import evaluate
 from ...inference.evaluation.evaluation import Evaluation
 from ...inference.evaluation.scores import Measure
+from ...locking import serialized
 from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting
-from ...turns import alone
 from ..data.protocols import Windows
 from . import kinematics
 from .rotations import from_matrix, to_matrix
-from .views import TURNS, Rotations
+from .views import ROTATIONS, Rotations
 
 TIMES = (80, 160, 320, 400, 560, 1000)
 """Milliseconds."""
@@ -156,7 +156,7 @@ class Angles:
         frames = [now, *(now + frame for frame in self.protocol.frames)]
         if self.protocol.inverse:
             return torch.cat([self.found(x[:, frames]) for x in self._batch[WHOLE].split(512)])
-        turns = self._batch.beside[TURNS][:, frames].unflatten(-1, (-1, 4))[..., self.joints, :]
+        turns = self._batch.view_inputs[ROTATIONS][:, frames].unflatten(-1, (-1, 4))[..., self.joints, :]
         return self.of(to_matrix(turns, "quaternion"))
 
     def found(self, x: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ class Angles:
         return from_matrix(turns, FORM).flatten(-2)
 
 
-class Angled(nn.Module):
+class AngleModel(nn.Module):
     """Adapter that turns a model of motion into a model of angles, for `evaluate`.
 
     Args:
@@ -204,7 +204,7 @@ class Angled(nn.Module):
         """Return {"x": (S, B, times, A)}, the angles at all times; the horizon equals their number."""
         frames, inverse = self.angles.protocol.frames, self.angles.protocol.inverse
         places, last, made = [frame - 1 for frame in frames], max(frames), _Made()
-        with alone, made:  # in one chunk, so that `_Made` sees all draws
+        with serialized, made:  # in one chunk, so that `_Made` sees all draws
             at_once = {} if inverse else {"chunk": 2**62}
             futures = self.model.forecast(batch[MOTION], last, samples, **options, **at_once)[WHOLE]
         if inverse:
@@ -262,7 +262,7 @@ def euler_errors(
         raise ValueError(f"the best is of at least one future, got {list(counts)}")
     angles = Angles(windows, times, inverse)
     return evaluate(
-        {name: Angled(model, angles) for name, model in models.items()},
+        {name: AngleModel(model, angles) for name, model in models.items()},
         angles,
         scores=lambda _: _measures(angles, counts),
         samples=max(counts),

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...constants import indices
-from .rotations import across, procrustes
+from .rotations import perpendicular, procrustes
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 TIE = 1e-6
@@ -104,7 +104,7 @@ def swing(start: Tensor, end: Tensor) -> Tensor:
     middle = start + end
     # below this, rounding dominates
     opposite = middle.norm(dim=-1, keepdim=True) < torch.finfo(middle.dtype).eps ** 0.5
-    middle = torch.nn.functional.normalize(torch.where(opposite, across(start), middle), dim=-1)
+    middle = torch.nn.functional.normalize(torch.where(opposite, perpendicular(start), middle), dim=-1)
     return _half_turn(middle) @ _half_turn(start)
 
 

@@ -79,7 +79,7 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
             apart = (second - (axis * second).sum(-1, keepdim=True) * axis).norm(dim=-1, keepdim=True)
             along = apart <= (shortest**0.5 * second.norm(dim=-1, keepdim=True)).clamp(shortest)
         if along.any():
-            second = torch.where(along, across(torch.nn.functional.normalize(first, dim=-1)), second)
+            second = torch.where(along, perpendicular(torch.nn.functional.normalize(first, dim=-1)), second)
         return roma.special_gramschmidt(torch.stack([first, second], -1))
     return roma.euler_to_rotmat(form.removeprefix("euler-").upper(), values)
 
@@ -167,7 +167,7 @@ def _unwrapped(vectors: Tensor) -> Tensor:
     return torch.stack(found, -3)
 
 
-def across(vectors: Tensor) -> Tensor:
+def perpendicular(vectors: Tensor) -> Tensor:
     """Return unit vectors perpendicular to unit vectors (..., 3), near the axis of their smallest component."""
     least = torch.nn.functional.one_hot(vectors.abs().argmin(-1), 3).to(vectors)
     return torch.nn.functional.normalize(least - (least * vectors).sum(-1, keepdim=True) * vectors, dim=-1)

@@ -409,7 +409,7 @@ class Skeleton:
             fields["bone_lengths_m"] = [0.0 if parent == -1 else next(lengths) for parent in self.parents]
         if self.rest:
             fields["rest_m"] = self.rest
-        with files.written(path) as file:
+        with files.atomic_write(path) as file:
             file.write((json.dumps(fields, indent=2) + "\n").encode())
 
 

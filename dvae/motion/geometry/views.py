@@ -21,8 +21,8 @@ HEADING = "heading"
 """Name in batches of the angles (B,) by which windows were rotated, in radians."""
 LENGTHS = "bone_lengths"
 """Name in batches of the bone lengths (B, J - 1) of windows, in metres, in the order of `Skeleton.edges`."""
-TURNS = "turns"
-"""Name in `Batch.beside` of the rotations (B, T, 4 J) of all joints, as concatenated quaternions w x y z."""
+ROTATIONS = "rotations"
+"""Name in `Batch.view_inputs` of the rotations (B, T, 4 J) of all joints, as concatenated quaternions w x y z."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class Heading(View):
     names = (HEADING,)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         source = self.pose or WHOLE
-        found = None if beside is None else beside.get(HEADING)
-        if HEADING in data or (source not in data if beside is None else found is None):
+        found = None if view_inputs is None else view_inputs.get(HEADING)
+        if HEADING in data or (source not in data if view_inputs is None else found is None):
             return data
         seen = Batch(data)
         for name, mask in data.masks().items():
@@ -151,7 +151,7 @@ class Bones(View):
     names = (LENGTHS,)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         held = {name: places for name, places in self.pieces.items() if name in data}
         if LENGTHS in data or (WHOLE not in data and not held):
             return data
@@ -160,7 +160,7 @@ class Bones(View):
         limbs = self.skeleton.limbs(x)
         seen = self._rooted(limbs * inverse_lengths(limbs)[..., None], x)
         found = self._named(data, seen)
-        if beside is not None:
+        if view_inputs is not None:
             return found
         return found | {LENGTHS: self._mean(limbs[:, : self.frames].norm(dim=-1), data.lengths)}
 
@@ -284,7 +284,7 @@ class Rotations(View):
         return 3 * self.root + size(self.form) * len(self.turning)
 
     @override
-    def __call__(self, data: Batch, beside: Batch | None = None) -> Batch:
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         seen = Batch(data)
         if WHOLE not in data or LENGTHS in data:
             return seen
@@ -300,7 +300,7 @@ class Rotations(View):
                 "positions, which may be masked"
             )
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
-        turns = data.beside.get(TURNS)
+        turns = data.view_inputs.get(ROTATIONS)
         if turns is None:
             matrices = kinematics.inverse(skeleton, positions, constant(self._offsets, x))[..., self.turning, :, :]
             found = in_time(matrices, self.form)
@@ -309,7 +309,7 @@ class Rotations(View):
             found = in_time(turns.index_select(-2, indices(self.turning, turns)).to(x), self.form, "quaternion")
         place = [positions[..., skeleton.root, :]] if self.root else []
         seen[WHOLE] = torch.cat([*place, found.flatten(-2)], -1)
-        seen[LENGTHS] = (beside or Batch()).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
+        seen[LENGTHS] = (view_inputs or Batch()).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
         return seen
 
     @override

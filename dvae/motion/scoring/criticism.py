@@ -13,15 +13,15 @@ from torch import Tensor
 from ...data.sequences import mean_of_known
 from ...inference.diagnostics.checks import Statistic, variance
 from ...inference.diagnostics.traversal import Traversal
-from ...inference.evaluation.result import canvas
-from ..data.exchange import Exchanged
+from ...inference.evaluation.result import new_figure
+from ..data.exchange import ExchangedWindows
 from ..data.protocols import Windows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
+def statistics(windows: Windows | ExchangedWindows) -> dict[str, Statistic]:
     """Return the statistics of motion for predictive checks.
 
     * speed: mean over frames and joints, by first differences.
@@ -65,7 +65,7 @@ def statistics(windows: Windows | Exchanged) -> dict[str, Statistic]:
 
 
 def draw_traversal(
-    found: Traversal, windows: Windows | Exchanged, frame: int = -1, sequence: int = 0, rows: int = 6
+    found: Traversal, windows: Windows | ExchangedWindows, frame: int = -1, sequence: int = 0, rows: int = 6
 ) -> Figure:
     """Draw poses of one sequence at one frame, one row per latent coordinate, the one with the largest effect first.
 
@@ -76,22 +76,22 @@ def draw_traversal(
         sequence: index of the sequence in the batch.
         rows: number of coordinates to draw.
     """
-    from ..drawing.plot import SPACING, bare, facing, pose
+    from ..drawing.plot import SPACING, final_heading, hide_axes, pose
 
     order = found.effect.argsort(descending=True, stable=True)[:rows]
     skeleton = windows.skeleton
     poses = windows.positions(found.frames[order, :, sequence])[:, :, frame].double().cpu()
     poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
     middle = int(found.offsets.abs().argmin())
-    azimuth = math.pi / 5 - facing(skeleton, poses[0, middle : middle + 1])
-    figure = canvas(0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
+    azimuth = math.pi / 5 - final_heading(skeleton, poses[0, middle : middle + 1])
+    figure = new_figure(0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
     panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     for panel, chosen, row in zip(panels, order.tolist(), poses, strict=True):
         for column, drawn in enumerate(row):
             at = (column * SPACING, 0.0)
             pose(panel, row[middle], skeleton, at=at, azimuth=azimuth, colors="0.8", linewidths=1.6)
             pose(panel, drawn, skeleton, at=at, azimuth=azimuth, colors="C0", linewidths=1.4)
-        bare(panel)
+        hide_axes(panel)
         moved = f"{found.latent}[{found.coordinates[chosen]}], which moves x by {float(found.effect[chosen]):.2g} m"
         panel.set_title(moved, loc="left", fontsize=8)
         panel.tick_params(labelsize=8)

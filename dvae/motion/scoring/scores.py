@@ -51,11 +51,11 @@ from torch import Tensor, nn
 
 from ...constants import indices
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, bridged, mean_of_known
+from ...data.sequences import HeldOutWindows, interpolate_missing, mean_of_known
 from ...inference.evaluation import metrics
-from ...inference.evaluation.held import clip_places, on_device_of, reproducibly
+from ...inference.evaluation.evaluation_windows import clip_index, on_device_of, seeded_evaluation
 from ...inference.evaluation.scores import ENERGY, VARIOGRAM, Measure, means_of_those_that_count, paired
-from ..data.exchange import Exchanged
+from ..data.exchange import ExchangedWindows
 from ..data.protocols import Windows
 from ..geometry.skeleton import SHORTEST, Skeleton
 from .energies import pose_prior_energy
@@ -96,7 +96,7 @@ def scores(
         ValueError: the skeleton, frames or labels of the windows do not match a classifier; there are too few windows
             for normal fits to its features; or the observed frames do not match the pose prior.
     """
-    if not isinstance(windows, Windows | Exchanged):
+    if not isinstance(windows, Windows | ExchangedWindows):
         raise TypeError(
             f"scores of motion need windows of dvae.motion, which have a skeleton, not {type(windows).__name__}; for "
             "errors in metres alone take dvae.motion.displacements"
@@ -155,7 +155,7 @@ def displacements(
         return metrics.energy_score(forecasts, truth, None if truth.isnan().any() else diversity(forecasts))
 
     apd = Measure("APD", lambda forecasts, *_: diversity(forecasts), "m", "higher")
-    several = [] if isinstance(windows, Exchanged) else _multimodal(windows, body, diversity, threshold)
+    several = [] if isinstance(windows, ExchangedWindows) else _multimodal(windows, body, diversity, threshold)
     proper = [replace(ENERGY, function=energy), VARIOGRAM]
     return list(map(of_body, [apd, _ADE, _FDE, *several[:2], *_MEDIAN, *several[2:], *proper]))
 
@@ -231,7 +231,7 @@ def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
     return body
 
 
-def _path_error(windows: Windows | Exchanged) -> Measure:
+def _path_error(windows: Windows | ExchangedWindows) -> Measure:
     places = [windows.joints.index(name) for name in windows.given_joints or ()]
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
@@ -243,7 +243,7 @@ def _path_error(windows: Windows | Exchanged) -> Measure:
     return Measure("path error", function, "m")
 
 
-def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
+def _bones(windows: Windows | ExchangedWindows) -> tuple[list[int], str]:
     """Return the bones with a length in every window, as indices into `Skeleton.edges`, and a note on the others."""
     lengths = mean_of_known(windows.skeleton.bone_lengths(windows.positions(Batch(windows.all()).mask_to_nan())), 1)
     short = (lengths < SHORTEST).any(0)
@@ -251,7 +251,7 @@ def _bones(windows: Windows | Exchanged) -> tuple[list[int], str]:
     return (~short).nonzero()[:, 0].tolist(), note if short.any() else ""
 
 
-def _limbs(windows: Windows | Exchanged, bones: list[int], note: str) -> list[Measure]:
+def _limbs(windows: Windows | ExchangedWindows, bones: list[int], note: str) -> list[Measure]:
     """Return errors of bone lengths, stretch and jitter of limbs, and errors of the angles between them."""
     skeleton = windows.skeleton
 
@@ -328,7 +328,7 @@ def _cross(first: Tensor, second: Tensor) -> Tensor:
     return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
-def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
+def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
     """Return the CMD, computed class by class."""
     label = "content"
     try:
@@ -360,7 +360,7 @@ def _cumulative_motion(windows: Windows | Exchanged) -> Measure:
     )
 
 
-def _jerk(windows: Windows | Exchanged) -> Measure:
+def _jerk(windows: Windows | ExchangedWindows) -> Measure:
     """Return the jerk, including the transition from the observed frames."""
     body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
     start = max(windows.protocol.observed - SEAM, 0)
@@ -394,14 +394,14 @@ def _pose_nll(prior: Any, observed: int) -> Measure:
 
     @torch.no_grad()
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        seen = bridged(past["x"], past.mask())[:, None].expand(-1, forecasts.shape[1], -1, -1)
+        seen = interpolate_missing(past["x"], past.mask())[:, None].expand(-1, forecasts.shape[1], -1, -1)
         motion = prior.facing(torch.cat([seen, forecasts], 2))[:, :, observed:]
         return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
 
     return Measure("pose NLL", function, "nats", basis={"pose prior": _hash(prior)})
 
 
-def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[Measure | None, Measure]:
+def _judged(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> tuple[Measure | None, Measure]:
     """Return the ACC, if the class of some window is known, and the FID."""
     if windows.missing:
         raise ValueError(
@@ -419,7 +419,7 @@ def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[M
 
     @lru_cache(maxsize=1)  # shared by both scores of a batch
     def features(futures: Tensor) -> Tensor:
-        with reproducibly(classifier, 0):
+        with seeded_evaluation(classifier, 0):
             found: Tensor = classifier.features(on_device_of(classifier, {"x": futures})["x"])
             return found
 
@@ -440,7 +440,7 @@ def _judged(name: str, classifier: Any, windows: Windows | Exchanged) -> tuple[M
     return Measure(f"ACC {name}", accuracy, "share", "higher", partial=True, **shared) if known else None, distance
 
 
-def _labels(name: str, classifier: Any, windows: Windows | Exchanged) -> list[str]:
+def _labels(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> list[str]:
     """Return the true labels of windows that match a classifier.
 
     Raises:
@@ -458,7 +458,7 @@ def _labels(name: str, classifier: Any, windows: Windows | Exchanged) -> list[st
             f"the classifier {name} was fitted to {fitted[0]} predicted frames at {fitted[1]:g} fps; these windows "
             f"have {asked[0]} at {asked[1]:g}"
         )
-    clips = clip_places(windows.keys).bincount()
+    clips = clip_index(windows.keys).bincount()
     if len(windows.keys) - (int(clips.max()) if len(clips) > 1 else 0) < 2:
         raise ValueError(
             f"FID {name} needs normal fits to the features of at least two windows, also without any one clip; these "

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ...data.batch import Batch
-from ...data.sequences import bridged
+from ...data.sequences import interpolate_missing
 from ..data.protocols import Windows
 from ..geometry.views import Heading
 
@@ -79,7 +79,7 @@ class PseudoTruths:
         self._chains = torch.linalg.inv(self._limbs).round()
 
         listed = windows.all(stride)
-        x = bridged(listed["x"], listed.mask())[:, self._observed - 1 :]
+        x = interpolate_missing(listed["x"], listed.mask())[:, self._observed - 1 :]
         self._average = self._lengths(x[:, 0].unflatten(-1, (-1, 3))).mean(0)
         self._last = torch.empty(len(x), len(nodes) * 3)
         self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # products and sums run along rows
@@ -198,7 +198,7 @@ class WithPseudoTruths:
             missing, also "mask"; missing values are interpolated before the search for futures.
         """
         batch = self.windows.sample(batch_size, generator)
-        x = bridged(batch["x"], batch.mask())
+        x = interpolate_missing(batch["x"], batch.mask())
         x = self.truths.turn(x) if self.truths.heading else x
         pseudo, valid = self.truths.of(x, generator)
         return batch | {"x": x, "pseudo": pseudo, "valid": valid}

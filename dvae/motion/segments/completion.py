@@ -39,7 +39,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from ...inference.bounds.elbo import ImportanceBound
+from ...inference.bounds.elbo import IWAEBound
 from ...inference.diagnostics.posteriors import Descent, Posterior, posterior
 from ...options import Positive, check
 from ...program.conditional import evaluating, like
@@ -135,8 +135,10 @@ class SegmentCompletion:
         if self.known is None or not self.aggregate:
             return _standard(self.model.sizes[LATENT], like(self.model))
         with torch.no_grad(), pyro.poutine.block():  # hides the inner program
-            law = self.model.posterior(self.known)
-        return dist.MultivariateNormal(law.mean.mean(0), _shrunk(law.mean, law.variance.mean(0)))
+            distribution = self.model.posterior(self.known)
+        return dist.MultivariateNormal(
+            distribution.mean.mean(0), _shrunk(distribution.mean, distribution.variance.mean(0))
+        )
 
     @torch.no_grad()
     def away(self, seen: Mapping[str, Any], z: Tensor, shape: Tensor) -> dict[str, Tensor]:
@@ -255,7 +257,7 @@ class Completed:
         """The model that decodes the segments."""
         return self.program.model
 
-    def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> ImportanceBound:
+    def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> IWAEBound:
         """Return the log evidence of the observations, and k-hat, by `Posterior.evidence`."""
         with evaluating(self.model):
             return self.posterior.evidence(self.program, self.seen, particles, seed=seed, chunk=chunk)
@@ -314,7 +316,7 @@ def complete(
     return Completed(program, data, found)
 
 
-def glimpsed(
+def simulate_observations(
     model: Any,
     x: Tensor,
     shape: Tensor,
@@ -360,13 +362,13 @@ def glimpsed(
     else:
         found = model.body(shape, rotations, places)[0]
         if kind == POINTS:
-            found = scanned(found, model.body.faces, points, generator)
+            found = sample_surfaces(found, model.body.faces, points, generator)
     kept = torch.rand(found.shape[:-1], generator=generator) >= (0.0 if kind == SURFACES else gaps)
     kept &= next(iter(seen.values())).isfinite()[..., None]
     return {**seen, kind: torch.where(kept[..., None], found, torch.nan)}
 
 
-def scanned(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:
+def sample_surfaces(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:
     """Draw points (..., M, 3) uniformly from surfaces (..., V, 3)."""
     first, second, third = (vertices[..., corner, :] for corner in faces.unbind(-1))
     area = (second - first).cross(third - first, dim=-1).norm(dim=-1)

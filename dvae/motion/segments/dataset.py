@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from ...options import Amount, check, nearest
-from ..bodies import fitted, human
+from ..bodies import fit_to_body, human
 from ..data.clips import Clip, MotionSet
 from ..data.dataset import SIMULATED
 from ..data.protocols import held_out
@@ -29,13 +29,13 @@ VALIDATION = 0.1
 """Fraction of the training takes held out for validation."""
 
 
-def thinned(clips: Sequence[Clip], many: int) -> list[Clip]:
+def subsample_clips(clips: Sequence[Clip], many: int) -> list[Clip]:
     """Return at most `many` evenly spaced clips."""
     return [clips[n] for n in np.linspace(0, len(clips) - 1, min(many, len(clips))).round().astype(int)]
 
 
 @dataclass(frozen=True)
-class Takes:
+class SegmentSource:
     """Record of where segments were read.
 
     Args:
@@ -75,8 +75,8 @@ class SegmentData:
     """
 
     kind: ClassVar[str] = "segments"
-    described: ClassVar[str] = SegmentSchema.kind
-    source: ClassVar[type[Takes]] = Takes
+    schema_kind: ClassVar[str] = SegmentSchema.kind
+    source: ClassVar[type[SegmentSource]] = SegmentSource
     onto: ClassVar[bool] = False
     """Always False: all motion is fitted to the body, never mapped to the skeleton of a run."""
 
@@ -126,7 +126,7 @@ class SegmentData:
     @property
     def schema(self) -> SegmentSchema:
         """Schema of the segments for models."""
-        return SegmentSchema.under(self.timed, human())
+        return SegmentSchema.from_data(self.timed, human())
 
     @cached_property
     def segments(self) -> MotionSet:
@@ -145,7 +145,7 @@ class SegmentData:
                 "it is; cut='gait' finds the gait cycles of longer ones"
             )
         marked = [replace(clip, labels={**clip.labels, "source": clip.name}) for clip in kept]
-        return fitted(replace(self.motion, clips=marked), human())
+        return fit_to_body(replace(self.motion, clips=marked), human())
 
     @cached_property
     def timed(self) -> TimedFrames:
@@ -186,12 +186,12 @@ class SegmentData:
             )
         return Segments(replace(self.segments, clips=clips), self.timed)
 
-    def recorded(self) -> Takes:
+    def recorded(self) -> SegmentSource:
         """Return the record of these data that `reopened` reads."""
-        return Takes(self.path, self.fingerprint, self.cut, self.skip_bad, self.bodies)
+        return SegmentSource(self.path, self.fingerprint, self.cut, self.skip_bad, self.bodies)
 
     @classmethod
-    def reopened(cls, source: Takes, schema: SegmentSchema, path: str | os.PathLike[str] | None = None) -> Self:
+    def reopened(cls, source: SegmentSource, schema: SegmentSchema, path: str | os.PathLike[str] | None = None) -> Self:
         """Open recorded data again, from the recorded path or from another one, in the representation of a run.
 
         The content may have changed.
@@ -219,7 +219,7 @@ class SegmentData:
 
     @cached_property
     def _embodied(self) -> MotionSet:
-        return fitted(self.motion, human())
+        return fit_to_body(self.motion, human())
 
     def _of(self, split: str) -> MotionSet:
         if split not in ("train", "validation", "test"):

@@ -21,7 +21,7 @@ from ...data.schema import Schema
 from ...data.views import Parts
 from ...options import tuples
 from ..bodies import Body, human, shapes_of
-from ..bodies.fitting import MOST, standing
+from ..bodies.fitting import MOST, standing_heights
 from ..data.clips import MotionSet
 from ..geometry.skeleton import Skeleton, brief
 from ..geometry.views import HEADING
@@ -45,7 +45,7 @@ class SegmentSchema(Schema):
     timed: TimedFrames = field(kw_only=True)
 
     @classmethod
-    def under(cls, timed: TimedFrames, body: Body) -> Self:
+    def from_data(cls, timed: TimedFrames, body: Body) -> Self:
         """Return the schema for these frames and for the shape parameters of a body."""
         sizes = {name: len(places) for name, places in timed.parts.items()}
         return cls({**sizes, SHAPE: body.parameters_of_shape}, timed.frames, timed=timed)
@@ -75,7 +75,7 @@ class SegmentSchema(Schema):
         skeleton = Skeleton(**tuples(timed.pop("skeleton")))
         if (skeleton.names, skeleton.parents, skeleton.up) != (body.names, body.parents, "y"):
             raise ValueError(f"timed.skeleton is not that of the body that ships, {', '.join(body.names)} with y up")
-        found = cls.under(TimedFrames(skeleton, references=references, **tuples(timed)), body)
+        found = cls.from_data(TimedFrames(skeleton, references=references, **tuples(timed)), body)
         if config["sizes"] != found.sizes:
             raise ValueError(f"sizes are {brief(config['sizes'])}, and such segments have {found.sizes}")
         return found
@@ -93,12 +93,12 @@ class Segments:
     """Segments in the representation of a model: training data that draw batches, or test data.
 
     Args:
-        motion: segments on the joints of the body, each a clip, e.g. from `bodies.fitted` and `gait_cycles`.
+        motion: segments on the joints of the body, each a clip, e.g. from `bodies.fit_to_body` and `gait_cycles`.
         timed: conversion to frames; for test data, the one of the training data.
         body: body with these joints; default: the bundled person.
         seen: result of `timed` for these segments, if known.
         bodies: standard deviation of the shape parameters that `sample` draws in place of the segments' own; 0 keeps
-            their own. Root positions scale with the length of the legs, as in `bodies.retargeted`. A model trained on
+            their own. Root positions scale with the length of the legs, as in `bodies.retarget`. A model trained on
             few bodies does not generalise to others.
 
     Raises:
@@ -134,13 +134,13 @@ class Segments:
         if not self.bodies:
             return batch
         drawn = self.bodies * torch.randn(batch[SHAPE].shape, generator=generator)
-        return self.on(batch, drawn.clamp(-MOST, MOST))
+        return self.on_bodies(batch, drawn.clamp(-MOST, MOST))
 
-    def on(self, batch: Mapping[str, Any], shape: Tensor) -> Mapping[str, Any]:
+    def on_bodies(self, batch: Mapping[str, Any], shape: Tensor) -> Mapping[str, Any]:
         """Return the same rotations and times on bodies (B, S); root positions scale with the length of the legs."""
-        legs = [standing(self.body, shapes).to(shape) for shapes in (batch[SHAPE], shape)]
+        legs = [standing_heights(self.body, shapes).to(shape) for shapes in (batch[SHAPE], shape)]
         x = batch[WHOLE].clone()
-        x[..., self.timed.parts["place"]] *= (legs[1] / legs[0])[:, None, None]
+        x[..., self.timed.parts["translation"]] *= (legs[1] / legs[0])[:, None, None]
         return {WHOLE: x, SHAPE: shape}
 
     @property
@@ -151,7 +151,7 @@ class Segments:
     @property
     def schema(self) -> SegmentSchema:
         """Schema of the segments for models."""
-        return SegmentSchema.under(self.timed, self.body)
+        return SegmentSchema.from_data(self.timed, self.body)
 
     @property
     def fingerprint(self) -> str:

@@ -142,7 +142,7 @@ class TimedFrames:
         found = made._found(motion)
         # in single precision, so that units do not depend on the last digits of a double
         x = made._scaled(found)[WHOLE]
-        metres = max(float(x[..., made.parts["place"]].abs().max()), 1e-3)
+        metres = max(float(x[..., made.parts["translation"]].abs().max()), 1e-3)
         made = replace(made, metres=metres, seconds=float(made.lasts(x[..., -1:].double()).max()))
         if scaling == "deviation":
             turns = made._turns(x.double()).flatten(-2).flatten(0, 1)
@@ -162,9 +162,9 @@ class TimedFrames:
 
     @property
     def parts(self) -> Mapping[str, list[int]]:
-        """Coordinates of a frame by part: turns (rotations, Theta), place (root position, Gamma), time (Phi)."""
+        """Coordinates of a frame by part: rotations (Theta), translation of the root (Gamma), time (Phi)."""
         turns = 6 * len(self.turning)
-        return {"turns": [*range(turns)], "place": [*range(turns, turns + 3)], "time": [turns + 3]}
+        return {"rotations": [*range(turns)], "translation": [*range(turns, turns + 3)], "time": [turns + 3]}
 
     def to(self, motion: MotionSet) -> dict[str, Any]:
         """Convert segments, each a clip, to time-stamped frames.

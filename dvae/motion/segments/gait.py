@@ -129,10 +129,12 @@ def gait_cycles(
             f"{motion.name or 'this motion'} has no gait cycle of {cycles.shortest:g} to {cycles.longest:g} s whose "
             f"hips are within {cycles.threshold:g} rad of the references; raise the threshold, if people walk in it"
         )
-    return MotionSet(found, motion.skeleton, f"{motion.name} cycles".strip(), copy=False, said=motion.said)
+    return MotionSet(
+        found, motion.skeleton, f"{motion.name} cycles".strip(), copy=False, interpretation=motion.interpretation
+    )
 
 
-def alike(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
+def on_common_joints(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
     """Return the motion of two sources on their common joints, to train on one and test on the other.
 
     Both get the same tree: the tree of the first without the joints that the second does not have. `MotionSet.loosened`
@@ -142,11 +144,11 @@ def alike(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
     Raises:
         ValueError: the common joints do not form a tree.
     """
-    from ..files.reading import chosen
+    from ..files.reading import select_joints
 
     shared = [name for name in first.skeleton.names if name in second.skeleton.names]
-    kept = chosen(first, shared)
-    both = kept, chosen(second, onto=replace(kept.skeleton, fps=second.skeleton.fps))
+    kept = select_joints(first, shared)
+    both = kept, select_joints(second, onto=replace(kept.skeleton, fps=second.skeleton.fps))
     marked = [
         replace(clip, split=f"{n}{clip.split}", rotations=None) for n, motion in enumerate(both) for clip in motion
     ]
@@ -155,7 +157,9 @@ def alike(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
     for n, motion in enumerate(both):
         clips = [replace(clip, split=clip.split[1:]) for clip in loose if clip.split[0] == str(n)]
         own = replace(loose.skeleton, fps=motion.skeleton.fps, name=motion.skeleton.name)
-        found.append(MotionSet(clips, own, motion.name, copy=False, skipped=motion.skipped, said=motion.said))
+        found.append(
+            MotionSet(clips, own, motion.name, copy=False, skipped=motion.skipped, interpretation=motion.interpretation)
+        )
     return found[0].with_rotations(), found[1].with_rotations()
 
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from ...data.batch import WHOLE
-from ...inference.evaluation.held import on_device_of, reproducibly
-from ...inference.evaluation.result import Table, as_they_are, canvas
+from ...inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
+from ...inference.evaluation.result import Table, literal_text, new_figure
 from ..bodies import Body
 from ..data.clips import MotionSet
 from .embodied import SHAPE, surfaces_of
@@ -135,7 +135,7 @@ def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any],
             f"expected at least 2 steps between as many segments as others, got {steps} between {len(first[WHOLE])} "
             f"and {len(second[WHOLE])}"
         )
-    with reproducibly(model, 0):
+    with seeded_evaluation(model, 0):
         ends = [on_device_of(model, batch) for batch in (first, second)]
         latents = [model.encode(batch) for batch in ends]
         shares = torch.linspace(0, 1, steps).to(latents[0])
@@ -147,7 +147,7 @@ def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any],
 
 
 @torch.no_grad()
-def transferred(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
+def transfer(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
     """Return the motion of segments on other bodies: their z with another beta.
 
     Args:
@@ -158,7 +158,7 @@ def transferred(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
     Returns:
         x (B, N, D).
     """
-    with reproducibly(model, 0):
+    with seeded_evaluation(model, 0):
         seen = on_device_of(model, batch)
         found: Tensor = model.decode(model.encode(seen), shape.to(seen[SHAPE]))
         return found
@@ -184,7 +184,7 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
     Raises:
         ValueError: there are too few segments, another number of labels, or too many distinct labels.
     """
-    with reproducibly(model, 0):
+    with seeded_evaluation(model, 0):
         means = model.encode(on_device_of(model, batch)).double().cpu()
     if len(means) < 3 or len(labels) != len(means):
         raise ValueError(f"expected at least 3 segments and a label of each, got {len(means)} and {len(labels)}")
@@ -195,7 +195,7 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
     _, spread, axes = torch.linalg.svd(away, full_matrices=False)
     places, shares = (away @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()
     columns = -(-len(names) // 20)
-    figure = canvas(5.0 + 1.3 * columns, 4.2)
+    figure = new_figure(5.0 + 1.3 * columns, 4.2)
     panel = figure.subplots()
     for n, name in enumerate(names):
         first, second = places[np.array([label == name for label in labels]), :2].T
@@ -204,5 +204,5 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
     panel.set_xlabel(f"first axis of z, {shares[0]:.0%} of variance")
     panel.set_ylabel(f"second axis, {shares[1]:.0%}")
     panel.set_aspect("equal", "datalim")
-    as_they_are(figure.legend(loc="outside right upper", fontsize=7, ncols=columns).get_texts())
+    literal_text(figure.legend(loc="outside right upper", fontsize=7, ncols=columns).get_texts())
     return figure

@@ -20,13 +20,13 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import WHOLE, Batch
-from ...inference.bounds.elbo import SequenceELBO, importance_bound
+from ...inference.bounds.elbo import SequenceELBO, iwae_bound
+from ...inference.evaluation.estimates import clustered_variance, linearised
 from ...inference.evaluation.evaluation import ARROWS, Score
-from ...inference.evaluation.held import clip_places, on_device_of, reproducibly
+from ...inference.evaluation.evaluation_windows import clip_index, on_device_of, seeded_evaluation
 from ...inference.evaluation.record import MODELS, Dims
-from ...inference.evaluation.result import Result, Table, as_they_are, canvas, progress_bar
+from ...inference.evaluation.result import Result, Table, literal_text, new_figure, progress_bar
 from ...inference.evaluation.scores import TEACHER_FORCED, Metric, clip_means
-from ...inference.evaluation.uncertainty import clustered_variance, linearised
 from ...options import nearest
 from ..bodies import vertex_error
 from .embodied import SHAPE, Segments, SegmentSchema, surfaces_of
@@ -88,11 +88,11 @@ class Reconstruction(Result):
 
     def plot(self) -> Figure:
         """Draw Tukey's box plots of vertex errors: quartiles, whiskers to 1.5 interquartile ranges, and outliers."""
-        figure = canvas(1.6 + 1.2 * len(self.rows), 3.4)
+        figure = new_figure(1.6 + 1.2 * len(self.rows), 3.4)
         axes = figure.subplots()
         axes.boxplot([row[ERROR] for row in self.rows.values()], widths=0.6, flierprops={"markersize": 2})
         axes.set_xticks(range(1, len(self.rows) + 1), list(self.rows), fontsize=8)
-        as_they_are(axes.get_xticklabels())
+        literal_text(axes.get_xticklabels())
         axes.set_ylim(bottom=0)
         axes.set_ylabel("vertex error (mm)")
         axes.set_title(f"{len(self.segments)} segments", fontsize=9)
@@ -120,7 +120,7 @@ class Reconstruction(Result):
         return self.rows[row]
 
     def _score(self, values: np.ndarray) -> Score:
-        places = clip_places([(split, take, 0) for split, _, take in self.segments])
+        places = clip_index([(split, take, 0) for split, _, take in self.segments])
         mean, deviations = linearised(np.array(clip_means(torch.from_numpy(values), places)), places.bincount().numpy())
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
@@ -211,7 +211,7 @@ def reconstruct_segments(
 
         for name, model in models.items():
             held = seen.by(model.timed)
-            with reproducibly(model, seed):
+            with seeded_evaluation(model, seed):
                 score(name, held, partial(_scores, model, held, bound_particles))
             size = model.sizes["z"] + held.schema.size(SHAPE)
             if remembered is None or (key := (_key(model.timed), size)) in linear:
@@ -250,8 +250,8 @@ def _scores(model: Any, held: Segments, particles: int, batch: Mapping[str, Any]
     terms = SequenceELBO().terms(model, seen)
     found["ELBO"] = terms.per_frame
     if particles:
-        weighted = importance_bound(model, seen, particles=particles)
-        found |= {"importance bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
+        weighted = iwae_bound(model, seen, particles=particles)
+        found |= {"IWAE bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
     return found
 
 

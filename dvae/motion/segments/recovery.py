@@ -16,7 +16,7 @@ from rich.console import Group
 from torch import Tensor
 
 from ...data.batch import WHOLE
-from ...data.npy import Refused
+from ...data.npy import NpyError
 from ...inference.diagnostics.posteriors import Descent
 from ...inference.evaluation.result import Table
 from ...options import nearest
@@ -212,9 +212,11 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     with archive(path) as members:
         if unknown := [name for name in members if name not in known]:
             meant = nearest(unknown[0], known)
-            raise Refused(f"{unknown[0]!r} is nothing that is seen{meant}; expected some of {', '.join(known)}")
+            raise NpyError(f"{unknown[0]!r} is nothing that is seen{meant}; expected some of {', '.join(known)}")
         if (size := sum(member.size for member in members.values())) > LARGEST:
-            raise Refused(f"it unpacks to {size:,} bytes, at most {LARGEST:,} are read; give fewer moments or segments")
+            raise NpyError(
+                f"it unpacks to {size:,} bytes, at most {LARGEST:,} are read; give fewer moments or segments"
+            )
         return {name: member.array() for name, member in members.items()}
 
 

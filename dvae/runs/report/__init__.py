@@ -1,8 +1,9 @@
-"""Reports: what is known of fitted runs, on one page that needs nothing else.
+"""Reports: all results of fitted runs on one self-contained page.
 
-`sections` are of any sequences; an application adds its own, as `dvae report` does with moving skeletons.
+`sections` contains the sections for any sequences. An application adds its own, as `dvae report` does with moving
+skeletons.
 """
 
-from .page import Section, document, lacking
+from .page import Section, document, missing_part
 
-__all__ = ["Section", "document", "lacking"]
+__all__ = ["Section", "document", "missing_part"]

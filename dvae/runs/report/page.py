@@ -1,8 +1,7 @@
-"""One HTML page in one file: what stands in it is text, tables and pictures, and a script that is known beforehand.
+"""One HTML page in one file, with text, tables, pictures and trusted scripts.
 
-Whatever is put into the page is escaped, unless it is `Markup`, which only this package and players of applications
-make. Should something slip through, the browser is told to load nothing from anywhere, and to run no script but those
-whose hashes the page names.
+All content is escaped, unless it is `Markup`, which only this package and players of applications create. As a second
+defence, a content security policy lets the browser load nothing and run only the scripts whose hashes the page lists.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ if TYPE_CHECKING:
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 DPI = 160
-"""Of pictures; their text is as large as that of the page."""
+"""Resolution of pictures, at which their text has the size of the page's text."""
 
 COLOURS = 64
-"""Of a picture."""
+"""Number of colours of a picture."""
 
-_SHRINK = 0.6  # how far a picture goes along with a narrow window, before it is to be scrolled
+_SHRINK = 0.6  # smallest scale of a picture in a narrow window, before it scrolls
 
 
 @dataclass(frozen=True)
@@ -39,10 +38,10 @@ class Section:
     """A part of the page.
 
     Args:
-        title: above it.
-        cells: run to what is shown of it; what several share is shown once.
-        about: how it is to be read, in a sentence or two.
-        before: what is shown of all runs together.
+        title: heading.
+        cells: {run: its content}; equal contents are shown once.
+        about: explanation of one or two sentences.
+        before: content for all runs together.
     """
 
     title: str
@@ -52,12 +51,12 @@ class Section:
 
 
 def document(title: str, sections: Sequence[Section], scripts: Sequence[str] = ()) -> str:
-    """The page.
+    """Return the page.
 
     Args:
-        title: of it.
-        sections: from top to bottom.
-        scripts: that it needs, which come from no run.
+        title: title of the page.
+        sections: sections from top to bottom.
+        scripts: scripts of the page, which must not come from a run.
     """
     hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     allowed = " ".join(f"'sha256-{each}'" for each in hashes) or "'none'"
@@ -111,22 +110,22 @@ def _section(number: int, section: Section) -> Markup:
 
 
 def paragraph(text: str) -> Markup:
-    """A paragraph."""
+    """Return a paragraph."""
     return Markup("<p>{}</p>").format(text)
 
 
-def lacking(text: str) -> Markup:
-    """What a run lacks, in a sentence."""
+def missing_part(text: str) -> Markup:
+    """Return a paragraph about a missing result."""
     return Markup('<p class="lacking">{}</p>').format(text)
 
 
 def command(*words: str) -> Markup:
-    """A command to type."""
+    """Return a command to type."""
     return Markup("<code>{}</code>").format(" ".join(words))
 
 
 def tabulated(shown: RenderableType) -> Markup:
-    """A rich table, or a group of them, with title and caption."""
+    """Return a rich table, or a group of them, with title and caption."""
     if isinstance(shown, Group):
         return Markup().join(map(tabulated, shown.renderables))
     assert isinstance(shown, rich.table.Table)
@@ -155,11 +154,11 @@ def _plain(cell: RenderableType) -> str:
 
 
 def picture(figure: Figure, about: str) -> Markup:
-    """A figure as a small PNG.
+    """Return a figure as a small PNG.
 
     Args:
-        figure: of matplotlib.
-        about: what it shows, for who does not see it.
+        figure: matplotlib figure.
+        about: alternative text.
     """
     from PIL import Image
 
@@ -176,6 +175,6 @@ def picture(figure: Figure, about: str) -> Markup:
     )
 
 
-def beside(*parts: Markup) -> Markup:
-    """Pictures beside each other, as many as there is room for."""
+def side_by_side(*parts: Markup) -> Markup:
+    """Return pictures in rows, as many per row as fit."""
     return Markup('<div class="pictures">{}</div>').format(Markup().join(parts))

@@ -1,6 +1,6 @@
-"""The parts of a report that hold for any sequences, from what lies in run directories and from held-out windows.
+"""Sections of a report for any sequences, from the files of run directories and from held-out windows.
 
-What a run lacks, and what is in a state that it cannot be shown, is said in a sentence with the command that makes it.
+For a missing or damaged result, the section shows a sentence with the command that computes it.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from ...factorization.graph import audit
 from ...inference.diagnostics.bracket import Bracket
 from ...inference.diagnostics.calibration import Calibration
 from ...inference.diagnostics.checks import PredictiveChecks
+from ...inference.diagnostics.reference_posterior import ReferencePosterior
 from ...inference.diagnostics.stein import SteinDiscrepancy
-from ...inference.diagnostics.yardstick import ReferencePosterior
 from ...inference.evaluation.compare import compare
 from ...inference.evaluation.comparison import KHAT, Comparison
-from ...inference.evaluation.conformal import Tubes
+from ...inference.evaluation.conformal import PredictionBands
 from ...inference.evaluation.evaluation import ARROWS, Evaluation
-from ...inference.evaluation.held import on_device_of, reproducibly
+from ...inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from ...inference.evaluation.record import plain
-from ...inference.evaluation.result import Table, as_they_are, canvas, progress_bar, reason
+from ...inference.evaluation.result import Table, error_message, literal_text, new_figure, progress_bar
 from ...inference.training.checkpoints import CheckpointError, Run
 from ...inference.training.fit import Fit
 from ...inference.training.trackers import JSONLines
@@ -43,40 +43,40 @@ from ...program.batch import repeat
 from ...program.protocols import Program
 from ..ablation import Ablation
 from ..directory import Loaded
-from .page import Section, beside, command, lacking, paragraph, picture, tabulated
+from .page import Section, command, missing_part, paragraph, picture, side_by_side, tabulated
 
 Runs = Mapping[str, Loaded]
-"""By what they are called."""
+"""Runs by name."""
 
 LARGEST = 2**24
-"""Bytes of a record that is shown."""
+"""Maximum size in bytes of a record that is shown."""
 
 PANEL = 3.0, 2.2
-"""Inches of a small picture: one is as wide as a telephone, two as half a page."""
+"""Width and height of a small picture in inches: one fits the width of a phone, two fit half a page."""
 
 MOST = 24
-"""Pictures of one kind."""
+"""Maximum number of pictures of one kind."""
 
 STEPS = 4
-"""Time steps of a graph."""
+"""Number of time steps of a graph."""
 
 GRAPH = 0.75
-"""Of its usual size, so that two have room beside each other."""
+"""Scale of a graph, at which two fit side by side."""
 
 DRAWS = 8
-"""Of the guide, for each window."""
+"""Number of draws from the guide for each window."""
 
 COORDINATES = 3
-"""Of a latent, that are drawn."""
+"""Maximum number of plotted coordinates of a latent."""
 
 
 @dataclass(frozen=True)
-class Few:
-    """Some of held-out windows, evenly spread, which are windows again.
+class SelectedWindows:
+    """Evenly spaced selection of held-out windows.
 
     Args:
-        windows: all of them.
-        most: how many at most.
+        windows: all windows.
+        most: maximum number of selected windows.
     """
 
     windows: HeldOutWindows
@@ -84,40 +84,40 @@ class Few:
 
     @property
     def chosen(self) -> list[int]:
-        """Which ones."""
+        """Numbers of the selected windows."""
         count = len(self.windows.keys)
         return np.unique(np.linspace(0, count - 1, min(self.most, count)).round().astype(int)).tolist()  # type: ignore[no-any-return]
 
     @property
     def protocol(self) -> Any:
-        """Of the windows."""
+        """Protocol of the windows."""
         return self.windows.protocol
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
-        """(split, clip, first frame) of each."""
+        """(split, clip, first frame) of each selected window."""
         return [self.windows.keys[n] for n in self.chosen]
 
     @property
     def fingerprint(self) -> str:
-        """Of the windows that they are taken from."""
+        """Fingerprint of all windows."""
         return self.windows.fingerprint
 
     @property
     def description(self) -> Mapping[str, Any]:
-        """Of the windows."""
+        """Description of the windows."""
         return self.windows.description
 
     def all(self) -> Batch:
-        """They, one in each row."""
+        """Return the selected windows, one in each row."""
         return Batch(self.windows.all()).rows(self.chosen)
 
 
-# ------------------------------------------------------------------------------------------ what a run directory says
+# ------------------------------------------------------------------------------- sections from files of run directories
 
 
 def overview(runs: Runs) -> Section:
-    """What was run, how far, and how good it is: a column for each run."""
+    """Return the section with facts and scores of the runs, a column for each run."""
     columns = {name: {**_facts(run), **_scores(run)} for name, run in runs.items()}
     shown = Table()
     for name in ("", *columns):
@@ -128,7 +128,7 @@ def overview(runs: Runs) -> Section:
 
 
 def equations(runs: Runs) -> Section:
-    """The two factorizations, where they come from, and the options."""
+    """Return the section with the two factorizations, their source, and the options."""
 
     def cell(run: Loaded) -> Markup:
         pair = (run.model.generative, run.model.inference)
@@ -147,62 +147,67 @@ def equations(runs: Runs) -> Section:
 
 
 def graphs(runs: Runs) -> Section:
-    """Both graphs unrolled, and what the guide misses."""
+    """Return the section with both unrolled graphs, and the dependencies that the guide ignores."""
 
     def cell(run: Loaded) -> Markup:
         model = run.model
         generative = _drawn(model.generative.draw(STEPS, observed=model.observed), "model")
         if not model.inference.factors:
-            why = "All that is latent is summed out" if model.summed else "Nothing is latent"
+            why = "All latents are summed out" if model.summed else "Nothing is latent"
             return generative + paragraph(f"{why}: there is no guide, and the bound is the log evidence.")
         found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed)
         return (
-            beside(generative, _drawn(found.draw(STEPS), "guide")) + paragraph(found.verdict) + tabulated(found.table())
+            side_by_side(generative, _drawn(found.draw(STEPS), "guide"))
+            + paragraph(found.verdict)
+            + tabulated(found.table())
         )
 
     about = (
-        "Latents are open, data shaded. Dashed red: what the exact posterior also reads; dotted: what is not needed."
+        "Latents are open, data shaded. Dashed red: dependencies of the exact posterior that the guide ignores. "
+        "Dotted: dependencies that are not needed."
     )
     return Section("Graph and audit", cells(runs, cell), about)
 
 
 def curves(runs: Runs) -> Section:
-    """Every term of the loss over the steps of the training."""
+    """Return the section with every term of the loss over the training steps."""
 
     def cell(run: Loaded) -> Markup:
         fit = _fit(run)
         if not fit.history:
-            return lacking("There is no log.jsonl in the run, which its training wrote: copy the run directory whole.")
+            return missing_part("The run has no log.jsonl, which training writes; copy the whole run directory.")
         names = {name for row in fit.history for name in row}
         order = ("bound", "loss", "log_likelihood/", "kl/", "energy/")
         kept = [name for start in order for name in sorted(names) if name.startswith(start)]
         more = paragraph(f"And {len(kept) - MOST} more terms.") if len(kept) > MOST else ""
-        return beside(*(_curve(fit, name) for name in kept[:MOST])) + more
+        return side_by_side(*(_curve(fit, name) for name in kept[:MOST])) + more
 
     about = "Grey: training batches. Blue: validation. Dotted: the step whose weights were kept."
     return Section("Learning curves", cells(runs, cell), about)
 
 
 def evaluated(runs: Runs) -> Section:
-    """The evaluation on test windows, beside the reference rows."""
+    """Return the section with scores on test windows, next to the reference rows."""
 
     def cell(run: Loaded) -> Markup:
         if (found := _evaluation(run)) is None:
             return _missing(run, "evaluation.json", "scores", "evaluate")
-        again = Markup("The run has changed since it was scored; score it anew with {}.").format(
+        again = Markup("The run has changed since it was scored; score it again with {}.").format(
             _command(run, "evaluate")
         )
         drawn = any("PIT" in row.histograms for row in found.rows.values())
         calibrated = picture(found.plot_calibration(), "calibration of forecasts") if drawn else ""
-        return tabulated(found.table()) + calibrated + (lacking(again) if _row(run, found) is None else "")
+        return tabulated(found.table()) + calibrated + (missing_part(again) if _row(run, found) is None else "")
 
     return Section(
-        "Scores", cells(runs, cell), "Of forecasts, and of bounds, on test windows; arrows say what is better."
+        "Scores",
+        cells(runs, cell),
+        "Scores of forecasts and bounds on test windows. Arrows show which direction is better.",
     )
 
 
 def calibration(runs: Runs) -> Section:
-    """Ranks of simulated latents among draws from the guide, and predictive checks."""
+    """Return the section with simulation-based calibration of the guide, and predictive checks."""
 
     def cell(run: Loaded) -> Markup:
         if (text := _record(run, "calibration.json")) is None:
@@ -212,18 +217,20 @@ def calibration(runs: Runs) -> Section:
             found = Calibration.of(document["calibration"])
             parts += [picture(found.plot(), found.verdict), tabulated(found.table())]
         else:
-            parts += [paragraph("The guide was not calibrated, as the model starts from given data.")]
+            parts += [
+                paragraph("The guide was not calibrated, because the model has no latents or conditions on data.")
+            ]
         if "predictive" in document:
             checks = PredictiveChecks.of(document["predictive"])
             parts += [picture(checks.plot(), "statistics of real and of replicated windows"), tabulated(checks.table())]
         return Markup().join(parts)
 
-    about = "Is the guide the model's posterior on the model's own data, and do replicated windows look like real ones?"
+    about = "Does the guide match the posterior on data simulated from the model, and do replicates match real windows?"
     return Section("Calibration and predictive checks", cells(runs, cell), about)
 
 
 def bracketed(runs: Runs) -> Section:
-    """The evidence between two bounds, and where the ELBO loses what it lacks."""
+    """Return the section with bounds of the evidence from both sides, and the decomposed gap of the ELBO."""
 
     def cell(run: Loaded) -> Markup:
         if (text := _record(run, "gap.json")) is None:
@@ -231,14 +238,12 @@ def bracketed(runs: Runs) -> Section:
         found = Bracket.from_json(text)
         return picture(found.plot(), "bounds of the evidence from both sides") + tabulated(found.table())
 
-    about = (
-        "How far the evidence lies above the bound that was trained, and how much of that a better guide would have."
-    )
+    about = "Distance of the evidence from the ELBO that was trained, and the part that a better guide would recover."
     return Section("Evidence from both sides", cells(runs, cell), about)
 
 
-def yardsticks(runs: Runs) -> Section:
-    """The guide beside reference posteriors of some windows."""
+def reference_posteriors(runs: Runs) -> Section:
+    """Return the section that compares the guide with reference posteriors of some windows."""
 
     def cell(run: Loaded) -> Markup:
         if (text := _record(run, "posterior.json")) is None:
@@ -251,35 +256,35 @@ def yardsticks(runs: Runs) -> Section:
             parts += picture(found.plot(), found.verdict) + tabulated(found.table())
         return parts
 
-    about = "What the guide says of the latents of some test windows, beside what their posterior is."
-    return Section("Guide beside the posterior", cells(runs, cell), about)
+    about = "The guide compared with the posterior of the latents of some test windows."
+    return Section("Guide and posterior", cells(runs, cell), about)
 
 
-def tubes(runs: Runs) -> Section:
-    """How forecasts are widened to hold the future as often as they say, and how often they do."""
+def prediction_bands(runs: Runs) -> Section:
+    """Return the section with the factors of the prediction bands, and their coverage on test windows."""
 
     def cell(run: Loaded) -> Markup:
         if (text := _record(run, "coverage.json")) is None:
-            return _missing(run, "coverage.json", "tubes around forecasts", "check coverage")
-        found, held = Tubes.from_json(text), _record(run, "coverage-test.json")
+            return _missing(run, "coverage.json", "prediction bands around forecasts", "check coverage")
+        found, held = PredictionBands.from_json(text), _record(run, "coverage-test.json")
         shown = picture(found.plot(), "factors over the horizon") + tabulated(found.table())
         return shown + (tabulated(Evaluation.from_json(held).table()) if held is not None else "")
 
-    about = "Forecasts hold the future as often as they say once they are this much wider; judged on windows apart."
-    return Section("Tubes around forecasts", cells(runs, cell), about)
+    about = "Factors by which forecasts are widened to reach the given coverage, and the coverage on other windows."
+    return Section("Prediction bands around forecasts", cells(runs, cell), about)
 
 
-def arrows(found: Ablation) -> Section:
-    """What every arrow of a model and its guide is worth."""
-    shown = picture(found.plot(), "model and guide of one step, arrows as thick as their price")
-    return Section("What every arrow is worth", before=shown + tabulated(found.table()))
+def edges(found: Ablation) -> Section:
+    """Return the section with the cost of every edge of a model and its guide."""
+    shown = picture(found.plot(), "model and guide of one step, edges as thick as their cost")
+    return Section("Cost of every edge", before=shown + tabulated(found.table()))
 
 
-# ---------------------------------------------------------------------------------------- what windows are needed for
+# ------------------------------------------------------------------------------------------ sections that need windows
 
 
 def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int = 0) -> Section:
-    """Bounds with their errors, the KL of every latent over time, and how far importance weights can be trusted."""
+    """Return the section with bounds and their errors, the KL of every latent over time, and Pareto k-hat."""
     likely = {name: run.model for name, run in runs.items() if run.model.likelihood}
     settings: dict[str, Any] = {"particles": particles, "contrasts": 0, "samples": 0, "seed": seed}
     about = f"Of {len(windows.keys)} test windows, evenly spread, with {particles} particles each."
@@ -287,12 +292,12 @@ def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int 
     try:
         found = compare(likely, windows, **settings) if likely else None
     except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
-        return Section(title, before=lacking(f"They cannot be measured: {reason(error)[:500]}"))
+        return Section(title, before=missing_part(f"The bounds cannot be computed: {error_message(error)[:500]}"))
 
     def cell(name: str) -> Markup:
         if found is None or name not in found.rows:
-            return lacking(
-                "It has no likelihood: its data are functions of its latents, so there is no bound and no KL."
+            return missing_part(
+                "The model has no likelihood: its data are functions of its latents, so there is no bound and no KL."
             )
         return _evidence(found, name)
 
@@ -300,17 +305,17 @@ def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int 
 
 
 def posteriors(runs: Runs, windows: HeldOutWindows, seed: int = 0) -> Section:
-    """Latents under the guide, and in free runs of the model."""
+    """Return the section with densities of the latents under the guide, and in free-running draws of the model."""
     about = (
-        "Grey: the prior, in free runs of the model. Line: the posterior, drawn from the guide for "
-        f"{len(windows.keys)} test windows. Both are over all windows and steps. Of each latent, the coordinates whose "
-        "posterior mean varies most over windows and steps."
+        "Grey: the prior, in free-running draws of the model. Line: the posterior, drawn from the guide for "
+        f"{len(windows.keys)} test windows. Both are over all windows and steps. Shown are the coordinates of each "
+        "latent whose posterior mean varies most over windows and steps."
     )
     return Section("Posterior against prior", cells(runs, partial(_latents, windows=windows, seed=seed)), about)
 
 
 def _evidence(found: Comparison, name: str) -> Markup:
-    """KL over time and k-hat of one model."""
+    """Return KL over time and k-hat of one model."""
     row, parts = found.rows[name], []
     for latent, steps in list(row.kl_steps.items())[:MOST]:
         figure, axes = _panel(f"KL of {latent}", "step", "nats a step")
@@ -323,11 +328,11 @@ def _evidence(found: Comparison, name: str) -> Markup:
         right = max(1.0, min(3.0, float(khat.max())))
         beyond = f", {(khat > right).mean():.0%} beyond {right:g}" if (khat > right).any() else ""
         figure, axes = _panel(f"Pareto k-hat{beyond}", f"k-hat (unreliable above {KHAT})", "share of windows")
-        axes.ecdf(np.minimum(khat, right + 1))  # it cannot draw infinity
+        axes.ecdf(np.minimum(khat, right + 1))  # `ecdf` cannot draw infinity
         axes.axvline(KHAT, color="grey", linewidth=0.8, linestyle="--")
         axes.set(xlim=(min(0.0, float(khat.min())), right), ylim=(0, 1.02))
         parts.append(picture(figure, "share of windows below a k-hat"))
-    return beside(*parts)
+    return side_by_side(*parts)
 
 
 @torch.no_grad()
@@ -335,7 +340,7 @@ def _latents(run: Loaded, windows: HeldOutWindows, seed: int) -> Markup:
     model = run.model
     if not model.latents:
         return paragraph("Nothing is latent.")
-    with reproducibly(model, seed):
+    with seeded_evaluation(model, seed):
         batch = windows.all()
         data = on_device_of(model, model.read(batch))
         size, length = (data["x"] if "x" in data else batch["x"]).shape[:2]
@@ -349,7 +354,7 @@ def _latents(run: Loaded, windows: HeldOutWindows, seed: int) -> Markup:
         for coordinate in told.argsort(descending=True, stable=True)[:COORDINATES].tolist():
             values = (free[latent].double().cpu()[..., coordinate], posterior[..., coordinate])
             parts.append(_densities(f"{latent}[{coordinate}]", *values))
-    return beside(*parts)
+    return side_by_side(*parts)
 
 
 def _densities(name: str, prior: Tensor, posterior: Tensor) -> Markup:
@@ -368,26 +373,28 @@ def _densities(name: str, prior: Tensor, posterior: Tensor) -> Markup:
 
 
 def cells(runs: Runs, make: Callable[[Loaded], Markup], doing: str = "") -> dict[str, Markup]:
-    """What is shown of each run; what fails is said in its place.
+    """Return the content of a section for each run, or the error message if it fails.
 
     Args:
-        runs: by name.
-        make: what is shown of one.
-        doing: what a bar says meanwhile, where it takes long.
+        runs: runs by name.
+        make: function from a run to its content.
+        doing: text of a progress bar; "" for no bar.
     """
     found = {}
     with progress_bar(bool(doing)) as bar:
         for name, run in bar.track(runs.items(), description=doing):
             try:
                 found[name] = make(run)
-            except Exception as error:  # what somebody else has laid into a run may fail in any way
-                found[name] = lacking(f"This cannot be shown: {reason(error)[:500] or type(error).__name__}")
+            except Exception as error:  # files of an untrusted run may raise any error
+                found[name] = missing_part(
+                    f"This cannot be shown: {error_message(error)[:500] or type(error).__name__}"
+                )
     return found
 
 
 def _missing(run: Loaded, file: str, what: str, name: str) -> Markup:
-    return lacking(
-        Markup("The run has no {}, so there are no {}. They are made by {}.").format(file, what, _command(run, name))
+    return missing_part(
+        Markup("The run has no {}, so there are no {}. Compute them with {}.").format(file, what, _command(run, name))
     )
 
 
@@ -396,7 +403,7 @@ def _command(run: Loaded, name: str) -> Markup:
 
 
 def _record(run: Loaded, name: str) -> str | None:
-    """What a record of a run says; None where there is none."""
+    """Return the text of a record of a run; None if it does not exist."""
     try:
         return files.read(run.path / name, LARGEST).decode()
     except FileNotFoundError:
@@ -409,13 +416,13 @@ def _evaluation(run: Loaded) -> Evaluation | None:
 
 
 def _row(run: Loaded, evaluation: Evaluation) -> str | None:
-    """What a run as it stands is called in an evaluation."""
+    """Return the name of a run with its current config in an evaluation; None if it is not there."""
     config = plain(Run(run.path).config)
     return next((name for name, row in evaluation.rows.items() if row.config == config), None)
 
 
 def _fit(run: Loaded) -> Fit:
-    """What the training left."""
+    """Return the stored result of the training."""
     state, history = Run(run.path).state, JSONLines(run.path / "log.jsonl").read()
     per = run.model.per if isinstance(run.model, Program) else Fit.per
     told = state["step"], state["best_step"], state["best_bound"], state["status"]
@@ -427,7 +434,7 @@ def _facts(run: Loaded) -> dict[str, str]:
     parameters = sum(parameter.numel() for parameter in run.model.parameters())
     try:
         best = _fit(run).best
-    except CheckpointError:  # the curves say what is wrong with the log
+    except CheckpointError:  # the section of curves reports the error
         best = ""
     return {
         "method": run.method.name,
@@ -441,7 +448,7 @@ def _facts(run: Loaded) -> dict[str, str]:
 
 
 def _scores(run: Loaded) -> dict[str, str]:
-    """What the evaluation says of a run itself."""
+    """Return the scores of a run in its own evaluation, in words."""
     try:
         found = _evaluation(run)
         name = None if found is None else _row(run, found)
@@ -452,13 +459,13 @@ def _scores(run: Loaded) -> dict[str, str]:
             metric = found.metrics[name_of]
             unit = f" ({metric.unit})" if metric.unit else ""
             values[name_of + ARROWS[metric.better] + unit] = str(score)
-    except Exception:  # the section of scores says what is wrong with it
+    except Exception:  # the section of scores reports the error
         return {}
     return {"forecasts scored, K": str(found.rows[name].samples), **values}
 
 
 def _drawn(axes: Any, title: str) -> Markup:
-    """A graph, which pyplot then forgets."""
+    """Return a graph as a picture, and close its figure."""
     axes.set_title(title)
     axes.figure.set_size_inches(GRAPH * axes.figure.get_size_inches())
     try:
@@ -468,9 +475,9 @@ def _drawn(axes: Any, title: str) -> Markup:
 
 
 def _panel(title: str, x: str, y: str) -> tuple[Any, Any]:
-    figure = canvas(*PANEL)
+    figure = new_figure(*PANEL)
     axes = figure.subplots()
-    as_they_are([axes.set_title(title, fontsize=10), axes.set_xlabel(x, fontsize=8), axes.set_ylabel(y, fontsize=8)])
+    literal_text([axes.set_title(title, fontsize=10), axes.set_xlabel(x, fontsize=8), axes.set_ylabel(y, fontsize=8)])
     axes.tick_params(which="both", labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
@@ -489,7 +496,7 @@ def _curve(fit: Fit, name: str) -> Markup:
         steps, found = fit.series(series)
         axes.plot(steps, found, linewidth=1.1, **style)
         values += [value for value in found if math.isfinite(value)]
-    if values:  # the first steps may be so far off that nothing else could be told apart
+    if values:  # the first steps may be so far off that all others would look equal
         low, high = np.quantile(values, (0.02, 0.98))
         axes.set_ylim(low - 0.1 * (high - low or 1), high + 0.1 * (high - low or 1))
         if kind == "energy" and min(values) > 0:

@@ -34,7 +34,7 @@ class Domain:
     """
 
     place: str
-    said: str
+    description: str
 
 
 DOMAINS: dict[str, Domain] = {

@@ -31,7 +31,7 @@ from ... import files
 from ...lazy import optional
 from ..columns import Column, Columns
 from ..panel import Panel, Series
-from .published import folder, lot
+from .published import name_hash, package_folder
 
 VOICES = ("Soprano", "Alto", "Tenor", "Bass")
 KEYS = range(21, 109)
@@ -63,18 +63,18 @@ def chorales(transposed: bool = True, cache: Path | None = None) -> Panel:
         ImportError: if music21 is not installed.
         ValueError: if the cache has other content, or music21's corpus has too few settings.
     """
-    folder("music21", "chorales")
+    package_folder("music21", "chorales")
     pooch = optional("pooch", "chorales")
     path = Path(cache or pooch.os_cache("dvae")) / f"chorales-{version('music21')}.json"
     if not path.exists():
         content = json.dumps({name: found.tolist() for name, found in _settings().items()})
-        with files.written(path) as file:
-            files.put(file, content.encode())
+        with files.atomic_write(path) as file:
+            files.write_all(file, content.encode())
     return _panel(_read(path), transposed)
 
 
 def _panel(settings: Mapping[str, np.ndarray], transposed: bool) -> Panel:
-    chosen = sorted(different(settings), key=lot)[: sum(SIZES.values())]
+    chosen = sorted(different(settings), key=name_hash)[: sum(SIZES.values())]
     if len(chosen) < sum(SIZES.values()):
         raise ValueError(f"music21 has {len(chosen)} different settings, of {sum(SIZES.values())}; install a newer one")
     splits = [split for split, size in SIZES.items() for _ in range(size)]

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 
-def folder(package: str, extra: str) -> Path:
+def package_folder(package: str, extra: str) -> Path:
     """Return the folder of an installed package, without importing it, which can take seconds.
 
     Args:
@@ -23,6 +23,6 @@ def folder(package: str, extra: str) -> Path:
     return Path(found.submodule_search_locations[0])
 
 
-def lot(name: str) -> int:
+def name_hash(name: str) -> int:
     """Return a pseudo-random number below 2^256 from a name, identical on every machine."""
     return int.from_bytes(hashlib.sha256(name.encode()).digest())

@@ -16,7 +16,7 @@ import numpy as np
 from ... import files
 from ..columns import Column, Columns
 from ..panel import Panel, Series
-from .published import folder
+from .published import package_folder
 
 MOST = 2**24
 """Maximum bytes of a file of sequences."""
@@ -68,7 +68,7 @@ def macrodata() -> Panel:
     Raises:
         ImportError: if statsmodels is not installed.
     """
-    path = folder("statsmodels", "series") / "datasets" / "macrodata" / "macrodata.csv"
+    path = package_folder("statsmodels", "series") / "datasets" / "macrodata" / "macrodata.csv"
     rows = list(csv.DictReader(files.read(path, MOST).decode().splitlines()))
     found = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
     growth = [100 * np.diff(np.log(found[of])) for of in RATES.values()]
@@ -82,7 +82,7 @@ def macrodata() -> Panel:
 
 def _archived(name: str, columns: list[str]) -> Panel:
     """Load a data set of the archive; every fifth training sequence of each class is used for validation."""
-    place = folder("aeon", "series") / "datasets" / "data" / name
+    place = package_folder("aeon", "series") / "datasets" / "data" / name
     series, seen = [], dict[str, int]()
     for split in ("train", "test"):
         for number, (values, label) in enumerate(read_ts(place / f"{name}_{split.upper()}.ts")):

@@ -20,7 +20,7 @@ from scipy.io import wavfile
 
 from ..columns import Column, Columns
 from ..panel import Panel, Series
-from .published import lot
+from .published import name_hash
 
 PLACE = Path("/usr/share/asterisk/sounds/en_US_f_Allison")
 RATE, WINDOW, HOP = 8000, 256, 128
@@ -32,7 +32,7 @@ QUIET = 30.0
 SILENT = 0.01
 """Largest absolute value of recordings of silence, which are omitted; speech reaches values up to 1."""
 TENTHS = {0: "validation", 1: "test"}
-"""Split of the recordings whose `lot` ends in this digit; all others are for training."""
+"""Split of the recordings whose `name_hash` ends in this digit; all others are for training."""
 
 
 def speech(folder: str | Path = PLACE) -> Panel:
@@ -46,7 +46,7 @@ def speech(folder: str | Path = PLACE) -> Panel:
         ValueError: if a file is not mono with 16 bits and 8 kHz.
     """
     series = [
-        Series(name, power(samples), split=TENTHS.get(lot(name) % 10, "train"))
+        Series(name, power(samples), split=TENTHS.get(name_hash(name) % 10, "train"))
         for name, samples in recordings(folder).items()
     ]
     hertz = np.arange(WINDOW // 2 + 1) * RATE / WINDOW

@@ -1,7 +1,7 @@
 """The pytest plugin: the fixture `elbo_regression` and its options.
 
-pytest imports a plugin at every start, in every project of the environment. So this package is installed under a second
-name, `pytest_dvae`, beside dvae and not within it, and imports dvae (and with it torch) when the fixture is first used.
+pytest imports a plugin at every start, in every project of the environment. This package is therefore installed under a
+second name, `pytest_dvae`, outside dvae, and imports dvae (and with it torch) only when the fixture is first used.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _OWNERS: pytest.StashKey[dict[Any, str]] = pytest.StashKey()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds --update-elbo and --elbo-strict."""
+    """Add the options --update-elbo and --elbo-strict."""
     group = parser.getgroup("dvae", "evidence bounds (dvae)")
     group.addoption("--update-elbo", action="store_true", help="renew the records of elbo_regression")
     group.addoption("--elbo-strict", action="store_true", help="fail where elbo_regression has no record yet")
@@ -25,7 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture
 def elbo_regression(request: pytest.FixtureRequest) -> ElboRegression:
-    """`elbo_regression.check(model, guide, data)` fails when the evidence bound has become significantly worse."""
+    """Return the fixture whose `check(model, guide, data)` fails if the evidence bound is significantly worse."""
     from dvae.testing.regression import ElboRegression
 
     item, config = request.node, request.config
@@ -34,13 +34,15 @@ def elbo_regression(request: pytest.FixtureRequest) -> ElboRegression:
         test=item.nodeid.partition("::")[2].replace("::", "."),
         update=config.getoption("--update-elbo"),
         strict=config.getoption("--elbo-strict"),
-        note=lambda line: item.user_properties.append(("elbo_regression", line)),  # xdist brings these home
+        note=lambda line: item.user_properties.append(
+            ("elbo_regression", line)
+        ),  # xdist sends these to the main process
         owners=config.stash.setdefault(_OWNERS, {}),
     )
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Lists records that are new or renewed, and bounds that became better."""
+    """List new and renewed records, and improved bounds."""
     reports = [report for group in terminalreporter.stats.values() for report in group]
     found = [entry for report in reports for entry in getattr(report, "user_properties", ())]
     if lines := dict.fromkeys(line for key, line in found if key == "elbo_regression"):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import dvae
-from dvae import Oracle, annealed_bound, twin
+from dvae import Oracle, annealed_bound, linear_gaussian_surrogate
 from dvae.inference.bounds import annealing
 
 T = 4
@@ -16,7 +16,7 @@ T = 4
 @pytest.mark.parametrize("temperatures", [1, 3])
 def test_weights_are_unbiased_for_the_evidence_and_their_inverses_for_its_inverse(temperatures):
     """Whatever the number of temperatures; weights of a guide that is nearly right, so that they have a variance."""
-    model = twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 1}, T)
+    model = linear_gaussian_surrogate("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 1}, T)
     x, oracle = model.sample(1, T)["x"], Oracle(model, T)
     oracle.fit_guide(100)
     model.requires_grad_(False)

@@ -7,10 +7,10 @@ from dense import exact_bound, library_bound
 from pyro import poutine
 from pyro.infer import Trace_ELBO, TraceMeanField_ELBO
 
-from dvae import DynamicalVAE, SequenceELBO, distributions, importance_bound, twin
+from dvae import DynamicalVAE, SequenceELBO, distributions, iwae_bound, linear_gaussian_surrogate
 from dvae.inference.bounds.elbo import _khat
 from dvae.networks import Attention, Recurrent
-from dvae.program.rollout import SelfFeeding, Sequence
+from dvae.program.rollout import ScheduledSampling, Sequence
 
 B, T = 3, 5
 EQUATIONS = ("p(w) p(z_t | z_{t-1}, w) p(x_t | x_{<t}, z_t, w)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)")
@@ -75,7 +75,7 @@ def test_it_is_a_pyro_elbo():
 
 def test_particles_average_to_pyros_trace_elbo():
     """A Student t prior has no closed form, and its KL is a log-ratio then."""
-    model, batch = build(laws={"p(x)": distributions.Normal(), "p(z)": distributions.StudentT()}), data()
+    model, batch = build(distributions={"p(x)": distributions.Normal(), "p(z)": distributions.StudentT()}), data()
     n = 150
     with torch.no_grad():
         ours = torch.stack([SequenceELBO().terms(model, batch).bound.sum() for _ in range(n)])
@@ -136,8 +136,8 @@ def test_khat_is_the_shape_of_a_pareto_tail_and_needs_25_particles():
     for shape in (0.3, 0.9):
         assert abs(_khat(shape * exponential).mean() - shape) < 0.1
     model, batch = build(), data()
-    assert importance_bound(model, batch, particles=24).khat.isnan().all()
-    assert importance_bound(model, batch, particles=25).khat.isfinite().all()
+    assert iwae_bound(model, batch, particles=24).khat.isnan().all()
+    assert iwae_bound(model, batch, particles=25).khat.isfinite().all()
 
 
 # ------------------------------------------------------------------------------------------------- missing entries
@@ -150,11 +150,14 @@ def hiding(steps, *hidden):
 
 
 @pytest.mark.parametrize(
-    "run", [{"seen": hiding(4, 1, 2)}, {"fed": torch.tensor([[False, True, True, False]]), "feeding": SelfFeeding(0.5)}]
+    "run",
+    [{"seen": hiding(4, 1, 2)}, {"fed": torch.tensor([[False, True, True, False]]), "feeding": ScheduledSampling(0.5)}],
 )
 def test_a_backward_guide_has_no_analytic_kl_where_the_model_reads_its_own_means(run):
     """p(z_t | x_{t-1}) reads a function of z_{t-1} then, which the guide drew from z_t."""
-    model = twin("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, x_{1:T})", {"z": 1, "x": 1}, 4, scale=1.5)
+    model = linear_gaussian_surrogate(
+        "p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, x_{1:T})", {"z": 1, "x": 1}, 4, scale=1.5
+    )
     x = torch.randn(1, 4, 1, dtype=torch.float64)
     exact = exact_bound(model, x[0], **{name: value[0] for name, value in run.items() if name != "feeding"})
     torch.testing.assert_close(library_bound(model, x, **run)[0], exact, rtol=0, atol=1e-9)

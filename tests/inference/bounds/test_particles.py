@@ -1,4 +1,4 @@
-"""The particle bound: unbiased for the evidence, the textbook's filter, and every network's state moved with it."""
+"""The FIVO bound: unbiased for the evidence, the textbook's filter, and every network's state moved with it."""
 
 import math
 
@@ -6,7 +6,7 @@ import pyro
 import pytest
 import torch
 
-from dvae import DynamicalVAE, Oracle, particle_bound, twin
+from dvae import DynamicalVAE, Oracle, fivo_bound, linear_gaussian_surrogate
 from dvae.factorization.notation import Factorization
 from dvae.inference.bounds.particles import ancestors, effective_size
 from dvae.networks import Attention, Dense, Linear, Recurrent
@@ -77,12 +77,12 @@ CASES = [
 
 
 def bounded(pair, seed=1):
-    """A twin whose guide is the best of its factorization, spread a little: its weights have light tails."""
-    model = twin(*PAIRS[pair], dict.fromkeys(names(PAIRS[pair][0]), 1), T, seed, scale=0.5)
+    """A surrogate whose guide is the best of its factorization, spread a little: its weights have light tails."""
+    model = linear_gaussian_surrogate(*PAIRS[pair], dict.fromkeys(names(PAIRS[pair][0]), 1), T, seed, scale=0.5)
     Oracle(model, T).fit_guide(100)
     with torch.no_grad():
         for conditional in model.encoder.values():
-            conditional.law.log_scale.add_(0.2)
+            conditional.head.log_scale.add_(0.2)
     return model
 
 
@@ -97,17 +97,17 @@ def test_it_is_unbiased_for_the_evidence(pair):
         evidence = Oracle(model, T).evidence(x)
     n = 3000
     for resample_below in (0.0, 0.7, 1.0):
-        out = particle_bound(model, x.repeat(n, 1, 1), 4, resample_below=resample_below, chunk=4 * n)
+        out = fivo_bound(model, x.repeat(n, 1, 1), 4, resample_below=resample_below, chunk=4 * n)
         ratio = (out.bound - evidence).exp()
         assert abs(ratio.mean() - 1) < 4 * ratio.std() / n**0.5 < 0.25
         assert (out.resamplings > 0).any() == (resample_below > 0)
 
 
 def test_the_exact_posterior_never_resamples_and_gives_the_evidence():
-    model = twin(*PAIRS["srnn"], {"z": 1, "x": 2}, T)
+    model = linear_gaussian_surrogate(*PAIRS["srnn"], {"z": 1, "x": 2}, T)
     assert Oracle(model, T).fit_guide() < 1e-10
     x = model.sample(5, T)["x"]
-    out = particle_bound(model, x, 8, chunk=16)
+    out = fivo_bound(model, x, 8, chunk=16)
     torch.testing.assert_close(out.bound, Oracle(model, T).evidence(x).detach(), rtol=0, atol=1e-3)
     assert (out.resamplings == 0).all()
     # On the way the particles are weighed for x_{1:t}, but drawn for x_{1:T}: only at the end are their weights equal.
@@ -130,8 +130,8 @@ def textbook(model, batch, particles, resample_below):
     def guide():
         return generator(guide=True)
 
-    def draw(law, noise):
-        return law.loc + law.scale * noise
+    def draw(distribution, noise):
+        return distribution.loc + distribution.scale * noise
 
     weight = torch.zeros(n, dtype=torch.float64)
     statics = [name for name in model.latents if not model.generative.local(name)]
@@ -140,9 +140,9 @@ def textbook(model, batch, particles, resample_below):
     bound, count = torch.zeros(shape[1], dtype=torch.float64), torch.zeros(shape[1], dtype=torch.long)
 
     def draw_static(name):
-        law = guide().law(name)
-        latents[name] = draw(law.base_dist, torch.randn(n, model.sizes[name], dtype=torch.float64))
-        return generator().law(name).log_prob(latents[name]) - law.log_prob(latents[name])
+        distribution = guide().distribution(name)
+        latents[name] = draw(distribution.base_dist, torch.randn(n, model.sizes[name], dtype=torch.float64))
+        return generator().distribution(name).log_prob(latents[name]) - distribution.log_prob(latents[name])
 
     for name in (name for name in statics if name not in last):
         weight = weight + draw_static(name)
@@ -160,9 +160,9 @@ def textbook(model, batch, particles, resample_below):
             count += low
         total = torch.zeros(n, dtype=torch.float64)
         for name in moving:
-            law = guide().evaluate(name, latents[name].clone())
-            latents[name][:, t] = draw(law, noise[name])[:, t]
-            total -= law.log_prob(latents[name])[:, t].sum(-1)
+            distribution = guide().evaluate(name, latents[name].clone())
+            latents[name][:, t] = draw(distribution, noise[name])[:, t]
+            total -= distribution.log_prob(latents[name])[:, t].sum(-1)
         rollout = generator()
         for name in (*moving, *model.observed):
             value = rollout.values[name].clone()
@@ -188,7 +188,7 @@ def test_it_is_the_textbooks_filter(pair, kind, extra):
         pyro.set_rng_seed(3)
         bound, count = textbook(model, batch, 4, below)
         pyro.set_rng_seed(3)
-        out = particle_bound(model, batch, 4, resample_below=below)
+        out = fivo_bound(model, batch, 4, resample_below=below)
         torch.testing.assert_close(out.bound, bound, rtol=0, atol=1e-9)
         assert torch.equal(out.resamplings, count)
     assert count.sum() > 3

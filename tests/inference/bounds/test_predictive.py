@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dvae import Oracle, twin
+from dvae import Oracle, linear_gaussian_surrogate
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.inference.evaluation.evaluate import evaluate
@@ -22,11 +22,11 @@ EXACT = ("p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t, x_{t-1})", {"z": 1, "x": 
 
 def wide(pair):
     """A model with a guide that is near the posterior, but wider, so that weights are bounded and not equal."""
-    model = twin(*pair, T)
+    model = linear_gaussian_surrogate(*pair, T)
     Oracle(model, T).fit_guide(15)
     with torch.no_grad():
         for conditional in model.encoder.values():
-            conditional.law.log_scale += 0.25
+            conditional.head.log_scale += 0.25
     return model
 
 
@@ -36,8 +36,8 @@ def draws(model, n):
         return model.sample(n, T)["x"]
 
 
-def law(model, x):
-    """Means (B, H D) and covariance of forecasts of x (B, T, D): the guide's law of the past, run on by the model."""
+def distribution(model, x):
+    """Means (B, H D) and covariance of forecasts of x (B, T, D): the guide given the past, then the model."""
     whole, past = Oracle(model, T), Oracle(model, SEEN)
     names = (*model.latents, *model.observed)
     steps = [T if model.generative.local(name) else 1 for name in names]
@@ -57,7 +57,7 @@ def law(model, x):
 
 
 def log_density(model, x):
-    mean, covariance = law(model, x)
+    mean, covariance = distribution(model, x)
     return torch.distributions.MultivariateNormal(mean, covariance).log_prob(x[:, SEEN:].flatten(1))
 
 
@@ -78,7 +78,7 @@ def test_weights_are_unbiased_for_the_density_of_forecasts_and_their_log_is_belo
 
 
 def test_with_exact_guides_one_particle_gives_the_exact_predictive_density():
-    model = twin(*EXACT, T)
+    model = linear_gaussian_surrogate(*EXACT, T)
     Oracle(model, T).fit_guide(100)
     x = draws(model, 20)
     exact = (Oracle(model, T).evidence(x) - Oracle(model, SEEN).evidence(x[:, :SEEN])).detach()
@@ -93,7 +93,7 @@ def test_a_log_score_with_gaps_is_of_what_was_observed(pair, last):
     mask[0, -1, 0] = False
     if not last:
         mask[0, 1, 0] = mask[0, 2, 1] = mask[0, 3, 1] = False
-    mean, covariance = law(model, torch.where(mask, x, 0.0))
+    mean, covariance = distribution(model, torch.where(mask, x, 0.0))
     kept = mask[0, SEEN:].flatten()
     marginal = torch.distributions.MultivariateNormal(mean[:, kept], covariance[kept][:, kept])
     exact = marginal.log_prob(x[:, SEEN:].flatten(1)[:, kept])
@@ -105,7 +105,7 @@ def test_a_log_score_with_gaps_is_of_what_was_observed(pair, last):
 
 
 def test_an_evaluation_has_it_in_nats_a_predicted_frame():
-    model = twin(*DKF, T)
+    model = linear_gaussian_surrogate(*DKF, T)
     x = draws(model, 6)
     windows = ArrayWindows(x, SEEN)
     options = {"samples": 2, "batch_size": 6, "progress": False}

@@ -8,7 +8,7 @@ from torch.distributions import Normal
 
 import dvae
 from dvae import motion
-from dvae.inference.bounds.probe import Redrawn
+from dvae.inference.bounds.probe import RedrawnModel
 
 PROTOCOL = replace(motion.PROTOCOLS["simulated"], observed=5, predicted=7, test_stride=6, representation="quaternion")
 FAR = Normal(50.0, 50**0.5)
@@ -27,7 +27,7 @@ def made(windows, **options):
 @pytest.mark.parametrize("noise", ["mix", "concatenate", "add", "step"])
 def test_latents_are_from_the_other_law_each_sample_its_own(windows, noise):
     model, past = made(windows, noise=noise), {"x": windows.all()["x"][:3, :5]}
-    z = Redrawn(model, {"z": FAR}).forecast(past, 7, samples=300)["z"]
+    z = RedrawnModel(model, {"z": FAR}).forecast(past, 7, samples=300)["z"]
     assert z.shape == model.forecast(past, 7, samples=300)["z"].shape
     assert z.mean() == pytest.approx(50, abs=0.3)
     assert z.std() == pytest.approx(50**0.5, rel=0.03)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import dvae
-from dvae import Bracket, Oracle, bracket, twin
+from dvae import Bracket, Oracle, bracket, linear_gaussian_surrogate
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.diagnostics.bracket import DATA, PARTS
 
@@ -20,7 +20,7 @@ FEW = {"particles": 8, "temperatures": 3, "chains": 2, "fitting": 2, "progress":
 @pytest.fixture(scope="module")
 def known():
     """The oracle of a model whose guide is off, the cost of the best one, sequences by clip, and their bracket."""
-    model = twin(*DKF, {"z": 1, "x": 1}, T, seed=1, scale=0.6)
+    model = linear_gaussian_surrogate(*DKF, {"z": 1, "x": 1}, T, seed=1, scale=0.6)
     oracle = Oracle(model, T)
     cost = oracle.fit_guide(300)
     model.requires_grad_(False)
@@ -49,7 +49,7 @@ def test_the_bracket_holds_the_evidence_and_is_narrow(known):
 
 
 def test_the_parts_of_the_gap_are_what_they_cost(known):
-    """Amortisation is what the guide lost by being off, missing arrows the price of the best one, the family nothing.
+    """Amortisation is what the guide lost by being off, missing edges the price of the best one, the family nothing.
 
     Logarithms of weights have a variance of about twice the gap that they are of, and of ELBOs each is a mean of 1000.
     """
@@ -60,7 +60,7 @@ def test_the_parts_of_the_gap_are_what_they_cost(known):
     error = 4 * math.sqrt(2 * float(total) / (1000 * N)) + 0.01
     assert min(cost, float(total) - cost) > 2 * error
     # of the best guide, which reads all data, every sequence loses the same
-    assert parts["missing arrows"].mean == pytest.approx(cost, abs=error)
+    assert parts["missing edges"].mean == pytest.approx(cost, abs=error)
     assert parts["amortisation"].mean == pytest.approx(float(total) - cost, abs=error)
     assert parts["family"].mean == pytest.approx(0, abs=error)
     assert found.added == {"z": ["z_{t-1}"]}
@@ -83,11 +83,11 @@ def test_it_is_shown_and_kept(known):
 
 
 def test_a_guide_that_goes_backward_has_no_fivo_and_a_law_that_is_no_normal_no_parts():
-    model = twin(DKF[0], "q(z_t | z_{>t}, x_{1:T})", {"z": 1, "x": 1}, T).requires_grad_(False)
+    model = linear_gaussian_surrogate(DKF[0], "q(z_t | z_{>t}, x_{1:T})", {"z": 1, "x": 1}, T).requires_grad_(False)
     found = bracket(model, torch.randn(2, T, 1), **{**FEW, "fitting": 0})
     assert "FIVO" not in found.bounds["real"]
     assert "backward" in found.notes[0]
-    model = dvae.DynamicalVAE(*DKF, {"z": 2, "x": 1}, laws={"q": dvae.distributions.FAMILIES["correlated"]})
+    model = dvae.DynamicalVAE(*DKF, {"z": 2, "x": 1}, distributions={"q": dvae.distributions.FAMILIES["correlated"]})
     found = bracket(model, torch.randn(2, T, 1), **FEW)
     assert "are normals" in found.notes[0]
     assert list(found.gap("simulated")) == ["unknown"]

@@ -13,7 +13,7 @@ import torch
 from scipy import stats
 
 import dvae
-from dvae import DynamicalVAE, Oracle, motion, twin
+from dvae import DynamicalVAE, Oracle, linear_gaussian_surrogate, motion
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.diagnostics.calibration import Calibration, calibrate
 from dvae.inference.diagnostics.checks import STATISTICS, Check, predictive_checks
@@ -27,8 +27,8 @@ CHAIN = Skeleton(("Pelvis", "Knee", "Foot"), (-1, 0, 1), up="y", fps=10.0, name=
 
 
 def linear(generative, inference, scale=0.9, seed=0, **sizes):
-    """A twin whose guide is the best of its factorization."""
-    model = twin(generative, inference, sizes, T, seed, scale=scale)
+    """A surrogate whose guide is the best of its factorization."""
+    model = linear_gaussian_surrogate(generative, inference, sizes, T, seed, scale=scale)
     Oracle(model, T).fit_guide()
     return model
 
@@ -174,7 +174,7 @@ def test_statistics_of_any_sequences_have_their_known_values():
 @pytest.fixture(scope="module")
 def true_checks():
     """Of windows that a model drew itself. Only x_{t-1} tells of the future: forecasts are exact whatever the guide."""
-    model = twin("p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t, x_{t-1})", {"z": 1, "x": 9}, T)
+    model = linear_gaussian_surrogate("p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t, x_{t-1})", {"z": 1, "x": 9}, T)
     Oracle(model, T).fit_guide()
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -211,7 +211,7 @@ def test_tail_areas_of_the_true_model_are_uniform(true_checks, name, samples):
 
 
 def test_a_coordinate_that_x_does_not_read_moves_nothing_and_others_move_it_linearly():
-    model = twin(STATIC, "q(w | x_{1:T})", {"w": 3, "x": 2}, T)
+    model = linear_gaussian_surrogate(STATIC, "q(w | x_{1:T})", {"w": 3, "x": 2}, T)
     weights = model.generator["x"].network.weights["w"]
     with torch.no_grad():
         weights[..., 1] = 0
@@ -228,7 +228,7 @@ def test_a_coordinate_that_x_does_not_read_moves_nothing_and_others_move_it_line
     chosen = traverse(model, x, "w", coordinates=[2], span=(-2, 2), steps=5)
     torch.testing.assert_close(chosen.frames[0], found.frames[2], rtol=0, atol=1e-12)
     own = traverse(model, model.sample(3, T)["x"], "w", unit="posterior", draws=4000).scale
-    scale = model.encoder["w"].law.log_scale.exp().detach().flatten()
+    scale = model.encoder["w"].head.log_scale.exp().detach().flatten()
     torch.testing.assert_close(own, scale, rtol=0.05, atol=0)
 
 

@@ -26,7 +26,9 @@ def covariance(found):
 
 def test_it_is_the_oracles_where_everything_is_normal():
     """Static latents and local ones, whatever is missing."""
-    model = dvae.twin("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)", _SIZES, 4)
+    model = dvae.linear_gaussian_surrogate(
+        "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)", "q(w | x_{1:T}) q(z_t | x_{1:T}, w)", _SIZES, 4
+    )
     oracle, x = dvae.Oracle(model, 4), model.sample(5, 4)["x"]
     whole = dvae.posterior(model.model, {"x": x}, guide=model.guide, descent=BRIEF)
     mean, spread = oracle.posterior(x)

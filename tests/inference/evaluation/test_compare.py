@@ -10,11 +10,11 @@ import pytest
 import torch
 
 import dvae
-from dvae import Comparison, DynamicalVAE, Oracle, motion, twin
+from dvae import Comparison, DynamicalVAE, Oracle, linear_gaussian_surrogate, motion
 from dvae.cli import main
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.evaluation.compare import compare
-from dvae.inference.evaluation.comparison import Contender
+from dvae.inference.evaluation.comparison import ModelResult
 from dvae.inference.evaluation.evaluate import evaluate
 
 T = 5
@@ -23,7 +23,7 @@ MEAN_FIELD = (DKF[0], "q(z_t | x_{1:T})")
 
 
 def build(pair=DKF, seed=0, fitted=True, scale=0.3):
-    model = twin(*pair, {"z": 1, "x": 2}, T, seed, scale=scale)
+    model = linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, T, seed, scale=scale)
     if fitted:
         Oracle(model, T).fit_guide(200)
     return model
@@ -60,7 +60,7 @@ def test_the_bounds_lie_in_order_below_the_evidence():
     x, oracle = draws(model, 300), Oracle(model, T)
     result = run({"a": model}, x, particles=64, contrasts=0)
     evidence, bound = (value.mean().item() / T for value in (oracle.evidence(x), oracle.bound(x)))
-    assert bound < result["a"]["importance bound"].mean < evidence
+    assert bound < result["a"]["IWAE bound"].mean < evidence
     exact = oracle.bound(x).detach().numpy()
     noise = (result.rows["a"].bounds["ELBO"] - exact).std() / math.sqrt(300) / T
     assert result["a"]["ELBO"].mean == pytest.approx(bound, abs=4 * noise)
@@ -72,7 +72,7 @@ def test_scores_are_those_of_an_evaluation_on_the_same_windows():
     result = run({"a": model}, windows, samples=4, seed=3, particles=32)
     same = {"samples": 4, "seed": 3, "bound_particles": 32, "references": False, "progress": False}
     expected = evaluate({"a": model}, windows, scores=motion.displacements, **same)["a"]
-    for metric in ("ELBO", "importance bound", "KL z", "ADE", "FDE", "MMADE", "MMFDE", "energy score"):
+    for metric in ("ELBO", "IWAE bound", "KL z", "ADE", "FDE", "MMADE", "MMFDE", "energy score"):
         ours = result["a"][metric]
         assert (ours.mean, ours.sequences) == pytest.approx((expected[metric].mean, expected[metric].standard_error))
     khat = result.rows["a"].bounds["k-hat"]
@@ -85,18 +85,18 @@ def test_the_particle_bound_is_that_of_the_filter_and_models_without_one_say_why
     models = {
         "filters": build(MEAN_FIELD, fitted=False),
         "backward": build((DKF[0], "q(z_t | z_{>t}, x_{1:T})")),
-        "nothing latent": twin("p(x_t | x_{t-1})", "", {"x": 2}, T),
+        "nothing latent": linear_gaussian_surrogate("p(x_t | x_{t-1})", "", {"x": 2}, T),
     }
     x = draws(models["filters"], 60)
     result, without = run(models, x, filter_particles=16), run(models, x)
-    own, evidence = result.rows["filters"].bounds["particle bound"][0], Oracle(models["filters"], T).evidence(x)
+    own, evidence = result.rows["filters"].bounds["FIVO bound"][0], Oracle(models["filters"], T).evidence(x)
     above = own - evidence.detach().numpy()
     assert -2 < above.mean() < 4 * above.std() / math.sqrt(60)
     none = result.rows["nothing latent"].bounds
-    np.testing.assert_allclose(none["particle bound"], none["importance bound"])
-    assert "particle bound" not in result.rows["backward"].bounds
+    np.testing.assert_allclose(none["FIVO bound"], none["IWAE bound"])
+    assert "FIVO bound" not in result.rows["backward"].bounds
     assert ["backward" in note for note in result.rows["backward"].notes] == [True]
-    assert "particle bound" not in str(without)
+    assert "FIVO bound" not in str(without)
     assert all(scores(without, name).items() <= scores(result, name).items() for name in models)
     assert str(Comparison.from_json(result.to_json())) == str(result)
 
@@ -110,8 +110,8 @@ def record(values, clips=None, frames=None):
     clips = range(count) if clips is None else clips
     rows = {}
     for name, bound in values.items():
-        bounds = {"ELBO": bound, "importance bound": bound, "k-hat": bound * math.nan}
-        rows[name] = Contender({}, {}, bounds, {}, {}, {}, bound.mean(0)[None], {})
+        bounds = {"ELBO": bound, "IWAE bound": bound, "k-hat": bound * math.nan}
+        rows[name] = ModelResult({}, {}, bounds, {}, {}, {}, bound.mean(0)[None], {})
     keys = [("test", str(clip), 0) for clip in clips]
     frames = np.ones(count) if frames is None else np.array(frames, dtype=float)
     counts = {"particles": 1, "contrasts": 0, "samples": 0, "seed": 0}
@@ -123,7 +123,7 @@ def test_errors_over_sequences_are_clustered_by_clip_and_weigh_frames():
     first, second = (np.random.default_rng(seed).normal(size=(1, 6)) for seed in (0, 1))
     result = record({"a": first, "b": second}, clips, frames)
     total = sum(frames)
-    for values, estimate in ((first, result["a"]["importance bound"]), (first - second, result.difference("a", "b"))):
+    for values, estimate in ((first, result["a"]["IWAE bound"]), (first - second, result.difference("a", "b"))):
         mean = values.sum() / total
         clip_sums = [sum(values[0, i] - frames[i] * mean for i in range(6) if clips[i] == clip) for clip in "abc"]
         assert estimate.mean == pytest.approx(mean)
@@ -137,7 +137,7 @@ def test_errors_over_seeds_are_those_of_their_means_and_the_total_has_two_way_ra
     assert record({"a": first, "b": second}).difference("a", "b").seeds == pytest.approx(math.hypot(*of_both))
 
     values = np.random.default_rng(0).normal(size=(3, 8)) + 3 * np.arange(3)[:, None] + np.arange(8)
-    estimate = record({"a": values})["a"]["importance bound"]
+    estimate = record({"a": values})["a"]["IWAE bound"]
     rest = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
     interaction = (rest**2).sum() / (2 * 7) / (3 * 8)
     sequences, seeds = values.mean(0).var(ddof=1) / 8, values.mean(1).var(ddof=1) / 3
@@ -148,7 +148,7 @@ def test_errors_over_seeds_are_those_of_their_means_and_the_total_has_two_way_ra
 # ----------------------------------------------------------------------------------------------------------- latents
 
 
-def law(model):
+def distribution(model):
     """Gain, covariance of q(latents | x), and covariance of x, of a linear-Gaussian model."""
     oracle = Oracle(model, T)
     gain, _, root = (part[0] for part in oracle._guide())
@@ -158,7 +158,7 @@ def law(model):
 
 def test_information_is_the_mutual_information_of_a_linear_guide():
     model, n = build(MEAN_FIELD, scale=0.8), 600
-    gain, noise, covariance = law(model)
+    gain, noise, covariance = distribution(model)
     told = (gain @ covariance * gain).sum(1) / noise.diagonal()  # signal to noise of each scalar latent
     found = run({"a": model}, draws(model, n), particles=1, contrasts=n).rows["a"].information["z"][0]
     exact = 0.5 * torch.log1p(told)
@@ -256,7 +256,7 @@ def test_arviz_reads_the_comparison(fitted):
     for name, tree in trees.items():
         loo = arviz_stats.loo(tree, pointwise=True)
         assert loo.n_data_points == 24
-        bound = result[name]["importance bound"].mean * result.frames.sum()
+        bound = result[name]["IWAE bound"].mean * result.frames.sum()
         # p is Monte Carlo error alone; of an exact guide it is 0, which leaves the rounding of sums of estimates
         rounding = 24 * 100 * np.finfo(float).eps * abs(bound)
         assert loo.elpd == pytest.approx(bound, abs=3 * loo.p + rounding)

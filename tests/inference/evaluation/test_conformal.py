@@ -1,4 +1,4 @@
-"""Tubes hold as many futures as they say, of dependent windows and few clips; TARP; calibration at each horizon."""
+"""Coverage of prediction bands for dependent windows and few clips; TARP; calibration at each horizon."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ import torch
 
 import dvae
 from dvae import ArrayWindows
-from dvae.inference.evaluation.conformal import Tubes, conformal, quantile
+from dvae.inference.evaluation.conformal import PredictionBands, conformal_bands, quantile
 from dvae.inference.evaluation.evaluate import evaluate
 from dvae.inference.evaluation.metrics import pit_histogram, tarp_histogram
 from dvae.inference.evaluation.scores import PIT, by_frame, calibrated, over_horizon, tarp
@@ -60,13 +60,16 @@ def test_a_window_of_a_new_clip_is_held_with_the_level(most):
         assert mean == pytest.approx(exact, abs=error)
 
 
-# ---------------------------------------------------------------------------------------------------------------- tubes
+# ----------------------------------------------------------------------------------------------------------------
+# prediction bands
 
 
 @pytest.fixture(scope="module")
 def fitted():
     """A model whose forecasts are exact, and windows that it drew, for calibration and new ones, with gaps to come."""
-    model = dvae.twin("p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t)", {"z": 1, "x": 2}, 6, scale=0.9)
+    model = dvae.linear_gaussian_surrogate(
+        "p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t)", {"z": 1, "x": 2}, 6, scale=0.9
+    )
     with torch.random.fork_rng():
         torch.manual_seed(0)
         x = model.sample(1000, 6)["x"]
@@ -92,11 +95,11 @@ class Narrow(torch.nn.Module):
         return {"x": torch.cat([x[:, :, : self.start], narrow[:, :, self.start :]], 2)}
 
 
-def test_tubes_hold_what_exact_forecasts_say_and_narrow_ones_do_not(fitted):
+def test_bands_hold_what_exact_forecasts_say_and_narrow_ones_do_not(fitted):
     model, kept, new = fitted
     for each, right in ((model, True), (Narrow(model), False)):
-        tubes = conformal(each, kept, samples=30, progress=False)
-        judged = tubes.coverage(each, new, progress=False)["model"]
+        bands = conformal_bands(each, kept, samples=30, progress=False)
+        judged = bands.coverage(each, new, progress=False)["model"]
         for region in ("number", "frame", "future"):
             held, said = (judged[f"{how} 90 %, {region}"] for how in ("held", "said"))
             # the calibration has as many clips as those that are judged, and as large an error
@@ -106,29 +109,29 @@ def test_tubes_hold_what_exact_forecasts_say_and_narrow_ones_do_not(fitted):
         assert widths == sorted(widths)
 
 
-def test_tubes_are_kept_and_put_around_forecasts(fitted, tmp_path):
+def test_bands_are_kept_and_put_around_forecasts(fitted, tmp_path):
     model, kept, new = fitted
-    tubes = conformal(model, kept, 0.8, samples=20, progress=False)
-    tubes.save(tmp_path / "coverage.json")
-    again = Tubes.load(tmp_path / "coverage.json")
-    assert again.to_json() == tubes.to_json()
+    bands = conformal_bands(model, kept, 0.8, samples=20, progress=False)
+    bands.save(tmp_path / "coverage.json")
+    again = PredictionBands.load(tmp_path / "coverage.json")
+    assert again.to_json() == bands.to_json()
     x = new.all()["x"]
     forecasts = model.forecast({"x": x[:, :2]}, 4, 20, draw_emission=True)["x"]
-    for region, factor in tubes.factors.items():
-        lower, upper = again.tube(forecasts, region)
+    for region, factor in bands.factors.items():
+        lower, upper = again.apply(forecasts, region)
         torch.testing.assert_close((upper - lower) / 2, torch.from_numpy(factor) * forecasts.std(0))
         torch.testing.assert_close((upper + lower) / 2, forecasts.mean(0))
-    assert "tubes of 80 % · 500 windows of 250 clips" in str(again)
+    assert "bands of 80 % · 500 windows of 250 clips" in str(again)
     assert again.plot()._repr_png_().startswith(b"\x89PNG")
-    with pytest.raises(ValueError, match="tubes"):
-        tubes.tube(forecasts, "futures")
+    with pytest.raises(ValueError, match="bands"):
+        bands.apply(forecasts, "futures")
     with pytest.raises(ValueError, match=r"\(20, B, 4, 2\), not \(19, 500, 4, 2\)"):
-        tubes.tube(forecasts[:19])
-    document = tubes.document()
+        bands.apply(forecasts[:19])
+    document = bands.document()
     shapes = document["attributes"]
     for change in ({"level": 2}, {"factors": {**shapes["factors"], "frame": [1, 1]}}):
         with pytest.raises(ValueError, match="written"):
-            Tubes.of({**document, "attributes": shapes | change})
+            PredictionBands.of({**document, "attributes": shapes | change})
 
 
 # ----------------------------------------------------------------------------------------------------------------- TARP

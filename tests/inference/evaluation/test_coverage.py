@@ -83,7 +83,9 @@ def test_calibration_is_a_matter_of_ranks_of_which_missing_ones_do_not_count(sco
 @pytest.fixture(scope="module")
 def truth():
     """A model, and windows of sequences that it drew, three of each clip with the same past."""
-    model = dvae.twin("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 6, scale=0.9)
+    model = dvae.linear_gaussian_surrogate(
+        "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})", {"z": 1, "x": 2}, 6, scale=0.9
+    )
     dvae.Oracle(model, 6).fit_guide()
     with torch.random.fork_rng():
         torch.manual_seed(0)

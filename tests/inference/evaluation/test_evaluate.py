@@ -210,8 +210,8 @@ def test_table_and_plot_show_every_method_and_metric(model):
         assert part in text
     assert str(result["dkf"]["ADE"]) in text
     panels = [axes.get_title() for axes in result.plot().axes if axes.axison]
-    arrows = {"lower": " ↓", "higher": " ↑", "": ""}
-    better = [arrows[metric.better] for metric in result.metrics.values()]
+    edges = {"lower": " ↓", "higher": " ↑", "": ""}
+    better = [edges[metric.better] for metric in result.metrics.values()]
     assert [title.split(" (")[0] for title in panels] == [n + b for n, b in zip(result.metrics, better, strict=True)]
     assert all(title.split(" (")[0] in text for title in panels)
     assert len([axes for axes in result.plot(["ADE", "FDE"]).axes if axes.axison]) == 2

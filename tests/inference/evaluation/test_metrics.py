@@ -1,4 +1,4 @@
-"""Scores of forecasts: their definitions, written out with loops, and the laws they obey."""
+"""Scores of forecasts: their definitions, written out with loops, and the distributions they obey."""
 
 import numpy as np
 import pytest

@@ -8,7 +8,7 @@ import torch
 
 from dvae.data.sequences import ArrayWindows
 from dvae.inference.evaluation.evaluate import evaluate
-from dvae.inference.evaluation.held import hold
+from dvae.inference.evaluation.evaluation_windows import prepare_windows
 from dvae.inference.evaluation.references import References, climatology, last_value, seasonal
 
 HORIZON = 5
@@ -75,7 +75,7 @@ def test_climatology_draws_futures_for_each_window_anew():
 
 def test_the_mean_is_of_every_column_where_it_was_observed():
     training = windows(30, seed=1, gaps=True)
-    count, forecaster = References(hold(windows()), 9, training=training)["mean"]
+    count, forecaster = References(prepare_windows(windows()), 9, training=training)["mean"]
     found = forecaster(slice(2, 5))
     assert (count, found.shape) == (1, (1, 3, HORIZON, 2))
     for d in range(2):

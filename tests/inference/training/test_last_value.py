@@ -20,8 +20,10 @@ LAWS = {
 }
 
 
-def model(law="real", size=2):
-    return dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": size}, dvae.networks.Recurrent(2), {"p(x)": LAWS[law]})
+def model(distribution="real", size=2):
+    return dvae.DynamicalVAE(
+        "p(x_t | x_{<t})", "", {"x": size}, dvae.networks.Recurrent(2), {"p(x)": LAWS[distribution]}
+    )
 
 
 def by_definition(train, x, seen, fed):
@@ -59,9 +61,9 @@ def test_a_fit_that_is_worse_says_so_with_both_numbers():
         assert fit.last_value is not None
         assert ("worse than repeating the last value" in fit.best) == worse == (fit.best_bound < fit.last_value)
         assert (f"({fit.last_value:.3f})" in fit.best) == worse
-        assert ("try residual=1" in fit.best, "try self_feeding=1" in fit.best) == (worse, worse)
+        assert ("try residual=1" in fit.best, "try scheduled_sampling=1" in fit.best) == (worse, worse)
     windows = ArrayWindows(walks, OBSERVED)
-    found = dvae.fit(model("residual", size=1), windows, windows, steps=1, self_feeding=1.0, progress=False)
+    found = dvae.fit(model("residual", size=1), windows, windows, steps=1, scheduled_sampling=1.0, progress=False)
     assert "best bound with scheduled sampling" in found.best
     assert "try " not in dataclasses.replace(found, last_value=math.inf).best  # the run has both options
     assert dvae.fit(model(size=1), walks[:40], walks[40:], steps=1, progress=False).last_value is None

@@ -17,7 +17,7 @@ from dvae.inference.training import processes
 from dvae.inference.training.checkpoints import Run
 from dvae.inference.training.fit import fit
 from dvae.inference.training.options import Training
-from dvae.inference.training.processes import LostProcess, launched, seed_of, together
+from dvae.inference.training.processes import LostProcess, average_gradients, launch, seed_of
 from dvae.inference.training.svi import SVI
 from dvae.networks import Dense
 from dvae.program.model import DynamicalVAE
@@ -69,7 +69,9 @@ def some_gradients(rank, out):
     parameters = [torch.nn.Parameter(torch.ones(2)) for _ in range(3)]
     parameters[0].grad = torch.full((2,), 1.0 + rank)
     parameters[1].grad = torch.ones(2) if rank else None
-    loss, share = together(launched(Training()), parameters, torch.tensor(2.0 - rank), torch.tensor(1.0 + 2 * rank))
+    loss, share = average_gradients(
+        launch(Training()), parameters, torch.tensor(2.0 - rank), torch.tensor(1.0 + 2 * rank)
+    )
     return [p.grad for p in parameters], loss, share
 
 
@@ -91,7 +93,7 @@ def stopped(rank, out):
 
 def play(out, *names):
     """Each of these functions in two processes, forked from one that has imported all, as if torchrun had."""
-    launched(Training())  # which imports fabric
+    launch(Training())  # which imports fabric
     for name in names:
         with socket.socket() as found:
             found.bind(("127.0.0.1", 0))
@@ -139,7 +141,7 @@ def of_two(tmp_path_factory):
 pytestmark = pytest.mark.slow
 
 
-# ------------------------------------------------------------------------------------------------ laws
+# ------------------------------------------------------------------------------------------------ distributions
 
 
 def test_they_are_one_process_with_the_batches_of_all(of_two):
@@ -186,10 +188,10 @@ def test_streams_are_of_one_process_of_one_seed():
 def test_what_cannot_be_started_is_told(monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(ValueError, match="accelerator"):
-        processes.launched(Training(accelerator="mps"))
+        processes.launch(Training(accelerator="mps"))
     monkeypatch.setattr("sys.argv", ["-c"])
     with pytest.raises(ValueError, match="program"):
-        processes.launched(Training(accelerator="cpu", devices=2))
+        processes.launch(Training(accelerator="cpu", devices=2))
 
 
 def test_torchrun_says_how_many_processes_there_are(monkeypatch):

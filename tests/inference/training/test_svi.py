@@ -22,7 +22,7 @@ RUNS = {
     "staged": {
         "stages": [
             Stage(10, WARM_UP, frozen=("generator.z.",)),
-            Stage(14, learning_rate=0.01, self_feeding=Piecewise(((10, 0.0), (21, 0.5)))),
+            Stage(14, learning_rate=0.01, scheduled_sampling=Piecewise(((10, 0.0), (21, 0.5)))),
         ],
         "optimizer": "adamw",
         "weight_decay": 0.01,

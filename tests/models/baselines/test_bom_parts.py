@@ -11,7 +11,7 @@ FIVE = ("torso", "right_leg", "left_leg", "right_arm", "left_arm")
 
 def built(windows, name="bom-parts", **options):
     torch.manual_seed(0)
-    return dvae.method(name, **SMALL, **options).suited(windows).build(windows).double().eval()
+    return dvae.method(name, **SMALL, **options).resolve_defaults(windows).build(windows).double().eval()
 
 
 @pytest.fixture(scope="module")

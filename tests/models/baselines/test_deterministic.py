@@ -75,7 +75,7 @@ ERD = [(48, 500), (500, 500), (1000, 500), (500, 100), (100, 48)]
     ],
 )
 def test_with_the_skeleton_of_the_papers_data_the_layers_are_the_papers(name, layers):
-    schema = Poses.under(motion.PROTOCOLS["h36m"], motion.HUMAN36M)
+    schema = Poses.from_data(motion.PROTOCOLS["h36m"], motion.HUMAN36M)
     with torch.device("meta"):
         expected = sum(parameter.numel() for layer in layers() for parameter in layer.parameters())
     model = dvae.method(name).build(schema)
@@ -85,7 +85,7 @@ def test_with_the_skeleton_of_the_papers_data_the_layers_are_the_papers(name, la
 
 def test_erd_is_a_decoder_of_lstms_of_an_encoder():
     model = small("erd", standardise=False).build({"x": 3}).double()
-    network, law = model.generator["x"].network, model.generator["x"].law
+    network, distribution = model.generator["x"].network, model.generator["x"].head
     x = torch.randn(2, 7, 3, dtype=torch.float64)
 
     def relu(layers, value):
@@ -97,7 +97,7 @@ def test_erd_is_a_decoder_of_lstms_of_an_encoder():
     read = torch.cat([x.new_zeros(2, 1, 5), relu(network.extractors["x"], x[:, :-1])], 1)
     for layer in network.past.layers:
         read = layer(read)[0]
-    expected = law.out(relu([network.join.first, *network.join.rest], read))
+    expected = distribution.out(relu([network.join.first, *network.join.rest], read))
     torch.testing.assert_close(model.generator["x"]({"x": x}, 2, 7)[0], expected, rtol=0, atol=1e-12)
 
 
@@ -107,8 +107,8 @@ def test_aclstm_is_trained_on_what_the_published_loop_makes():
     model = method.build({"x": 3}).double()
     x = torch.randn(2, 23, 3, dtype=torch.float64)
     cells = [nn.LSTMCell(size, 5).double() for size in (3, 5, 5)]
-    out = model.generator["x"].law.out
-    model.generator["x"].law.log_scale.fill_(math.log(0.5) / 2)  # which was single precision's
+    out = model.generator["x"].head.out
+    model.generator["x"].head.log_scale.fill_(math.log(0.5) / 2)  # which was single precision's
     for cell, layer in zip(cells, model.generator["x"].network.past.layers, strict=True):
         cell.load_state_dict({name.removesuffix("_l0"): value for name, value in layer.state_dict().items()})
     states = [(x.new_zeros(2, 5), x.new_zeros(2, 5)) for _ in cells]
@@ -124,7 +124,7 @@ def test_aclstm_is_trained_on_what_the_published_loop_makes():
 
     feeding = method.train(Sequences({"x": x}), steps=50).feeding
     assert feeding == 1.0
-    terms = dvae.SequenceELBO().terms(model, x, self_feeding=feeding)
+    terms = dvae.SequenceELBO().terms(model, x, scheduled_sampling=feeding)
     torch.testing.assert_close(-terms.bound - CONSTANT * x[0].numel(), loss, rtol=0, atol=1e-10)
     theirs = torch.autograd.grad(loss.sum(), [cells[0].weight_hh, cells[2].weight_ih, out.weight], retain_graph=True)
     layers = model.generator["x"].network.past.layers

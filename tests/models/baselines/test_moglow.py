@@ -51,8 +51,8 @@ def test_it_starts_where_training_data_are_noise_of_variance_1(mean, dtype):
     start_flow(model, Sequences({"x": x}))
     torch.testing.assert_close(model.units["x"].scale.double(), x.var((0, 1)).mean().sqrt(), rtol=0.1, atol=0)
     run = model.rollout(x)
-    law, centred = run.evaluate("x", x), model.generator["x"].centred(x)
-    noise, _ = getattr(law, "base", law).flow.to_noise(centred)
+    distribution, centred = run.evaluate("x", x), model.generator["x"].centred(x)
+    noise, _ = getattr(distribution, "base", distribution).flow.to_noise(centred)
     torch.testing.assert_close(noise.mean((0, 1)).double(), torch.zeros(3).double(), rtol=0, atol=0.2)
     torch.testing.assert_close(noise.var((0, 1)).double(), torch.ones(3).double(), rtol=0, atol=0.3)
 
@@ -66,23 +66,23 @@ def table(*columns):
 
 def test_of_a_table_the_flow_makes_the_real_columns_and_others_have_their_law():
     panel = table(Column("a"), Column("n", family="count"), Column("b"))
-    model = small().build(PanelSchema.under(panel, Cut()))
+    model = small().build(PanelSchema.from_data(panel, Cut()))
     assert model.generator["x"].events == [[0, 2]]
     x = torch.tensor(np.stack([one.values for one in panel])).float()
     assert torch.isfinite(dvae.SequenceELBO().terms(model, x).bound).all()
     assert not model.forecast(x, 2, samples=3)["x"][..., 1].frac().any()
     start_flow(model, Sequences({"x": x}))
-    assert all(move.shift.any() for move in model.generator["x"].law.parts[0].flow.transforms[::4])
-    whole = small().build(PanelSchema.under(table(Column("a"), Column("b")), Cut()))
-    assert isinstance(whole.laws["p(x)"], ConditionalFlow)
+    assert all(move.shift.any() for move in model.generator["x"].head.parts[0].flow.transforms[::4])
+    whole = small().build(PanelSchema.from_data(table(Column("a"), Column("b")), Cut()))
+    assert isinstance(whole.distributions["p(x)"], ConditionalFlow)
     with pytest.raises(ValueError, match="columns"):
-        small().build(PanelSchema.under(table(Column("n", family="count")), Cut()))
+        small().build(PanelSchema.from_data(table(Column("n", family="count")), Cut()))
 
 
 def test_at_the_sizes_of_the_paper_it_is_built():
     model = dvae.method("moglow", **PAPER).build({"x": 51})
-    law = model.generator["x"].law
-    assert len(law.flow.transforms) == 4 * 16
+    distribution = model.generator["x"].head
+    assert len(distribution.flow.transforms) == 4 * 16
     lstm = 4 * 512 * (51 + 512 + 2) + 4 * 512 * (512 + 512 + 2)
     coupling = (25 + 512 + 1) * 512 + (512 + 1) * 2 * 26
     assert sum(p.numel() for p in model.parameters()) == lstm + 513 * 2 * 51 + 16 * (coupling + 51**2 + 2 * 51)

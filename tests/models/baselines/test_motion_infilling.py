@@ -62,7 +62,7 @@ def test_the_network_for_human36m_has_the_published_size():
         model = dvae.method("motion-infilling", maps=(32, 64, 128, 256, 256)).build_on(skeleton)
         assert sum(parameter.numel() for parameter in model.parameters()) == 4_703_425
     published = dvae.method("motion-infilling")
-    assert published.filled(published.preset(HUMAN36M)).maps == (32, 64, 128, 256, 256)
+    assert published.with_presets(published.preset(HUMAN36M)).maps == (32, 64, 128, 256, 256)
 
 
 @pytest.mark.parametrize("frames", [1, 11, 33])

@@ -90,13 +90,13 @@ def test_the_loss_is_the_papers(windows):
     made, free = future(model, batch, w), future(model, batch, other)
     network, guide = model.generator["x"].network, model.encoder["w"]
     _, style = network.past(batch["x"][:, :5])
-    loc, scale = guide.law(guide.network.coded(network.changed(style, other) - style))
+    loc, scale = guide.head(guide.network.coded(network.changed(style, other) - style))
     again = loc + scale * torch.randn(3, 4, dtype=torch.float64)
     joints, a = 16, 1 - torch.exp(torch.tensor(-3.0, dtype=torch.float64))
     paper = (made - truth).abs().sum() / joints
     paper = paper + 5 * a * sum((velocity(each) - velocity(truth)).abs().sum() / joints for each in (made, free))
     paper = paper + a * terms.kl["w"].sum() / 4 + 5 * (other - again).abs().sum() / 4
-    scale = joints / 4  # of the Laplace law
+    scale = joints / 4  # of the Laplace distribution
     constant = 3 * truth[0].numel() * torch.tensor(2 * scale).log()
     join = 2 * (made[:, 0] - last[:, 0]).square().sum()
     torch.testing.assert_close(objective(terms, 100), (4 * paper + constant + join) / (3 * 12))

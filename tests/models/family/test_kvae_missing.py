@@ -176,15 +176,15 @@ def test_one_step_at_a_time_is_all_steps_at_once(known):
 
 def linear(model, data):
     """log p(x) (B,) of what was observed, of a model with one component whose decoder is linear: one dense normal."""
-    network, law = model.generator["a"].network, model.generator["x"].law
+    network, distribution = model.generator["a"].network, model.generator["x"].head
     steps = data["x"].shape[1]
     covariance = dense(network, torch.ones(steps, 1).double())
     here = places(network, torch.ones(steps, dtype=torch.bool), steps, "a")
-    out = torch.block_diag(*[law.out.weight] * steps)
+    out = torch.block_diag(*[distribution.out.weight] * steps)
     spread = out @ covariance[here][:, here] @ out.mT + torch.eye(3 * steps)
     total = []
     for x, mask in zip(data["x"].flatten(1), data["mask"].flatten(1), strict=True):
-        loc = law.out.bias.repeat(steps)[mask]
+        loc = distribution.out.bias.repeat(steps)[mask]
         total.append(MultivariateNormal(loc, spread[mask][:, mask]).log_prob(x[mask]))
     return torch.stack(total)
 
@@ -192,7 +192,7 @@ def linear(model, data):
 @pytest.mark.parametrize("bound", ["particles", "importance"])
 def test_bounds_estimate_the_evidence_of_what_was_observed(bound):
     model, data, n = build(components=1), batch(), 75
-    into, out = model.encoder["a"].law.out, model.generator["x"].law.out
+    into, out = model.encoder["a"].head.out, model.generator["x"].head.out
     for layer in (into, out):
         layer.weight.zero_()
     out.weight[:D] = 2 * torch.eye(D)  # x_t tells a_t, but for its last coordinate, which may be missing
@@ -203,10 +203,10 @@ def test_bounds_estimate_the_evidence_of_what_was_observed(bound):
     expected = linear(model, data)
     many = {name: value.repeat(n, 1, 1) for name, value in data.items()}
     if bound == "particles":
-        found = dvae.particle_bound(model, many, 100, resample_below=0.9)
+        found = dvae.fivo_bound(model, many, 100, resample_below=0.9)
         assert found.resamplings.any()
     else:
-        found = dvae.importance_bound(model, many, 100)
+        found = dvae.iwae_bound(model, many, 100)
     ratio = (found.bound.unflatten(0, (n, B)) - expected).exp()
     assert ratio.std(0).max() < 1
     assert ((ratio.mean(0) - 1).abs() < 4 * ratio.std(0) / n**0.5).all()

@@ -79,7 +79,7 @@ def test_the_loss_is_the_squared_error_the_first_step_and_the_weighted_divergenc
     """Windows are turned where models see them, which no distance knows."""
     model, batch = built(windows, "cvae", join=3.0), batch_of(windows)
     torch.manual_seed(1)
-    terms = dvae.SequenceELBO().terms(model, batch, self_feeding=1.0)
+    terms = dvae.SequenceELBO().terms(model, batch, scheduled_sampling=1.0)
     loss = small("cvae", join=3.0).train(windows).objective(terms, 0)
     torch.manual_seed(1)
     (made,), truth = futures(model, batch, [model.guide(batch)])
@@ -93,7 +93,7 @@ def test_best_of_many_pays_for_the_nearest_future_alone(windows):
     model, batch = built(windows, "bom", samples=4), batch_of(windows)
     objective = small("bom", samples=4).train(windows).objective
     torch.manual_seed(1)
-    terms = dvae.SequenceELBO().terms(model, batch, self_feeding=1.0, draws=objective.draws)
+    terms = dvae.SequenceELBO().terms(model, batch, scheduled_sampling=1.0, draws=objective.draws)
     torch.manual_seed(1)
     w = model.guide(batch, draws=objective.draws)["w"].unflatten(0, (4, -1))
     made, truth = futures(model, batch, [{"w": each} for each in w])
@@ -122,7 +122,7 @@ def test_decoders_read_their_own_means_in_training_and_gradients_flow_through_th
 def test_perturbations_of_nothing_have_the_squared_error_of_draws_of_the_prior(windows):
     model, batch = built(windows, "rhp"), batch_of(windows)
     torch.manual_seed(1)
-    terms = dvae.SequenceELBO().terms(model, batch, self_feeding=1.0)
+    terms = dvae.SequenceELBO().terms(model, batch, scheduled_sampling=1.0)
     torch.manual_seed(1)
     (made,), truth = futures(model, batch, [{"w": torch.randn(3, 4, dtype=torch.float64)}])
     constant = 0.5 * math.log(math.pi) * truth[0].numel()  # of N(0, 1/2)

@@ -10,7 +10,7 @@ import dvae
 from dvae import motion
 from dvae.inference.evaluation.metrics import average_pairwise_distance
 from dvae.models.motion.gsps import PRESETS, GSPSModel, part_by_part
-from dvae.models.registry import judge
+from dvae.models.registry import metric_model
 from dvae.motion.geometry.parts import body_parts
 from dvae.motion.scoring import energies
 from dvae.networks import GraphConv
@@ -25,13 +25,13 @@ FIVE = ("torso", "right_leg", "left_leg", "right_arm", "left_arm")
 def prior_run(walkers, tmp_path_factory):
     """A run of a pose prior, of two steps."""
     out = tmp_path_factory.mktemp("prior") / "run"
-    method = judge("pose-prior", heading=True)
+    method = metric_model("pose-prior", heading=True)
     dvae.fit(method, walkers, out=out, **vars(dvae.Training(steps=2, progress=False, accelerator="cpu")))
     return str(out)
 
 
 def build(windows, **options):
-    method = dvae.method("gsps", **{**SMALL, **options}).suited(windows)
+    method = dvae.method("gsps", **{**SMALL, **options}).resolve_defaults(windows)
     return method.build(windows).double()
 
 
@@ -77,14 +77,14 @@ def test_the_program_runs_in_pyro(windows):
     assert drawn == ["a", "b"]
     truth = model.turned(data["x"])
     values = trace.nodes["_RETURN"]["value"]
-    found = energies.best_of_many(model.shown(values)["x"].unflatten(0, (-1, 4))[:, :, 15:], truth[:, 15:])
+    found = energies.best_of_many(model.to_data_space(values)["x"].unflatten(0, (-1, 4))[:, :, 15:], truth[:, 15:])
     assert torch.allclose(trace.nodes["reconstruction"]["log_prob"], -found, atol=1e-10)
 
 
 def test_the_energies_are_those_of_the_card(windows):
     """Every term from its formula, over all futures, one after the other."""
     model, data = build(windows, heading=False, limb=1.0).eval(), batch(windows)
-    values = model.shown(model.model(data))
+    values = model.to_data_space(model.model(data))
     x, S = data["x"], values["x"].unflatten(0, (-1, 4))
     found = model.energies(values, x, data)
     future, truth = S[:, :, 15:], x[:, 15:]
@@ -167,7 +167,7 @@ def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, walkers, prior_run)
     loaded, other = runs.load(tmp_path / "whole"), runs.load(tmp_path / "half")
     for (name, value), found in zip(loaded.model.state_dict().items(), other.model.state_dict().values(), strict=True):
         assert torch.equal(value, found), name
-    assert loaded.method == method.suited(walkers.windows("train"))
+    assert loaded.method == method.resolve_defaults(walkers.windows("train"))
     test = walkers.windows("test")
     prior = runs.load(prior_run).model
     judged = partial(motion.scores, pose_prior=prior)

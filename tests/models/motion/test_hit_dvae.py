@@ -29,7 +29,7 @@ ENERGIES = {"samples": None, "pose_prior": None, "angles": None, "multimodal": N
 
 def build(windows, **options):
     torch.manual_seed(0)
-    return small(**options).suited(windows).build(windows).double()
+    return small(**options).resolve_defaults(windows).build(windows).double()
 
 
 def small(**options):
@@ -167,8 +167,8 @@ def test_the_presets_are_the_papers_weights(skeleton, frames, card):
 
 
 def test_schedules_have_the_papers_shares_of_500_epochs(windows):
-    """KL weights rise over 20 epochs, self-feeding over the next 80."""
-    method = dvae.method("hit-dvae").suited(windows)
+    """KL weights rise over 20 epochs, scheduled sampling over the next 80."""
+    method = dvae.method("hit-dvae").resolve_defaults(windows)
     recipe = method.train(windows, steps=500)
     feeding, (stage,) = recipe.feeding, recipe.stages
     assert [feeding(epoch) for epoch in (0, 20, 60, 100, 499)] == [0, 0, 0.5, 1, 1]
@@ -207,7 +207,9 @@ def test_an_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
     assert all(("validation/loss" in row) == (method.loss == "best-of-many") for row in rows)
     assert ("validation loss" in result.best) == (method.loss == "best-of-many")
     loaded = runs.load(tmp_path / "run")
-    assert loaded.method == configured(loaded.method.config()) == replace(method.suited(data.windows("train")))
+    assert (
+        loaded.method == configured(loaded.method.config()) == replace(method.resolve_defaults(data.windows("train")))
+    )
     assert loaded.model.feeding.probability == 0
     past = data.windows("test").all()["x"][:2, :15]
     assert torch.isfinite(loaded.model.forecast(past, 3, 2)["x"]).all()

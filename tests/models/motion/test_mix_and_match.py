@@ -12,7 +12,7 @@ from dvae import motion
 from dvae.distributions import Subset
 from dvae.models.motion.codes import CodeDiversity, codes
 from dvae.models.motion.mix_and_match import _aligned
-from dvae.motion.geometry.views import TURNS
+from dvae.motion.geometry.views import ROTATIONS
 from dvae.networks.noise import MixAndMatch
 from dvae.testing import FactorizationContract
 
@@ -54,7 +54,7 @@ def made(windows, **options):
 
 def past(windows, rows=4):
     batch = windows["test"].all()
-    return {"x": batch["x"][:rows, :5], "beside": {TURNS: batch["beside"][TURNS][:rows, :5]}}
+    return {"x": batch["x"][:rows, :5], "view_inputs": {ROTATIONS: batch["view_inputs"][ROTATIONS][:rows, :5]}}
 
 
 # -------------------------------------------------------------------------------------------------- the drawn indices
@@ -62,13 +62,13 @@ def past(windows, rows=4):
 
 @pytest.mark.parametrize(("share", "size", "chosen"), [(0, 7, 0), (0.3, 10, 3)])
 def test_a_subset_has_its_share_of_indices_all_alike_often(share, size, chosen):
-    law = Subset(share).distribution(size)
-    drawn = law.sample((4000,))
+    distribution = Subset(share).distribution(size)
+    drawn = distribution.sample((4000,))
     assert (drawn.sum(-1) == chosen).all()
     np.testing.assert_allclose(drawn.mean(0), chosen / size, atol=0.04)
     different = np.unique(drawn.numpy(), axis=0)
-    np.testing.assert_allclose(law.log_prob(drawn).exp() * len(different), 1, rtol=1e-5)
-    assert law.log_prob(1 - drawn[0]) == -torch.inf
+    np.testing.assert_allclose(distribution.log_prob(drawn).exp() * len(different), 1, rtol=1e-5)
+    assert distribution.log_prob(1 - drawn[0]) == -torch.inf
 
 
 def test_model_and_guide_share_one_set_of_indices_which_costs_nothing(windows):
@@ -85,7 +85,7 @@ def test_model_and_guide_share_one_set_of_indices_which_costs_nothing(windows):
     torch.manual_seed(0)
     terms = dvae.SequenceELBO(num_particles=2).terms(model, batch)
     assert set(terms.kl) == {"z"}
-    assert dvae.importance_bound(model, batch, particles=3).bound.shape == (6,)
+    assert dvae.iwae_bound(model, batch, particles=3).bound.shape == (6,)
 
 
 # ------------------------------------------------------------------------------------------------ how noise enters
@@ -170,7 +170,7 @@ def test_codes_are_those_that_futures_are_made_of(windows, noise):
     last = data["h"][:, -model.sizes["x"] :]
     for code, x in zip(found, forecast["x"], strict=True):
         state = code if noise == "step" else network.cell(last[:, None], code[None].contiguous())[0][:, 0]
-        shown = model.shown({"x": network.out(state)[:, None]}, data)["x"]
+        shown = model.to_data_space({"x": network.out(state)[:, None]}, data)["x"]
         torch.testing.assert_close(shown, x, atol=1e-6, rtol=1e-5)
 
 

@@ -70,7 +70,7 @@ def cvae_run(people, tmp_path_factory):
 
 def built(windows, name, **options):
     torch.manual_seed(0)
-    return small(name, **options).suited(windows).build(windows).double()
+    return small(name, **options).resolve_defaults(windows).build(windows).double()
 
 
 def batch_of(windows, size=4):
@@ -86,7 +86,7 @@ def decoder_of(model, windows):
     """A CVAE with the decoder of a model."""
     cvae = dvae.method("cvae", **OF_CVAE).build(windows).double()
     cvae.generator["x"].network.load_state_dict(model.generator["x"].network.decoder.state_dict())
-    cvae.generator["x"].law.load_state_dict(model.generator["x"].law.state_dict())
+    cvae.generator["x"].head.load_state_dict(model.generator["x"].head.state_dict())
     return cvae
 
 
@@ -110,7 +110,7 @@ def test_the_loss_of_dlow_is_the_papers(windows):
     model, batch = built(windows, "dlow", **options), batch_of(windows)
     objective = small("dlow", **options).train(windows).objective
     torch.manual_seed(1)
-    terms = dvae.SequenceELBO().terms(model, batch, self_feeding=1.0, draws=objective.draws)
+    terms = dvae.SequenceELBO().terms(model, batch, scheduled_sampling=1.0, draws=objective.draws)
     torch.manual_seed(1)
     noise = model.guide(batch, draws=objective.draws)["e"]
     assert torch.equal(noise, noise[:4].repeat(3, 1))
@@ -140,7 +140,7 @@ def test_the_loss_of_dsf_is_the_papers(windows):
     with torch.no_grad():
         model.sampler.heads.bias.mul_(3)  # some latents are outside of the radius
     objective = small("dsf", **options).train(windows).objective
-    terms = dvae.SequenceELBO().terms(model, batch, self_feeding=1.0, draws=objective.draws)
+    terms = dvae.SequenceELBO().terms(model, batch, scheduled_sampling=1.0, draws=objective.draws)
     w, cvae = codes(model, batch), decoder_of(model, windows)
     made = torch.stack([cvae.forecast(past_of(batch), FUTURE, fix={"w": w[:, k]})["x"][0] for k in range(3)])
     excess = (w.square().sum(2) - chi2.ppf(0.2, 4)).clamp_min(0)
@@ -168,7 +168,7 @@ def test_a_run_has_the_decoder_of_the_cvae_and_does_without_its_run(people, cvae
     assert run.method.heading
     for ours, theirs in (
         (run.model.generator["x"].network.decoder, cvae.network),
-        (run.model.generator["x"].law, cvae.law),
+        (run.model.generator["x"].head, cvae.head),
     ):
         assert all(torch.equal(value, theirs.state_dict()[key]) for key, value in ours.state_dict().items())
     assert run.model.forecast(past_of(people.windows("test").all()), FUTURE, 3)["x"].isfinite().all()
@@ -176,7 +176,7 @@ def test_a_run_has_the_decoder_of_the_cvae_and_does_without_its_run(people, cvae
 
 @pytest.mark.parametrize("name", NAMES)
 def test_without_a_run_a_cvae_is_fitted_first(windows, name):
-    method = small(name).suited(windows)
+    method = small(name).resolve_defaults(windows)
     decoders = []
     for seed in (0, 0, 1):
         torch.manual_seed(seed)
@@ -191,7 +191,7 @@ def test_without_a_run_a_cvae_is_fitted_first(windows, name):
 
 
 def started(windows, run, **options):
-    method = dvae.method("dlow", cvae_run=str(run), modes=3, **options).suited(windows)
+    method = dvae.method("dlow", cvae_run=str(run), modes=3, **options).resolve_defaults(windows)
     method.train(windows).prepare(method.build(windows))
 
 
@@ -207,7 +207,7 @@ def test_a_config_that_is_none_of_a_cvae_is_refused(windows, cvae_run, tmp_path,
     run = Path(shutil.copytree(cvae_run, tmp_path / "cvae"))
     config = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps({**config, **change}))
-    with pytest.raises(ValueError, match="none"):
+    with pytest.raises(ValueError, match="not the configuration of a cvae"):
         started(windows, run)
 
 

@@ -15,7 +15,7 @@ SMALL = MotionLatent(latent=4, widths=(32, 16))
 
 @pytest.fixture(scope="module")
 def people():
-    return bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
+    return bodies.fit_to_body(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
 
 
 @pytest.fixture(scope="module")

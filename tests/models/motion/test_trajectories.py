@@ -379,7 +379,7 @@ def test_scores_are_of_poses_relative_to_the_root_and_of_the_world(people):
 
 def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
     windows = motion.windows(people, replace(PROTOCOL, test_stride=3), "test").given(["RFoot", "LFoot"])
-    found = motion.Exchanged(windows, threshold=0.4)
+    found = motion.ExchangedWindows(windows, threshold=0.4)
     x, y = found.all()["x"], found.all()["y"]
     whole, keys = windows.all(), windows.keys
     feet = [windows.skeleton.find(name) for name in ("RFoot", "LFoot")]
@@ -394,14 +394,16 @@ def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
         assert keys[partner][:2] != key[:2]
         apart = (whole["x"][partner, 0] - whole["x"][own, 0]).unflatten(-1, (-1, 3))[feet].norm(dim=-1)
         assert (apart < 0.4).all()
-    assert found.fingerprint != motion.Exchanged(windows, threshold=0.4, seed=5).fingerprint != windows.fingerprint
+    assert (
+        found.fingerprint != motion.ExchangedWindows(windows, threshold=0.4, seed=5).fingerprint != windows.fingerprint
+    )
     scores = evaluate(build(windows).float(), found, samples=2, references=False)
     assert math.isfinite(scores["model"]["path error"].mean)
     assert "MMADE" not in scores["model"]  # the windows that begin with that pose have other paths
     assert scores.data["exchanged"] == {"threshold": 0.4, "seed": 0, "partners": len(partners), "truth": "path"}
     assert len(partners) > 0.3 * len(x)
-    owner = motion.Exchanged(windows, 0.4, truth="pose").all()
+    owner = motion.ExchangedWindows(windows, 0.4, truth="pose").all()
     assert torch.equal(owner["y"], y)
     assert torch.equal(owner["x"][:, 0], x[:, 0])
     with pytest.raises(ValueError, match="nearest"):
-        motion.Exchanged(windows, threshold=1e-9)
+        motion.ExchangedWindows(windows, threshold=1e-9)

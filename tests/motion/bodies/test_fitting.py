@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from dvae.motion import Clip, MotionSet, Skeleton, read_motion, simulate
-from dvae.motion.bodies import SHAPE, Body, betas, fitted, fitting, human, retargeted, shapes_of
-from dvae.motion.files.reading import chosen
+from dvae.motion.bodies import SHAPE, Body, betas, fit_to_body, fitting, human, retarget, shapes_of
+from dvae.motion.files.reading import select_joints
 from dvae.motion.geometry import rotations
 from dvae.motion.naming import sides
 from dvae.motion.scoring.matching import parts
@@ -61,7 +61,7 @@ def walkers():
 
 @pytest.fixture(scope="module")
 def on_body(walkers):
-    return fitted(walkers, PERSON)
+    return fit_to_body(walkers, PERSON)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def recorded(real):
     def read(file):
         motion = real(file)
         some = replace(motion, clips=motion.clips[:: -(-len(motion) // 8)])
-        return some, fitted(some, PERSON)
+        return some, fit_to_body(some, PERSON)
 
     return read
 
@@ -91,9 +91,9 @@ def test_clips_together_are_put_onto_the_body_as_each_alone(walkers, monkeypatch
     cut = [replace(part, name=f"{clip.name}-{n}") for clip in walkers for n, part in enumerate((clip, clip))]
     shape = shapes(6).repeat_interleave(torch.tensor([1, 3, 2, 2, 3, 1]), dim=0)
     monkeypatch.setattr(fitting, "AT_ONCE", 250)  # blocks that begin and end amid clips of one body
-    together = fitted(replace(walkers, clips=cut), PERSON, shape)
+    together = fit_to_body(replace(walkers, clips=cut), PERSON, shape)
     for clip, own, found in zip(cut, shape, together, strict=True):
-        (alone,) = fitted(replace(walkers, clips=[clip]), PERSON, own)
+        (alone,) = fit_to_body(replace(walkers, clips=[clip]), PERSON, own)
         np.testing.assert_allclose(found.positions, alone.positions, atol=1e-6)
         np.testing.assert_allclose(found.rotations, alone.rotations, atol=1e-6)
 
@@ -114,7 +114,7 @@ def test_the_person_in_motion_is_found_where_the_spine_does_not_bend():
     shape, vectors = shapes(4), 0.8 * torch.randn(4, 30, 22, 3)
     vectors[:, :, [3, 6, 9]] = 0
     motion = moved(shape, rotations.to_matrix(vectors, "vector"), torch.randn(4, 30, 3))
-    found = fitted(motion, PERSON, shape)
+    found = fit_to_body(motion, PERSON, shape)
     torch.testing.assert_close(positions(found), positions(motion), atol=1e-5, rtol=0)
     torch.testing.assert_close(shapes_of(found, PERSON), shape, atol=1e-5, rtol=0)
 
@@ -146,7 +146,7 @@ def test_nothing_is_twisted(recorded, on_body, file):
 
 def test_it_does_not_matter_which_axis_is_up(walkers, on_body):
     stood = [replace(clip, positions=clip.positions[..., [0, 2, 1]] * np.float32([1, -1, 1])) for clip in walkers]
-    again = fitted(MotionSet(stood, replace(walkers.skeleton, up="z")), PERSON)
+    again = fit_to_body(MotionSet(stood, replace(walkers.skeleton, up="z")), PERSON)
     assert again.skeleton.up == "y"
     torch.testing.assert_close(positions(again), positions(on_body), atol=1e-5, rtol=0)
 
@@ -156,7 +156,7 @@ def test_it_does_not_matter_which_axis_is_up(walkers, on_body):
 
 def test_other_bodies_make_the_same_turns_at_the_same_speed_in_legs(on_body):
     own, other = shapes_of(on_body, PERSON), shapes(len(on_body), 2)
-    moving = retargeted(on_body, PERSON, other)
+    moving = retarget(on_body, PERSON, other)
     torch.testing.assert_close(shapes_of(moving, PERSON), other, atol=1e-5, rtol=0)
     torch.testing.assert_close(joints_of(moving, other), positions(moving), atol=5e-6, rtol=0)
     legs = []
@@ -174,8 +174,8 @@ def test_whoever_stands_stays_on_the_floor():
     unturned = torch.eye(3).expand(6, 3, 22, 3, 3)
     low = -PERSON.at_rest(shape.float())[0][..., 1].amin(-1)
     rise = torch.stack([torch.zeros(6), low, torch.zeros(6)], -1)[:, None].expand(6, 3, 3)
-    standing = fitted(moved(shape, unturned, rise), PERSON, shape)
-    made = retargeted(standing, PERSON, other)
+    standing = fit_to_body(moved(shape, unturned, rise), PERSON, shape)
+    made = retarget(standing, PERSON, other)
     places = torch.from_numpy(np.stack([clip.positions[:, 0] for clip in made]))
     soles = PERSON(other.float(), unturned, places)[0][..., 1].amin(-1)
     torch.testing.assert_close(soles, torch.zeros(6, 3), atol=1e-5, rtol=0)
@@ -195,14 +195,14 @@ def test_files_of_amass_bring_turns_and_betas(tmp_path):
         np.savez(tmp_path / f"{n}.npz", poses=poses, trans=trans, gender=np.array("female"), **beside)
     motion = read_motion(tmp_path)
     torch.testing.assert_close(betas(motion), shape)
-    found = fitted(motion, PERSON, betas(motion))
+    found = fit_to_body(motion, PERSON, betas(motion))
     torch.testing.assert_close(shapes_of(found, PERSON), shape, atol=1e-5, rtol=0)
     exact, lying = deepcopy(PERSON).double(), torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()  # z to y
     for clip, own, (poses, trans) in zip(found, shape, written, strict=True):
         turns = rotations.to_matrix(torch.from_numpy(poses[:, :66]).unflatten(-1, (-1, 3)), "vector")
         expected = exact(own, turns, torch.from_numpy(trans))[1] @ lying.T
         np.testing.assert_allclose(clip.positions, expected, atol=1e-5)
-    assert fitted(motion, PERSON).skeleton.names == PERSON.names
+    assert fit_to_body(motion, PERSON).skeleton.names == PERSON.names
 
 
 # ------------------------------------------------------------------------------------------------------ what is refused
@@ -211,18 +211,18 @@ def test_files_of_amass_bring_turns_and_betas(tmp_path):
 def test_what_cannot_be_put_onto_a_body_is_refused(walkers, on_body):
     with pytest.raises(ValueError, match="has no betas, expected 8"):
         betas(walkers)
-    armless = chosen(walkers, [name for name in walkers.skeleton.names if "Wrist" not in name])
+    armless = select_joints(walkers, [name for name in walkers.skeleton.names if "Wrist" not in name])
     with pytest.raises(ValueError, match="has no l wrist, r wrist"):
-        fitted(armless, PERSON)
+        fit_to_body(armless, PERSON)
     hidden = walkers.clips[0].positions.copy()
     hidden[3, 5] = np.nan
     gaps = MotionSet([replace(walkers.clips[0], positions=hidden)], walkers.skeleton, missing=True)
     with pytest.raises(ValueError, match="lacks joints"):
-        fitted(gaps, PERSON)
+        fit_to_body(gaps, PERSON)
     with pytest.raises(ValueError, match=r"expected \(8,\) or \(6, 8\)"):
-        retargeted(on_body, PERSON, torch.zeros(5, 8))
-    with pytest.raises(ValueError, match="fitted puts it there"):
+        retarget(on_body, PERSON, torch.zeros(5, 8))
+    with pytest.raises(ValueError, match="fit_to_body puts it there"):
         shapes_of(walkers.with_rotations(), PERSON)
     tensors = [getattr(PERSON, name) for name in ("template", "shapes", "regressor", "weights", "faces")]
     with pytest.raises(ValueError, match="the body has no pelvis"):
-        fitted(walkers, Body([f"joint {n}" for n in range(22)], PERSON.parents, *tensors))
+        fit_to_body(walkers, Body([f"joint {n}" for n in range(22)], PERSON.parents, *tensors))

@@ -19,13 +19,13 @@ from dvae.cli.console import Missing
 from dvae.cli.help import Expert
 from dvae.inference.diagnostics.checks import STATISTICS
 from dvae.inference.evaluation import metrics
-from dvae.inference.evaluation.held import clip_places
+from dvae.inference.evaluation.evaluation_windows import clip_index
 from dvae.inference.evaluation.references import distances, last_value
 from dvae.models.motion.trajectories import TrajectoryMethod
 from dvae.models.registry import METHODS
 from dvae.motion.data.clips import Clip, MotionSet
 from dvae.motion.drawing.player import MISSING, _scene
-from dvae.motion.drawing.plot import staged
+from dvae.motion.drawing.plot import make_scene
 from dvae.motion.scoring import energies
 from dvae.motion.scoring import metrics as errors
 
@@ -261,7 +261,7 @@ def test_a_diversity_with_gaps_is_that_of_what_pairs_share():
 def test_what_is_forecast_in_gaps_changes_no_score_and_the_truth_errs_in_nothing():
     whole, windows = (motion.windows(each, motion.PROTOCOLS["simulated"], "test") for each in (PEOPLE, GAPS))
     observed, x, index = windows.protocol.observed, windows.all().mask_to_nan(), torch.arange(len(windows))
-    past, truth, clips = windows.all().past(observed), x[:, observed:], clip_places(windows.keys)
+    past, truth, clips = windows.all().past(observed), x[:, observed:], clip_index(windows.keys)
     forecasts, real = torch.randn(len(x), 3, *truth.shape[1:]), whole.all()["x"][:, None, observed:]
     anywhere = torch.where(truth[:, None].isnan(), 9.0, forecasts)
     measures = {measure.name: measure for measure in motion.scores(windows)}
@@ -300,10 +300,10 @@ def test_what_needs_whole_bodies_says_what_to_do():
         motion.scores(windows, classifiers={"content": None})
     told = motion.windows(GAPS, motion.PROTOCOLS["simulated-trajectories"], "test").given(["LWrist"])
     with pytest.raises(ValueError, match=r"exchanged whole, but these windows may lack joints.*dvae impute"):
-        motion.Exchanged(told)
+        motion.ExchangedWindows(told)
     data, method = small("trajevae")
     pose = GAPS.clips[0].positions[np.isnan(GAPS.clips[0].positions).any((1, 2))][0]
-    with pytest.raises(ValueError, match=r"the initial pose lacks .*fill the gaps first") as refused:
+    with pytest.raises(ValueError, match=r"the initial pose has no positions of .*fill the gaps first") as refused:
         method.build(data.schema).complete(pose, frames=5)
     assert "--missing" not in str(refused.value)
     flow = dvae.method("moglow", width=4, flow_steps=1)
@@ -327,7 +327,7 @@ def test_windows_are_put_back_where_they_were(root, heading):
     if heading:
         angle = WALKER.heading_near(read, protocol.observed - 1)[:, None, None]
         made = motion.rotate_about_up(made, -angle, WALKER.up)
-    found = windows.filled(made)
+    found = windows.fill_missing(made)
     assert found.missing == any(np.isnan(clip.positions).any() for clip in found)
     covered = max(key[2] for key in windows.keys) + windows.length
     for clip in found:
@@ -367,7 +367,7 @@ def small(name):
     data = motion.MotionData("simulated", GAPS, protocol)
     own = {"latent": 4, "warm_up": 1} | ({"width": 8} if name == "equations" else {})
     options = SMALL.get(name, {"width": 4} if name == "autoregressive" else own)
-    return data, dvae.method(name, **options).suited(data.windows("train"))
+    return data, dvae.method(name, **options).resolve_defaults(data.windows("train"))
 
 
 @pytest.mark.parametrize("name", [name for name in METHODS if name not in ("mix-and-match", "motion-latent", "moglow")])
@@ -435,7 +435,7 @@ def test_gsps_fills_gaps_by_what_comes_near_to_all_that_was_seen():
 def test_players_have_gaps():
     """A joint that is missing is nowhere; all others are where they are in whole motion."""
     samples, observed, truth = (each[:, 0] if each.ndim == 5 else each[0] for each in _future_with_gaps())
-    stage = staged(WALKER, observed, samples, truth, every=1)
+    stage = make_scene(WALKER, observed, samples, truth, every=1)
     gaps = np.isnan(np.concatenate([observed, truth])).any(-1)
     assert np.array_equal(np.isnan(stage.motion[0]).any(-1), gaps)
     scene = _scene(stage)
@@ -446,7 +446,7 @@ def test_players_have_gaps():
     assert np.array_equal((person == MISSING).any(-1), gaps)
     np.testing.assert_allclose(scene["unit"] * person[~gaps], stage.motion[0][~gaps], atol=0.51 * scene["unit"])
     with pytest.raises(ValueError, match="NaN"):
-        staged(WALKER, observed, truth[None])
+        make_scene(WALKER, observed, truth[None])
 
 
 # ----------------------------------------------------------------------------------------------------- the command line
@@ -519,9 +519,9 @@ def test_gaps_are_filled_in_the_motion_itself(fitted, tmp_path, capsys):
     assert (bvh.clips[0].frames, bvh.skeleton.fps) == (clip.frames, WALKER.fps)
     capsys.readouterr()
     for arguments, message in (
-        (["--filled", str(tmp_path / "all.bvh")], "holds one clip, of"),
+        (["--filled", str(tmp_path / "all.bvh")], "can contain one of"),
         (["--particles", "2", "--out", str(tmp_path / "i.npz")], "--particles chooses among fillings of tables"),
-        ([], "say which, by --out or --filled"),
+        ([], "name it with --out or --filled"),
     ):
         assert main([*impute, *arguments]) == 2
         assert message in capsys.readouterr().err
@@ -534,6 +534,6 @@ def test_a_run_is_scored_and_shown_on_other_motion_with_gaps(gaps, tmp_path, cap
     assert main([*forecast, *other[:2]]) == 1
     assert main([*forecast, *other]) == 0
     assert main([*forecast, "--missing"]) == 2
-    assert "--missing is about other data" in capsys.readouterr().err
+    assert "--missing is for other data" in capsys.readouterr().err
     assert main(["evaluate", run, *other, *few, "--log-score-particles", "2", "--out", str(tmp_path / "e.json")]) == 0
     assert np.isfinite(json.loads((tmp_path / "e.json").read_text())["summary"]["vae"]["log score"]["mean"])

@@ -170,9 +170,9 @@ def test_the_command_plays_what_dvae_forecast_wrote(forecasts, tmp_path, capsys)
     assert main(["animate", str(file), "--out", str(page), "--window", "1"]) == 0
     assert "window 1, test/stand" in capsys.readouterr().err
     assert "no window of a clip 'run'" in failure(capsys, file, "--out", page, "--clip", "run")
-    assert "they go from 0 to 1" in failure(capsys, file, "--out", page, "--window", "2", code=2)
-    assert "has 3 of each window" in failure(capsys, file, "--out", page, "--samples", "4", code=2)
-    assert "no run directory" in failure(capsys, file, "--out", page, "--data", "simulated", code=2)
+    assert "it must be from 0 to 1" in failure(capsys, file, "--out", page, "--window", "2", code=2)
+    assert "has only 3 futures of each window" in failure(capsys, file, "--out", page, "--samples", "4", code=2)
+    assert "not a run directory" in failure(capsys, file, "--out", page, "--data", "simulated", code=2)
 
 
 def test_the_command_plays_a_run_and_its_data(run, tmp_path, capsys):
@@ -187,4 +187,6 @@ def test_the_command_plays_a_run_and_its_data(run, tmp_path, capsys):
     assert "train/person_0001, 80 frames" in capsys.readouterr().err
     assert "futures" in failure(capsys, data, "--out", page, "--samples", "2", code=2)
     assert "no clip 'nobody'" in failure(capsys, data, "--out", page, "--clip", "nobody")
-    assert "is no run directory; name a run, or one motion file" in failure(capsys, tmp_path, "--out", page)
+    assert "is a folder but not a run directory; name a run, or a motion file" in failure(
+        capsys, tmp_path, "--out", page
+    )

@@ -37,7 +37,8 @@ def test_points_that_a_model_of_the_body_computed_are_no_joints(tmp_path):
     read = read_motion(tmp_path / "a.c3d")
     assert sorted(read.skeleton.names) == names
     assert (
-        "4 points computed by a model of the body are left out (LKneeAngle, RKneeAngle, LKneePower, Spare)" in read.said
+        "4 points computed by a model of the body are left out (LKneeAngle, RKneeAngle, LKneePower, Spare)"
+        in read.interpretation
     )
 
 

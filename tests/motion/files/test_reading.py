@@ -22,7 +22,7 @@ from dvae.motion import (
     write_motion,
 )
 from dvae.motion.files.recording import Recording
-from dvae.motion.files.settled import settle, understand
+from dvae.motion.files.world import infer_world, to_world
 
 FORMATS = {"npz": "all.npz", "bvh": "folder", "csv": "folder", "amass": "folder"}
 
@@ -99,7 +99,7 @@ def test_a_joint_rests_where_its_channels_place_it(people, tmp_path):
     path.write_text(placed(text, "LKnee", 1.0))  # a centimetre along each axis, in every other frame
     read = read_motion(path)
     assert (read.clips[0].rotations, read.skeleton.rest) == (None, ())
-    assert "rotations are left out, as a joint moves against the one that it hangs from" in read.said
+    assert "rotations are left out, as a joint moves against the one that it hangs from" in read.interpretation
     path.write_text(placed(text, "LKnee", 0.01))
     assert read_motion(path).clips[0].rotations is not None
 
@@ -127,8 +127,8 @@ def test_skeletons_survive_bvh(people, tmp_path):
 def test_samples_are_people_of_a_plausible_size(file, joints, said, shared, real):
     read = read_motion(shared(f"cmu_raw/{file}"))
     assert (read.skeleton.joints, read.skeleton.up, len(read)) == (joints, "y", 1)
-    assert said in read.said
-    assert read.said in printed(read)
+    assert said in read.interpretation
+    assert read.interpretation in printed(read)
     assert len(read.skeleton.left) == len(read.skeleton.right) > 0
     assert read_motion(shared(f"cmu_raw/{file}"), onto=WALKER).skeleton.names == WALKER.names
     if not file.endswith("bvh"):
@@ -143,9 +143,9 @@ def test_units_and_axes_are_found_from_the_person(people, scale, turn):
     turns |= {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "-z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
     positions = people.clips[0].positions.astype(float)
     seen = Recording(WALKER.names, WALKER.parents, scale * positions @ np.array(turns[turn], float).T, fps=30)
-    world = understand({"a": seen})
+    world = infer_world({"a": seen})
     assert world.metres == pytest.approx(1 / scale)
-    settled = settle(seen, world)
+    settled = to_world(seen, world)
     assert settled.up == ("z" if turn == "z" else "y")
     vertical = 2 if turn == "z" else 1
     heights = positions[..., 1]
@@ -156,7 +156,7 @@ def test_units_and_axes_are_found_from_the_person(people, scale, turn):
 
 def test_what_is_given_goes_before_what_is_found(bvh, people):
     read = read_motion(bvh, metres=0.005, fps=60)
-    assert "as given (0.005 m)" in read.said
+    assert "as given (0.005 m)" in read.interpretation
     assert read.skeleton.fps == 60
     np.testing.assert_allclose(2 * read.clips[0].positions, read_motion(bvh).clips[0].positions, rtol=1e-5)
     assert read_motion(bvh, up="z").skeleton.up == "z"
@@ -190,18 +190,21 @@ def test_who_lies_is_said_and_files_that_say_their_axis_are_turned(people, tmp_p
     tilted = [replace(clip, positions=clip.positions[..., [2, 0, 1]]) for clip in people]  # z up
     save(tmp_path / "a.npz", MotionSet(tilted, WALKER))
     read = read_motion(tmp_path / "a.npz")
-    assert read.said == "heads are above feet along z, not y, which was taken for up in 3 of 3 clips"
-    assert read.said in printed(read).replace("\n", " ")
-    assert read_motion(tmp_path / "a.npz", up="z").said == ""
+    assert read.interpretation == "heads are above feet along z, not y, which was taken for up in 3 of 3 clips"
+    assert read.interpretation in printed(read).replace("\n", " ")
+    assert read_motion(tmp_path / "a.npz", up="z").interpretation == ""
     for name, up, clip in (("a", "y", people.clips[0]), ("b", "y", people.clips[1]), ("c", "z", tilted[2])):
         whole = MotionSet([replace(clip, name=name, split="all")], replace(WALKER, up=up))
         write_motion(tmp_path / "mixed" / name / "a.csv", whole)
     read = read_motion(tmp_path / "mixed")
-    assert (read.skeleton.up, read.said.count("heads")) == ("y", 0)
+    assert (read.skeleton.up, read.interpretation.count("heads")) == ("y", 0)
     for clip, own in zip(read, people, strict=True):
         np.testing.assert_allclose(clip.positions[..., 1], own.positions[..., 1], atol=1e-6)
     given = read_motion(tmp_path / "mixed", up="y")
-    assert "heads are above feet along z, not y, which was taken for up in 1 of 3 files, the first a.csv" in given.said
+    assert (
+        "heads are above feet along z, not y, which was taken for up in 1 of 3 files, the first a.csv"
+        in given.interpretation
+    )
 
 
 def test_a_folder_is_read_to_its_last_subfolder_without_its_links(bvh, tmp_path):

@@ -17,7 +17,7 @@ from dvae.motion import (
     simulate,
     write_motion,
 )
-from dvae.motion.files.plain import read_arrays
+from dvae.motion.files.arrays import read_arrays
 from dvae.motion.files.smpl import JOINTS
 
 

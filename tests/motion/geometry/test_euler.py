@@ -11,7 +11,7 @@ import dvae
 from dvae import motion
 from dvae.motion.geometry.euler import Angles, euler_errors
 from dvae.motion.geometry.rotations import from_matrix, to_matrix
-from dvae.motion.geometry.views import TURNS
+from dvae.motion.geometry.views import ROTATIONS
 
 PROTOCOL = replace(motion.PROTOCOLS["simulated"], observed=5, predicted=12, test_stride=6, representation="quaternion")
 TIMES = (80, 160, 320, 400)
@@ -58,7 +58,7 @@ def test_the_angles_are_those_of_the_public_protocol(windows):
 
 def by_hand(windows, futures, joints):
     """Errors (K, N, times) of turns (K, N, T, J, 3, 3), in numpy and from the file's turns."""
-    truth = to_matrix(windows.all()["beside"][TURNS].unflatten(-1, (-1, 4)), "quaternion")
+    truth = to_matrix(windows.all()["view_inputs"][ROTATIONS].unflatten(-1, (-1, 4)), "quaternion")
     at = [round(time * 30 / 1000) + 4 for time in TIMES]  # 2, 5, 10 and 12 frames after the fifth
     true, made = (from_matrix(each[..., at, :, :, :][..., joints, :, :], "euler-zyx") for each in (truth, futures))
     varying = true.flatten(0, 1).flatten(1).std(0) > 1e-4
@@ -69,7 +69,7 @@ def test_zero_velocity_by_hand_and_no_error_of_the_truth(windows):
     found = euler_errors({}, windows, times=TIMES, counts=(1, 5), progress=False)
     skeleton = windows.skeleton
     joints = sorted(set(skeleton.parents) - {-1, skeleton.root})
-    turns = to_matrix(windows.all()["beside"][TURNS].unflatten(-1, (-1, 4)), "quaternion")
+    turns = to_matrix(windows.all()["view_inputs"][ROTATIONS].unflatten(-1, (-1, 4)), "quaternion")
     still = by_hand(windows, turns[:, 4:5].expand(-1, 17, -1, -1, -1), joints)
     for place, time in enumerate(TIMES):
         for count in (1, 5):
@@ -83,8 +83,8 @@ def test_zero_velocity_by_hand_and_no_error_of_the_truth(windows):
 
 def test_the_best_is_among_the_first_futures_by_its_mean_over_the_times(windows, monkeypatch):
     model, counts, seen = mix(windows, noise="step", velocity=True), (1, 3, 8), []
-    shown = model.shown
-    monkeypatch.setattr(model, "shown", lambda values, data: seen.append(values["x"]) or shown(values, data))
+    shown = model.to_data_space
+    monkeypatch.setattr(model, "to_data_space", lambda values, data: seen.append(values["x"]) or shown(values, data))
     found = euler_errors({"mix": model}, windows, times=TIMES, counts=counts, progress=False)
     turning = sorted(set(windows.skeleton.parents) - {-1})
     made = to_matrix(torch.cat(seen, 1).unflatten(-1, (len(turning), 4)), "quaternion")
@@ -130,7 +130,7 @@ def test_positions_are_scored_by_the_turns_that_they_show_on_both_sides(people, 
     for name in again.rows:
         assert again[name]["320 ms, best of 4"].mean == pytest.approx(errors[name], abs=1e-3)
     past = Angles(windows, TIMES).all()["motion"]  # a model is not shown the future
-    assert past["x"].shape[1] == past["beside"][TURNS].shape[1] == 5
+    assert past["x"].shape[1] == past["view_inputs"][ROTATIONS].shape[1] == 5
 
 
 def test_what_it_refuses(people, windows):

@@ -10,9 +10,9 @@ from dvae import motion
 from dvae.cli.futures import draw_futures
 from dvae.data.batch import Batch
 from dvae.data.schema import SchemaError
-from dvae.inference.evaluation.held import clip_places
+from dvae.inference.evaluation.evaluation_windows import clip_index
 from dvae.motion.geometry import kinematics, rotations
-from dvae.motion.geometry.views import LENGTHS, TURNS, Rotations
+from dvae.motion.geometry.views import LENGTHS, ROTATIONS, Rotations
 from dvae.motion.scoring import metrics as errors
 
 PROTOCOL = replace(motion.PROTOCOLS["simulated"], observed=5, predicted=7)
@@ -61,7 +61,7 @@ def test_what_is_seen_goes_back(people_of_two_sizes, form, root):
         seen = model.read(given)
         assert seen["x"].shape == (6, 12, model.sizes["x"])
         assert model.read(seen) == seen  # once
-        again = model.shown({"x": seen["x"]}, seen)["x"]
+        again = model.to_data_space({"x": seen["x"]}, seen)["x"]
         torch.testing.assert_close(again, batch["x"].double(), atol=1e-6, rtol=0)
 
 
@@ -71,16 +71,16 @@ def test_turns_of_windows_are_those_of_their_positions(people_of_two_sizes, opti
     for batch in (data.sample(6, torch.Generator().manual_seed(0)), data.all()):
         positions = data.positions(batch["x"]).double()
         body = data.skeleton
-        turns = rotations.to_matrix(batch["beside"][TURNS].double().unflatten(-1, (-1, 4)), "quaternion")
+        turns = rotations.to_matrix(batch["view_inputs"][ROTATIONS].double().unflatten(-1, (-1, 4)), "quaternion")
         offsets = torch.zeros(len(positions), 1, body.joints, 3, dtype=torch.float64)
         children = [child for _, child in body.edges]
         directions = torch.nn.functional.normalize(body.offsets, dim=-1)[children]
         offsets[:, 0, children] = body.bone_lengths(positions).mean(1)[..., None] * directions
         again, _ = kinematics.forward(body.parents, turns, offsets, positions[:, :, body.root])
         torch.testing.assert_close(again, positions, atol=1e-5, rtol=0)
-        assert (batch.leaves()[f"beside/{TURNS}"][:, 1:] * batch["beside"][TURNS][:, :-1]).unflatten(-1, (-1, 4)).sum(
-            -1
-        ).min() > 0.5
+        assert (batch.leaves()[f"view_inputs/{ROTATIONS}"][:, 1:] * batch["view_inputs"][ROTATIONS][:, :-1]).unflatten(
+            -1, (-1, 4)
+        ).sum(-1).min() > 0.5
 
 
 @pytest.mark.parametrize(("method", "form"), [("vae", "6d"), ("srnn", "quaternion"), ("vae", "vector")])
@@ -119,13 +119,13 @@ def test_what_is_seen_has_no_jumps(people_of_two_sizes, form, told):
 def test_the_past_does_not_see_turns_of_its_future(people_of_two_sizes):
     data = windows(people_of_two_sizes, representation="6d")
     model, batch = small(data, "srnn"), data.all()
-    turns = batch["beside"][TURNS]
+    turns = batch["view_inputs"][ROTATIONS]
     found = []
     for changed in (slice(0, 0), slice(5, None), slice(4, None)):  # nothing, the future, and the last of the past
         told = turns.clone()
         told[:, changed] = torch.randn_like(told[:, changed])
         torch.manual_seed(0)
-        found.append(model.forecast({"x": batch["x"][:, :5], "beside": {TURNS: told}}, horizon=4)["x"])
+        found.append(model.forecast({"x": batch["x"][:, :5], "view_inputs": {ROTATIONS: told}}, horizon=4)["x"])
     torch.testing.assert_close(found[1], found[0])
     assert (found[2] - found[0]).abs().max() > 1e-3
 
@@ -146,7 +146,7 @@ def test_a_run_of_turns_keeps_its_rest_pose_and_draws_what_is_scored(people_of_t
         torch.from_numpy(drawn.truth[..., 1:, :]).flatten(2),
     )
     scored = dvae.evaluate(loaded.model, test, scores=motion.scores, samples=3, seed=0, progress=False).rows["model"]
-    means = [found[places == clip].mean() for places in [clip_places(test.keys)] for clip in places.unique()]
+    means = [found[places == clip].mean() for places in [clip_index(test.keys)] for clip in places.unique()]
     torch.testing.assert_close(torch.stack(means), torch.tensor(scored.clip_means["ADE"]).to(found))
 
 

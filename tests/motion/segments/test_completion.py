@@ -16,9 +16,9 @@ from dvae.motion.segments.completion import (
     chamfer,
     complete,
     error_by_time,
-    glimpsed,
     nearest_vertices,
-    scanned,
+    sample_surfaces,
+    simulate_observations,
     surfaces_at,
 )
 from dvae.motion.segments.embodied import SHAPE, Segments
@@ -30,7 +30,7 @@ THOROUGH = dvae.Descent(steps=80, rate=0.1, starts=2, candidates=8, newton=3)
 
 @pytest.fixture(scope="module")
 def segments():
-    people = bodies.fitted(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
+    people = bodies.fit_to_body(motion.simulate(clips=4, frames=90, seed=1), bodies.human())
     return Segments(motion.gait_cycles(people))
 
 
@@ -40,7 +40,7 @@ def model(segments):
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(0)
         model = MotionLatent(latent=3, widths=(16,)).build(segments).eval().double()
-        trunk = model.generator["turns"].network.trunk
+        trunk = model.generator["rotations"].network.trunk
         waves = torch.stack([torch.cos(torch.pi * n * torch.linspace(0, 1, 100)) for n in range(4)], 1).double()
         drawn = torch.randn(4, 16, model.timed.size, dtype=torch.float64)
         trunk.out.weight.copy_(0.05 * torch.einsum("tn,nhd->tdh", waves, drawn).flatten(0, 1))
@@ -62,7 +62,7 @@ def test_decoding_is_the_mean_of_the_program(model):
     z, shape, x = made(model, 3)
     program = poutine.condition(model.model, data={"z": z})
     parts = program({SHAPE: shape}, length=100, mean_emission=True)
-    torch.testing.assert_close(model.shown(parts)["x"], x)
+    torch.testing.assert_close(model.to_data_space(parts)["x"], x)
     torch.testing.assert_close(model.decode(z[:, None], shape[:, None]), x[:, None])
     some = torch.tensor([0, 40, 99])
     torch.testing.assert_close(model.decode(z, shape, some), x[:, some])
@@ -99,7 +99,7 @@ def test_moments_are_met_in_decoded_time(model):
 def test_what_the_decoder_made_is_found_again(model, kind, options):
     """A mode is no less probable than the truth; of points, which do not tell how they belong, it is as near."""
     z, shape, x = made(model, 2)
-    seen = glimpsed(model, x, shape, kind, **options)
+    seen = simulate_observations(model, x, shape, kind, **options)
     found = complete(model, seen, descent=THOROUGH)
     if kind == "points":
         ours, theirs = (
@@ -125,7 +125,7 @@ def test_intervals_of_completions_hold_what_they_promise(model):
     """Of segments from the model and markers with its noise, within four binomial standard errors."""
     z, shape, x = made(model, 120, seed=3)
     noise = Deviations(marker=0.05)
-    seen = glimpsed(model, x, shape, "markers", frames=[10, 60])
+    seen = simulate_observations(model, x, shape, "markers", frames=[10, 60])
     seen["markers"] = seen["markers"] + noise.marker * torch.randn_like(seen["markers"])
     found = complete(model, {**seen, SHAPE: shape}, deviations=noise, descent=BRIEF)
     away = ((z - found.posterior.mode["z"]) / found.posterior.deviation["z"]).abs()
@@ -139,7 +139,7 @@ def test_intervals_of_completions_hold_what_they_promise(model):
 def test_what_is_missing_counts_for_nothing(model):
     z, shape, x = made(model, 2)
     program = SegmentCompletion(model)
-    seen = glimpsed(model, x, shape, "markers", frames=[5, 50, 80])
+    seen = simulate_observations(model, x, shape, "markers", frames=[5, 50, 80])
 
     def energy(seen):
         conditioned = poutine.condition(program, data={"z": z + 0.1, SHAPE: shape})
@@ -164,7 +164,7 @@ def test_the_nearest_vertices_are_what_points_are_held_against(model):
     which = nearest_vertices(model.body, shape, rotations, places, points)
     assert torch.equal(which, torch.cdist(points, vertices).argmin(-1))
     program, (z, shape, x) = SegmentCompletion(model), made(model, 2)
-    seen = program.read(glimpsed(model, x, shape, "points", frames=[0, 50]))
+    seen = program.read(simulate_observations(model, x, shape, "points", frames=[0, 50]))
     values = {"z": z, SHAPE: shape}
     runs = [poutine.trace(poutine.condition(program, values)) for _ in range(2)]
     batches = seen, program.renewed(seen, values)
@@ -175,13 +175,13 @@ def test_the_nearest_vertices_are_what_points_are_held_against(model):
 def test_known_segments_make_the_prior(model, segments):
     """Where nothing is told of z, it is found in their middle, as wide as they are; without them, in the model's."""
     batch = {name: value.double() for name, value in segments.all().items()}
-    law = model.posterior(batch)
+    distribution = model.posterior(batch)
     z, shape, x = made(model, 2)
-    seen = {**glimpsed(model, x, shape, "markers", frames=[0]), SHAPE: shape}
+    seen = {**simulate_observations(model, x, shape, "markers", frames=[0]), SHAPE: shape}
     how = {"deviations": Deviations(marker=1e6, time=1e6), "descent": BRIEF}
     ours, theirs = (complete(model, seen, known=batch, aggregate=each, **how).posterior for each in (True, False))
-    wide = _shrunk(law.mean, law.variance.mean(0)).diagonal()
-    torch.testing.assert_close(ours.mode["z"], law.mean.mean(0).expand(2, -1))
+    wide = _shrunk(distribution.mean, distribution.variance.mean(0)).diagonal()
+    torch.testing.assert_close(ours.mode["z"], distribution.mean.mean(0).expand(2, -1))
     torch.testing.assert_close(ours.deviation["z"], wide.sqrt().expand(2, -1))
     torch.testing.assert_close(theirs.mode["z"], torch.zeros_like(z))
     torch.testing.assert_close(theirs.deviation["z"], torch.ones_like(z))
@@ -202,7 +202,7 @@ def test_a_covariance_of_few_is_shrunk():
 def test_scans_are_uniform_and_errors_are_of_the_time_asked_for(model):
     _, shape, x = made(model, 3)
     vertices = model.vertices(x[:, :1].expand(-1, 100, -1), shape)[:, :2]
-    points = scanned(vertices, model.body.faces, 4000, torch.Generator().manual_seed(0))
+    points = sample_surfaces(vertices, model.body.faces, 4000, torch.Generator().manual_seed(0))
     assert chamfer(points, vertices).max() < 0.02
     assert chamfer(torch.where(torch.rand(*points.shape[:-1], 1) < 0.5, points, torch.nan), vertices).isfinite().all()
     # shares of points are shares of area: above the pelvis and below
@@ -213,7 +213,7 @@ def test_scans_are_uniform_and_errors_are_of_the_time_asked_for(model):
     assert abs(float((points[0, 0, :, 1] > 0).double().mean()) - share) < 4 * error + 0.02  # of triangles across
 
     longest, moved = float(model.timed.lasts(x).max()), x.clone()
-    moved[..., model.timed.parts["place"][1]] += 0.1 / model.timed.metres
+    moved[..., model.timed.parts["translation"][1]] += 0.1 / model.timed.metres
     errors, many = error_by_time(model, (moved, shape), (x, shape), [0.0, 0.1, longest, longest + 1])
     assert many.tolist() == [3, 3, 1, 0]
     torch.testing.assert_close(errors[:2], torch.full((2,), 0.1, dtype=torch.float64))
@@ -224,7 +224,7 @@ def test_scans_are_uniform_and_errors_are_of_the_time_asked_for(model):
 
 def test_recovered_segments_are_compared_with_the_truth_and_become_motion(model):
     _, shape, x = made(model, 2)
-    seen = glimpsed(model, x, shape, "markers", frames=range(0, 100, 20))
+    seen = simulate_observations(model, x, shape, "markers", frames=range(0, 100, 20))
     keys, truth = [("a", "first"), ("b", "second")], {"x": x, SHAPE: shape}
     found = recover(model, {**seen, SHAPE: shape}, keys, truth=truth, descent=THOROUGH)
     assert found.away["markers"].max() < 1e-3
@@ -246,7 +246,7 @@ def test_recovered_segments_are_compared_with_the_truth_and_become_motion(model)
 
 def test_what_cannot_have_been_seen_is_refused(model):
     _, shape, x = made(model, 2)
-    seen = glimpsed(model, x, shape, "markers", frames=[0, 50])
+    seen = simulate_observations(model, x, shape, "markers", frames=[0, 50])
     program = SegmentCompletion(model)
     for wrong, message in (
         ({**seen, "marker": seen["markers"]}, "nothing to be seen called marker"),
@@ -259,7 +259,7 @@ def test_what_cannot_have_been_seen_is_refused(model):
         with pytest.raises(ValueError, match=message):
             program.read(wrong)
     with pytest.raises(ValueError, match="expected 'surfaces', 'points' or 'markers'"):
-        glimpsed(model, x, shape, "marker")
+        simulate_observations(model, x, shape, "marker")
     with pytest.raises(ValueError, match="marker"):
         Deviations(marker=0.0)
 

@@ -9,7 +9,7 @@ import torch
 
 from dvae.motion import Clip, Cycles, MotionSet, Skeleton, gait_cycles, reference_cycles, simulate
 from dvae.motion.geometry import kinematics, rotations
-from dvae.motion.segments.gait import alike, find_cycles
+from dvae.motion.segments.gait import find_cycles, on_common_joints
 
 SKELETON = simulate(clips=4, frames=60).with_rotations().skeleton
 
@@ -133,7 +133,7 @@ def test_two_sources_get_one_tree_and_rest_poses_of_their_own(real):
     bandai, cmu = real("bandai/bandai2.npz"), real("cmu/cmu8.npz")
     bandai = MotionSet([clip for clip in bandai if clip.labels["content"] == "walk"][::40], bandai.skeleton, "bandai")
     cmu = MotionSet([clip for clip in cmu if clip.labels["content"] == "walking"][::4], cmu.skeleton, "cmu")
-    first, second = alike(bandai, cmu)
+    first, second = on_common_joints(bandai, cmu)
     assert (first.skeleton.names, first.skeleton.parents) == (second.skeleton.names, second.skeleton.parents)
     assert first.skeleton.rest != second.skeleton.rest
     assert [clip.key for clip in second] == [clip.key for clip in cmu]

@@ -6,7 +6,7 @@ import torch
 
 import dvae
 from dvae import motion
-from dvae.motion import Interpolation, falls, interpolate, latent_map, transferred
+from dvae.motion import Interpolation, falls, interpolate, latent_map, transfer
 from dvae.motion.geometry.rotations import from_matrix, to_matrix
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import SHAPE
@@ -31,7 +31,7 @@ def test_the_ends_are_the_segments_as_they_come_back_and_all_between_is_on_a_lin
     first, second = some(held, [0, 1]), some(held, [2, 3])
     found, back = interpolate(model, first, second, 5), interpolate(model, second, first, 5)
     for step, batch in ((0, first), (-1, second)):
-        torch.testing.assert_close(found.x[:, step], transferred(model, batch, batch[SHAPE]))
+        torch.testing.assert_close(found.x[:, step], transfer(model, batch, batch[SHAPE]))
         torch.testing.assert_close(found.shape[:, step], batch[SHAPE])
     for value in (found.latent, found.shape):
         torch.testing.assert_close(value.diff(n=2, dim=1), torch.zeros_like(value[:, 2:]), rtol=0, atol=1e-5)
@@ -45,7 +45,7 @@ def test_measures_are_of_what_changes_alone(held, model):
     timed, x = held.timed, held.all()["x"][:1]
     slow, far, turned, bent = (x.clone() for _ in range(4))
     slow[..., timed.parts["time"]] *= 1.5
-    far[..., timed.parts["place"]] *= 2
+    far[..., timed.parts["translation"]] *= 2
     turn = to_matrix(torch.tensor([0.0, 0.5, 0.0]), "vector")
     for changed, joint in ((turned, timed.skeleton.root), (bent, timed.turning[-1])):
         places = slice(6 * timed.turning.index(joint), 6 * timed.turning.index(joint) + 6)

@@ -33,7 +33,7 @@ def test_a_body_that_is_moved_is_off_by_as_much_and_one_that_is_slow_by_its_time
     _, test = held
     timed = test.timed
     x = test.all()["x"].clone()
-    x[..., timed.parts["place"]] += torch.tensor([0.003, 0.0, 0.004]) / timed.metres
+    x[..., timed.parts["translation"]] += torch.tensor([0.003, 0.0, 0.004]) / timed.metres
     x[..., timed.parts["time"]] *= 1.1
     monkeypatch.setattr(model, "encode", lambda batch: torch.arange(len(batch["x"])))
     monkeypatch.setattr(model, "decode", lambda latent, shape: x[latent])
@@ -69,7 +69,7 @@ def test_models_are_beside_components_of_their_size_and_frames(held, model):
     found = reconstruct_segments(models, test, train, bound_particles=2, progress=False)
     assert list(found.rows) == ["a", "PCA of 11", "b", "coarse", "PCA of 11, frames of coarse"]
     for name in ("a", "coarse"):
-        assert {*found.rows[name]} == {ERROR, DURATION, "ELBO", "importance bound", "k-hat"}
+        assert {*found.rows[name]} == {ERROR, DURATION, "ELBO", "IWAE bound", "k-hat"}
     for name, values in found.rows["a"].items():
         np.testing.assert_array_equal(values, found.rows["b"][name])  # every model draws from the same seed
     assert found.difference("a", "b").mean == 0

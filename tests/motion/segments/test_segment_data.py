@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dvae import motion
-from dvae.motion.segments.dataset import SegmentData, Takes
+from dvae.motion.segments.dataset import SegmentData, SegmentSource
 from dvae.motion.segments.embodied import SegmentSchema
 
 PEOPLE = motion.simulate(clips=8, frames=80, seed=1)
@@ -47,7 +47,7 @@ def test_what_is_reopened_is_cut_and_seen_as_it_was(options, tmp_path):
     motion.save(tmp_path / "people.npz", PEOPLE)
     data = SegmentData.open(tmp_path / "people.npz", **options)
     source, schema = data.recorded(), SegmentSchema.from_config(json.loads(json.dumps(data.schema.config())))
-    again = SegmentData.reopened(Takes(**vars(source)), schema)
+    again = SegmentData.reopened(SegmentSource(**vars(source)), schema)
     assert again.fingerprint == source.fingerprint
     assert (bool(schema.timed.mean), len(schema.timed.references)) == ((True, 2) if options else (False, 0))
     assert torch.equal(again.windows("test").all()["x"], data.windows("test").all()["x"])
@@ -63,11 +63,11 @@ def test_training_segments_are_drawn_on_other_bodies_with_places_in_lengths_of_l
     for known in (held.sample(1, torch.Generator())["beta"], kept["beta"][:1]):
         assert any(torch.equal(known[0], beta) for each in (held, own) for beta in each.all()["beta"])
     assert 0.8 < drawn["beta"].std() < 1.2
-    turns = train.timed.parts["turns"]
+    turns = train.timed.parts["rotations"]
     order = torch.cdist(drawn["x"][..., turns].flatten(1), train.all()["x"][..., turns].flatten(1)).argmin(1)
     assert order.sort().values.equal(torch.arange(len(train)))
     chosen = replace(train.motion, clips=[train.motion.clips[n] for n in order])
-    moved = motion.bodies.retargeted(chosen, motion.bodies.human(), drawn["beta"].double())
+    moved = motion.bodies.retarget(chosen, motion.bodies.human(), drawn["beta"].double())
     for ours, theirs in zip(*map(_whatever_the_heading, (drawn["x"], train.timed.to(moved)["x"])), strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=0)
 
@@ -118,4 +118,4 @@ def test_options_out_of_range_are_refused():
     with pytest.raises(FileNotFoundError):
         SegmentData.open("nowhere.npz")
     with pytest.raises(TypeError, match="skip_bad"):
-        Takes("simulated", "", skip_bad="yes")
+        SegmentSource("simulated", "", skip_bad="yes")

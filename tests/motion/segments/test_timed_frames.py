@@ -77,7 +77,7 @@ def test_the_heading_alone_is_taken_from_the_first_frame(people):
 
 def test_deviations_are_one_and_warped_time_comes_back(people):
     view = TimedFrames.of(people, scaling="deviation")
-    turns = view.to(people)["x"][..., view.parts["turns"]].flatten(0, 1)
+    turns = view.to(people)["x"][..., view.parts["rotations"]].flatten(0, 1)
     torch.testing.assert_close(turns.mean(0), torch.zeros(view.size - 4), atol=1e-3, rtol=0)
     moving = torch.tensor(view.deviation) > 1e-3
     assert moving.sum() > 50

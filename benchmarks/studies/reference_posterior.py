@@ -1,0 +1,134 @@
+"""Write the tables of docs/criticism.md on reference posteriors: guides of a surrogate, power, a neural model."""
+
+from collections.abc import Callable
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import torch
+import tyro
+
+import dvae
+
+from . import bounds
+from .pages import DOCS, code, table, write
+
+LENGTH = 6
+"""Steps of the sequences that neural models are fitted to."""
+GUIDES = {name: bounds.GUIDES[name] for name in ("exact", "mean-field", "filtering")}
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """Of all numbers that are there."""
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
+    """What both diagnostics say of a guide."""
+    found = dvae.reference_posterior(model, x, progress=False, **nuts)
+    tested = dvae.stein_discrepancy(model, x, progress=False)
+    steps = found.pairs["z, between steps"]
+    least, most = np.nanmin(found.ratio), np.nanmax(found.ratio)
+    reference, guide = (root_mean_square(part.correlation[:, steps]) for part in (found.reference, found.guide))
+    fared = found.sampling
+    return [
+        *([] if fared is None else [f"{np.nanmax(fared.rhat):.3f}, {np.nanmin(fared.effective):.0f}"]),
+        f"{root_mean_square(found.bias):.2f} ± {root_mean_square(found.bias_error):.2f}",
+        f"{np.exp(np.log(found.ratio).mean()):.2f} ({least:.2f} to {most:.2f})",
+        f"{reference:.2f}",
+        f"{guide:.2f}",
+        f"{(tested.p_values <= 0.05).sum()} of {len(tested.sequences)}",
+        f"{tested.p_value:.2g}",
+    ]
+
+
+COLUMNS = ["bias (rms)", "deviation ratio", "correlations", "the guide’s", "told by KSD at 5 %", "p, together"]
+
+
+def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
+    """The posterior as a guide: right, or without correlations, or with z_T too narrow by a third given all else."""
+
+    def guide(batch: Any) -> None:
+        mean, covariance = oracle.posterior(batch)
+        root = torch.linalg.cholesky(covariance)
+        if wrong == "correlations":
+            root = torch.linalg.inv(covariance).diagonal().rsqrt().diag()
+        if wrong == "a deviation":
+            root[-1, -1] *= 2 / 3
+        z = mean + torch.randn(mean.shape).to(mean) @ root.T
+        with pyro.plate("sequences", len(z)):
+            pyro.sample("z", dist.Delta(z[..., None], event_dim=2))
+
+    return guide
+
+
+def power(steps: int, sequences: int) -> list[str]:
+    """Of the discrepancy: the share of sequences that are told."""
+    model = dvae.linear_gaussian_surrogate(
+        bounds.MODEL, GUIDES["exact"], {"z": 1, "x": 1}, steps, scale=0.9
+    ).requires_grad_(False)
+    torch.manual_seed(0)
+    x, cells = model.sample(sequences, steps)["x"], [str(steps)]
+    for wrong, draws in (("", 500), ("correlations", 100), ("correlations", 500), ("a deviation", 500)):
+        guide = normal(dvae.Oracle(model, steps), wrong)
+        found = dvae.stein_discrepancy(model, x, guide=guide, draws=draws, bootstrap=200, progress=False)
+        cells.append(f"{(found.p_values <= 0.05).mean():.0%}")
+    return [*cells, f"{found.p_value:.2g}"]
+
+
+def neural(inference: str, x: torch.Tensor, fitting: int) -> dvae.DynamicalVAE:
+    """A small model that was fitted to sequences."""
+    torch.manual_seed(0)
+    model = dvae.DynamicalVAE(bounds.MODEL, inference, {"z": 2, "x": 4}, dvae.networks.Recurrent(16))
+    dvae.fit(model, dvae.ArrayWindows(x, observed=LENGTH - 1), steps=fitting, progress=False)
+    return model
+
+
+def main(
+    page: Path | None = DOCS / "criticism.md",
+    steps: int = 8,
+    sequences: int = 10,
+    powers: int = 40,
+    fitting: int = 1000,
+    draws: int = 400,
+) -> None:
+    """Write the tables.
+
+    Args:
+        page: where.
+        steps: of a sequence of the surrogate.
+        sequences: of the first table.
+        powers: sequences of the table of power.
+        fitting: steps of the neural models.
+        draws: of each chain of NUTS, and the warm-up's.
+    """
+    rows = []
+    for name, text in GUIDES.items():
+        model, _ = bounds.fitted(text, steps, 300, scale=0.9)
+        rows.append([f"{code(text)}, {name}", *said(model, model.sample(sequences, steps)["x"])])
+    write(page, table(["best guide", *COLUMNS], rows), name="reference")
+    guides = ["the posterior, 500 draws", "mean-field, 100 draws", "500 draws", "z_T too narrow, 500 draws"]
+    head = ["T", *guides, f"{powers} of these together (p)"]
+    write(page, table(head, [power(each, powers) for each in (4, 16, 64, 256)]), name="power")
+    torch.manual_seed(1)
+    phase, speed = 6.3 * torch.rand(400, 1), 0.3 + 0.4 * torch.rand(400, 1)
+    angle = phase + speed * torch.arange(LENGTH)
+    x = torch.stack([angle.sin(), angle.cos(), angle.sin() * angle.cos(), angle.cos().abs()], -1)
+    x = x + 0.3 * torch.randn_like(x)
+    rows = []
+    for name in ("exact", "mean-field"):
+        model = neural(GUIDES[name], x[:320], fitting)
+        start = process_time()
+        cells = said(model, x[320:322], draws=draws, warmup=draws)
+        spent = process_time() - start
+        bound = dvae.SequenceELBO(num_particles=20).terms(model, x[320:]).bound
+        told = f"{bound.mean():.2f} ± {bound.std() / len(bound) ** 0.5:.2f}"
+        rows.append([f"{code(GUIDES[name])}, {name}", told, *cells, f"{spent:.0f} s"])
+    write(page, table(["fitted guide", "bound", "R-hat, draws", *COLUMNS, "CPU"], rows), name="fitted")
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

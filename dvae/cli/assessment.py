@@ -1,0 +1,314 @@
+"""Commands that score runs: evaluate and compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from .. import motion
+from ..inference.evaluation.compare import compare as compare_models
+from ..inference.evaluation.evaluate import evaluate as evaluate_models
+from ..inference.evaluation.scores import Scores
+from ..inference.training.checkpoints import CheckpointError, Run
+from ..models.motion.trajectories import TrajectoryModel
+from ..motion.metric_models.pose_prior import PosePriorModel
+from ..runs import directory as runs
+from . import loading
+from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, note, save_figure
+from .futures import joint_names
+from .help import Expert
+
+MOST_REMEMBERED = 2**32
+"""Maximum size in bytes of the training windows that references load; memory-mapped data may be larger."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """Paths given to methods that take trajectories (trajevae, cvae-rnn, motion-infilling).
+
+    Args:
+        joints: joints whose paths are given to the runs.
+        exchange: start each window with the pose of another window, whose given joints are at most this many metres
+            away (0.01 in the paper).
+        temperature: scale factor of the latents; 0 for the motion at the mean of the prior.
+    """
+
+    joints: tuple[str, ...] | None = None
+    exchange: float | None = None
+    temperature: float | None = None
+
+    def windows(self, windows: motion.Windows, loaded: Sequence[runs.Loaded]) -> Any:
+        """Return the windows with the given paths and exchanged poses.
+
+        Raises:
+            UsageError: a run of another method.
+        """
+        if self == Control():
+            return windows
+        for each in loaded:
+            if not isinstance(each.model, TrajectoryModel):
+                raise UsageError(
+                    f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
+                    f"{each.method.name}"
+                )
+        given = windows.given(joint_names(self.joints or ()))
+        return given if self.exchange is None else motion.ExchangedWindows(given, self.exchange)
+
+    def __str__(self) -> str:
+        parts = ["", *joint_names(self.joints or ())]
+        parts += [] if self.exchange is None else [f"exchanged-{self.exchange:g}"]
+        return "-".join(parts if self.temperature is None else [*parts, f"temperature-{self.temperature:g}"])
+
+
+def evaluate(
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    control: Control,
+    data: str | None = None,
+    missing: Expert[Missing] = False,
+    failed: Expert[Failed] = False,
+    samples: int = 50,
+    bound_particles: int = 0,
+    log_score_particles: Expert[int] = 0,
+    pose_prior: Path | None = None,
+    classifier: tuple[Path, ...] = (),
+    seed: int = 0,
+    batch_size: Expert[int] = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Score runs on the test windows of their protocol, next to zero velocity and nearest neighbours.
+
+    For runs of motion-latent, scores the reconstruction of test segments, next to principal components of equal
+    dimension. Options for forecasts do not apply to them.
+
+    Prints the table, and writes it with all settings to evaluation.json in each run, or to --out. With given joints or
+    other data, the file name contains them. Nearest neighbours require the training data of the runs.
+
+    Args:
+        run: run directories, fitted on the same data under the same protocol.
+        control: paths given to methods that take trajectories.
+        data: where the data are now, if the path in the runs is no longer valid; or other data of the same joints.
+        samples: number K of forecasts of each window.
+        bound_particles: number of particles of the IWAE bound; 0 omits it.
+        log_score_particles: number of particles of the log density of the future under the forecasts; 0 omits it.
+        pose_prior: run of a pose-prior, which scores the poses of the forecasts.
+        classifier: runs of action-classifiers with different labels, which score the actions in the forecasts.
+        seed: seed of the draws.
+        batch_size: number of windows forecast at once.
+        out: file to write instead of evaluation.json in each run.
+        figure: save the scores as dots with error bars, or as box plots for segments.
+    """
+    at_least(1, samples=samples, batch_size=batch_size)
+    at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
+    check_files(out, figure, ".json")
+    how = ForecastScoring(samples, log_score_particles, pose_prior, classifier, control, missing, failed)
+    score = _segments if loading.kind_of(run, data) == "segments" else _forecasts
+    result, record = score(run, data, how, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
+    save_and_print(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
+
+
+OF_MOTION = ("pose_prior", "classifier", "control", "missing")
+"""Options of `evaluate` for motion only."""
+
+
+@dataclass(frozen=True)
+class ForecastScoring:
+    """Options of `evaluate` for forecasts only."""
+
+    samples: int = 50
+    log_score_particles: int = 0
+    pose_prior: Path | None = None
+    classifier: tuple[Path, ...] = ()
+    control: Control = Control()
+    missing: bool = False
+    failed: bool = False
+
+
+def _forecasts(paths: Sequence[Path], data: str | None, how: ForecastScoring, **settings: Any) -> tuple[Any, str]:
+    """Score forecasts of test windows; return the scores and the name of their file."""
+    loaded = loading.with_equal_windows(paths, data, failed=how.failed)
+    opened = loading.data_of(data, *loaded, missing=how.missing)
+    windows = loading.windows_to_test(loaded[0], opened, whole=False)
+    temperature = how.control.temperature
+    scores: Scores = loading.SCORES[loaded[0].config.kind]
+    if loaded[0].config.kind == "motion":
+        classifiers = _classifiers(how, data, loaded[0])
+        scores = partial(motion.scores, pose_prior=_pose_prior(how, data, windows.skeleton), classifiers=classifiers)
+        windows = how.control.windows(windows, loaded)
+    elif odd := [name for name in OF_MOTION if getattr(how, name) != getattr(ForecastScoring, name)]:
+        raise UsageError(
+            f"--{odd[0].replace('_', '-')} is for motion, and {paths[0]} was fitted on a table; leave it out"
+        )
+    result = evaluate_models(
+        {name: each.model for name, each in zip(loading.names(loaded), loaded, strict=True)},
+        windows,
+        scores=scores,
+        samples=how.samples,
+        log_score_particles=how.log_score_particles,
+        training_windows=_remembered(opened) if loading.is_training_data(loaded[0], opened) else None,
+        configs={name: Run(each.path).config for name, each in zip(loading.names(loaded), loaded, strict=True)},
+        options={} if temperature is None else {"temperature": temperature},
+        **settings,
+    )
+    return result, f"{loading.record('evaluation', loaded[0], opened)}{how.control}"
+
+
+def _remembered(opened: Any) -> Any:
+    """Return training windows for the references that use them; None if they exceed `MOST_REMEMBERED`."""
+    windows = opened.windows("train+validation")
+    size = 4 * len(windows) * windows.length * windows.schema.sizes["x"]
+    if size <= MOST_REMEMBERED:
+        return windows
+    note(
+        f"omitted references that use training windows: {len(windows):,} windows would take {size / 2**30:.1f} GB; in "
+        "Python, pass fewer to dvae.evaluate as training_windows"
+    )
+    return None
+
+
+def _segments(paths: Sequence[Path], data: str | None, how: ForecastScoring, **settings: Any) -> tuple[Any, str]:
+    """Score the reconstruction of test segments; return the scores and the name of their file."""
+    if odd := [
+        name for name, value in vars(how).items() if name != "failed" and value != getattr(ForecastScoring, name)
+    ]:
+        options = "--joints, --exchange and --temperature are" if odd[0] == "control" else f"--{odd[0]} is"
+        raise UsageError(f"{options.replace('_', '-')} for forecasts, and {paths[0]} generates whole segments")
+    loaded = loading.with_equal_windows(paths, data, ("segments",), how.failed)
+    opened = loading.data_of(data, *loaded)
+    called = dict(zip(loading.names(loaded), loaded, strict=True))
+    try:
+        own = opened if loading.is_training_data(loaded[0], opened) else replace(loaded[0], where=None).data
+        training = own.windows("train")
+    except CheckpointError as error:
+        note(f"omitted principal components, which need the training segments: {error}")
+        training = None
+    result = motion.reconstruct_segments(
+        {name: each.model for name, each in called.items()},
+        opened.windows("test"),
+        training,
+        configs={name: Run(each.path).config for name, each in called.items()},
+        **settings,
+    )
+    return result, loading.record("evaluation", loaded[0], opened)
+
+
+def save_and_print(result: Any, paths: Sequence[Path], figure: Path | None) -> None:
+    """Write a result to files, and only then print it, because the output may be closed or full."""
+    for path in paths:
+        result.save(path)
+        ERROR.print(f"wrote {path}")
+    if figure is not None:
+        save_figure(result.plot(), figure)
+        if "PIT" in {name for row in getattr(result, "rows", {}).values() for name in getattr(row, "histograms", {})}:
+            save_figure(result.plot_calibration(), figure.with_stem(f"{figure.stem}-calibration"))
+    OUT.print(result.table())
+
+
+def compare(
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    data: str | None = None,
+    missing: Expert[Missing] = False,
+    particles: int = 64,
+    estimates: Expert[int] = 1,
+    filter_particles: Expert[int] = 0,
+    contrasts: Expert[int] = 128,
+    samples: int = 50,
+    forecasts: bool = True,
+    draw_emission: Expert[bool | None] = None,
+    stride: Expert[int | None] = None,
+    seed: int = 0,
+    batch_size: Expert[int] = 32,
+    out: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Compare runs on the test windows of their protocol.
+
+    Runs that differ only in the seed are seeds of one row. All runs must have finished. For whole sequences of a
+    table, only bounds are compared.
+
+    Args:
+        run: run directories, fitted on the same data under the same protocol.
+        data: where the data are now, if the path in the runs is no longer valid; or other data of the same joints.
+        particles: number K of particles of the IWAE bound.
+        estimates: number of independent estimates of the IWAE bound; 25 or more for arviz, 1 otherwise.
+        filter_particles: number of particles of the FIVO bound; 0 omits it.
+        contrasts: number of windows for the mutual information of latents and data; 0 omits it.
+        samples: number of forecasts of each window.
+        forecasts: also score forecasts, which takes longest.
+        draw_emission: forecast draws of x, or its means. By default draws for a table and means for motion, whose
+            published scores use means, unless the data are discrete or nothing is latent.
+        stride: frames between the starts of test windows, in place of the protocol's; a larger stride is faster.
+        seed: seed of the draws.
+        batch_size: number of windows scored at once.
+        out: JSON file for the comparison.
+        figure: save bounds, differences, k-hat, and KL over time.
+    """
+    at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
+    at_least(0, contrasts=contrasts, filter_particles=filter_particles)
+    check_files(out, figure, ".json")
+    loaded = loading.with_equal_windows(run, data, failed=True)
+    opened = loading.data_of(data, *loaded, missing=missing)
+    if stopped := [str(each.path) for each in loaded if each.unfinished]:
+        raise ValueError(
+            f"{', '.join(stopped)} did not finish and cannot be compared; leave it out, or "
+            + "; ".join(runs.advice(path) for path in stopped)
+        )
+    windows = loading.windows_to_test(loaded[0], opened, stride)
+    shown = loading.rows(loaded)
+    result = compare_models(
+        {name: [each.model for each in row] for name, row in shown.items()},
+        windows,
+        scores=loading.SCORES[loaded[0].config.kind],
+        particles=particles,
+        estimates=estimates,
+        filter_particles=filter_particles,
+        contrasts=contrasts,
+        samples=samples if forecasts else 0,
+        draw_emission=draw_emission,
+        seed=seed,
+        batch_size=batch_size,
+        configs={name: loading.config_without_seed(row[0]) for name, row in shown.items()},
+    )
+    save_and_print(result, [] if out is None else [out], figure)
+
+
+def _pose_prior(how: ForecastScoring, data: str | None, skeleton: motion.Skeleton) -> Any:
+    """Return the pose prior of a run for a skeleton; None if no run is given.
+
+    Raises:
+        UsageError: the run is not a pose prior of this skeleton.
+    """
+    if (path := how.pose_prior) is None:
+        return None
+    model = loading.load(path, data, how.failed).model
+    if not isinstance(model, PosePriorModel) or model.skeleton != skeleton:
+        raise UsageError(f"--pose-prior {path} is not a run of a pose-prior for the skeleton {skeleton.name!r}")
+    return model
+
+
+def _classifiers(how: ForecastScoring, data: str | None, judged: runs.Loaded) -> dict[str, Any]:
+    """Return the action classifiers of runs by label.
+
+    Raises:
+        UsageError: a run is not an action classifier, repeats a label, or was fitted on other data than `judged`.
+    """
+    found: dict[str, Any] = {}
+    for path in how.classifier:
+        loaded = loading.load(path, data, how.failed)
+        if loaded.method.name != "action-classifier":
+            raise UsageError(f"--classifier {path} is a fitted {loaded.method.name}, not an action-classifier")
+        if loaded.model.label in found:
+            raise UsageError(f"--classifier {path} is the second for the label {loaded.model.label!r}; give only one")
+        if not loaded.alike(judged):
+            there, here = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (loaded, judged))
+            raise UsageError(
+                f"--classifier {path} was fitted on other data or under another protocol ({there}) than the runs "
+                f"({here}); it may have seen test clips"
+            )
+        found[loaded.model.label] = loaded.model
+    return found

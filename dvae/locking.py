@@ -1,0 +1,72 @@
+"""Serialise threads, because Pyro's handler stack and torch's random state are global to the process.
+
+Two programs running at the same time would share one handler stack and one stream of random numbers. Building a model
+and running a program therefore hold the lock `serialized`: in `DynamicalVAE.running`, in the terms of a bound, and in a
+step of `SVI`. `seeded` holds it too, and also sets and restores the random state. Threads wait for one such step, not
+for a whole fit. Processes are independent (`dvae.runs.sweep`). If a process forks while another thread holds the lock,
+the child starts with a free lock and an empty handler stack.
+"""
+
+from __future__ import annotations
+
+import logging  # noqa: F401  register its fork hook first: it must lock after `no_fork`, since imports create loggers
+import os
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import ContextDecorator, contextmanager
+from typing import Any
+
+SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
+"""The table that Pyro appends to an error raised inside a program."""
+
+
+class _Alone(ContextDecorator):
+    """A reentrant lock, usable as a context manager or a decorator."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self._lock.release()
+        if error is not None and error.args and isinstance(error.args[0], str):
+            error.args = (SHAPES.sub("", error.args[0]), *error.args[1:])
+
+    def _leave_to_the_parent(self) -> None:
+        """Replace a lock held by a thread of the parent process, which does not exist in a forked child."""
+        if self._lock.acquire(blocking=False):
+            self._lock.release()
+            return
+        from pyro.poutine.runtime import _PYRO_STACK
+
+        self._lock = threading.RLock()
+        _PYRO_STACK.clear()
+
+
+serialized = _Alone()
+
+
+@contextmanager
+def seeded(seed: int | None, device: Any = None) -> Iterator[None]:
+    """Set torch's random seed for a block, or keep the current state if it is None; restore the state at the end.
+
+    Args:
+        seed: seed of torch's random numbers.
+        device: a `torch.device` whose random state is also restored if it is a GPU.
+    """
+    import torch
+
+    with serialized, torch.random.fork_rng([device] if device is not None and device.type == "cuda" else []):
+        if seed is not None:
+            torch.manual_seed(seed)
+        yield
+
+
+no_fork = threading.RLock()
+"""A lock held during imports: a child forked during an import would wait forever for the lock of the module."""
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(before=no_fork.acquire, after_in_parent=no_fork.release, after_in_child=no_fork.release)
+    os.register_at_fork(after_in_child=serialized._leave_to_the_parent)

@@ -1,0 +1,192 @@
+"""Normalise recordings to metres and an up axis, inferred from the recordings, reported and checked."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import log
+
+import numpy as np
+import torch
+
+from ..data.clips import extents, fullest
+from ..geometry.rotations import continuous, from_matrix, to_matrix
+from .recording import Recording
+
+HEIGHT = 1.65
+"""Assumed height of a person in metres if a file does not contain its unit."""
+
+UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "1 / .45 inches": 0.0254 / 0.45}
+WITHIN = 1.35
+"""Maximum ratio to `HEIGHT` of a person's height; small enough that no recording fits two units."""
+
+STANDING = 0.8
+"""Minimum cosine between an axis and the direction from feet to head for people to stand along the axis."""
+
+_TOP = re.compile(r"head|neck|skull|face", re.IGNORECASE)
+_BOTTOM = re.compile(r"foot|toe|ankle|heel", re.IGNORECASE)
+
+
+def upright(recording: Recording) -> tuple[str, bool]:
+    """Return the axis along which the person stands, and whether it points up.
+
+    It is found from heads and feet, or else from the longest extent.
+
+    Axes of files are right-handed; in most files y or z is up.
+    """
+    if recording.up:
+        return recording.up, True
+    bodies = _from_feet_to_head(recording.names, recording.positions)
+    along = np.median(extents(recording.positions), axis=0) if bodies is None else bodies.mean(0)
+    axis = int(np.abs(along).argmax())
+    return "xyz"[axis], bool(along[axis] > 0)
+
+
+def orientation_warning(names: Sequence[str], positions: np.ndarray, up: str) -> str:
+    """Return a warning if heads are above feet along another axis than `up`, otherwise an empty string.
+
+    Args:
+        names: joint names.
+        positions: (F, J, 3).
+        up: assumed up axis.
+    """
+    bodies = _from_feet_to_head(names, positions)
+    if bodies is None or not len(bodies):
+        return ""
+    along = np.median(bodies, axis=0) / max(float(np.median(np.linalg.norm(bodies, axis=1))), 1e-9)
+    axis = int(np.abs(along).argmax())
+    if np.abs(along[axis]) < STANDING or ("xyz"[axis] == up and along[axis] > 0):
+        return ""
+    return f"heads are above feet along {'' if along[axis] > 0 else '-'}{'xyz'[axis]}, not {up}, which was taken for up"
+
+
+def _from_feet_to_head(names: Sequence[str], positions: np.ndarray) -> np.ndarray | None:
+    """Return vectors (frames, 3) from feet to head in up to about 2000 frames; None if no names match."""
+    ends = [[place for place, name in enumerate(names) if kind.search(name)] for kind in (_TOP, _BOTTOM)]
+    if not all(ends):
+        return None
+    positions = positions[:: max(len(positions) // 1000, 1)]
+    head, foot = (np.ma.masked_invalid(positions[:, places]).mean(1) for places in ends)
+    bodies = head - foot
+    found: np.ndarray = bodies.data[~np.ma.getmaskarray(bodies).any(1)].astype(np.float64)
+    return found
+
+
+def height_of(recording: Recording) -> float:
+    """Estimate the body's height in the recording's unit, whatever the pose: the length of the bones from head to foot.
+
+    It is the median over all joints whose names identify heads and feet, and over frames; without such names, the
+    body's largest extent.
+    """
+    parents, places = recording.parents, fullest(recording.positions)
+    chains: list[set[int]] = []  # for each joint, the joints up to the root
+    for joint, parent in enumerate(parents):
+        chains.append({joint} | (chains[parent] if parent >= 0 else set()))
+    bones = np.median(np.linalg.norm(places - places[:, [max(parent, 0) for parent in parents]], axis=2), axis=0)
+    ends = [[chains[joint] for joint, name in enumerate(recording.names) if of.search(name)] for of in (_TOP, _BOTTOM)]
+    ways = [sum(bones[joint] for joint in head ^ foot) for head in ends[0] for foot in ends[1]]
+    return float(np.median(ways or extents(places).max(1)))
+
+
+def unit(recording: Recording) -> tuple[str, float]:
+    """Return the name of the file's unit and its length in metres: from the file, or by the size of a person.
+
+    Raises:
+        ValueError: no unit fits.
+    """
+    if recording.metres is not None:
+        return "as the file says", recording.metres
+    height = height_of(recording)
+    fitting = {name: abs(log(max(height, 1e-12) * metres / HEIGHT)) for name, metres in UNITS.items()}
+    name = min(fitting, key=fitting.__getitem__)
+    if not fitting[name] <= log(WITHIN):
+        raise ValueError(
+            f"the body is about {height:.4g} tall (median over frames), which is a person's height in none of "
+            f"{', '.join(UNITS)}; give the metres of the file's unit"
+        )
+    return name, UNITS[name]
+
+
+@dataclass(frozen=True)
+class World:
+    """Units and axes of recordings that belong together.
+
+    Args:
+        unit: name of the files' unit.
+        metres: length of the unit in metres.
+        axis: axis along which people stand.
+        upwards: whether it points up.
+    """
+
+    unit: str
+    metres: float
+    axis: str
+    upwards: bool
+
+    @property
+    def up(self) -> str:
+        """The up axis after normalisation: y or z. People who stand along x, or upside down, are rotated to y."""
+        return self.axis if self.upwards and self.axis != "x" else "y"
+
+    def __str__(self) -> str:
+        turned = "" if self.up == self.axis and self.upwards else f", turned from {'' if self.upwards else '-'}"
+        return f"unit {self.unit} ({self.metres:.4g} m), {self.up} up{turned}{self.axis if turned else ''}"
+
+
+def infer_world(recordings: Mapping[str, Recording], metres: float | None = None, up: str | None = None) -> World:
+    """Return unit and axes of recordings that belong together: from the files, or from most people in them.
+
+    Args:
+        recordings: sample of the recordings, by name.
+        metres: length of the files' unit in metres; overrides the inferred one.
+        up: "y" or "z"; overrides the inferred axis.
+
+    Raises:
+        ValueError: no unit fits, the recordings have different units, or an argument is not a valid unit or axis.
+    """
+    if up not in (None, "y", "z"):
+        raise ValueError(f"the up axis is {up!r}, expected 'y' or 'z'")
+    if metres is not None and not 1e-6 < metres < 1e6:
+        raise ValueError(f"a unit of {metres} m, expected such as 0.01 for centimetres")
+    found: dict[tuple[str, float], str] = {} if metres is None else {("as given", metres): ""}
+    unknown = []
+    for name, recording in recordings.items() if metres is None else ():
+        try:
+            found.setdefault(unit(recording), name)
+        except ValueError as error:
+            unknown.append(f"{name}: {error}")
+    if not found:
+        raise ValueError(unknown[0])
+    if len({known for _, known in found}) > 1:
+        ((first, _), here), ((other, _), there), *_ = found.items()
+        raise ValueError(f"{here} looks as if in {first}, {there} in {other}; give the metres of the unit of all")
+    axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
+    return World(*next(iter(found)), axis, upwards)
+
+
+def to_world(recording: Recording, world: World) -> Recording:
+    """Return a recording in metres, with y or z up."""
+    turn = np.eye(3)
+    if world.axis == "x" or not world.upwards:  # a rotation that maps the person's axis to y
+        turn = np.roll(np.eye(3), "yzx".index(world.axis), axis=1)
+        turn = turn if world.upwards else np.diag([1.0, -1.0, -1.0]) @ turn
+    return replace(
+        rotate_recording(recording, turn),
+        positions=world.metres * (recording.positions @ turn.T),
+        offsets=None if recording.offsets is None else world.metres * recording.offsets,
+        loose=world.metres * recording.loose,
+        metres=1.0,
+        up=world.up,
+    )
+
+
+def rotate_recording(recording: Recording, turn: np.ndarray) -> Recording:
+    """Return a recording whose world is rotated by a matrix (3, 3)."""
+    rotations = recording.rotations
+    if rotations is not None and (turn != np.eye(3)).any():
+        root = torch.from_numpy(turn) @ to_matrix(torch.from_numpy(rotations[:, 0]).double(), "quaternion")
+        rotations = np.concatenate([from_matrix(root, "quaternion").numpy()[:, None], rotations[:, 1:]], 1)
+        rotations = continuous(torch.from_numpy(rotations)).numpy()
+    return replace(recording, positions=recording.positions @ turn.T, rotations=rotations)

@@ -1,0 +1,389 @@
+"""Discrete latents, summed out by the forward algorithm, and their posterior.
+
+    p(v, x) = sum over k of prod_t p(k_t | k_{t-1}, ...) p(v_t | k_t, ...) p(x_t | k_t, ...)
+
+The sum is given v, the latents that are drawn, and x, the data (Rabiner, 1989). A factor reads few steps of k, at lags
+up to L, and the recursion keeps the states of L + 1 steps only. All densities come from few evaluations of all steps in
+parallel. Each evaluation uses a sequence of states that repeats with the period of the factor's lags, and every step
+sees one state of its window. Only the recursion is a loop, with three small operations per step.
+
+Static latents are enumerated in addition to the chain. Every variable contributes a term to the log joint: its density
+given all earlier variables with the states summed out, log p(x_t | v_{<=t}, x_{<t}). Bounds use these terms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from ..distributions.scan import BLOCK
+from ..factorization.notation import Factor, Factorization
+from .conditional import like
+
+LARGEST = 4096
+"""Maximum number of joint states of a window and the static latents."""
+WIDE = 2**11
+"""Maximum number of transition terms of a step, over all sequences, for blocks; above it they cost more time."""
+COURSES = 2**17
+"""Maximum number of state sequences that are enumerated one by one."""
+
+
+class Discrete(int):
+    """The size of a categorical latent that is summed out: its number of states; values are one-hot vectors.
+
+    The latent has a factor in the generative model and none in the guide.
+
+    Raises:
+        ValueError: if there are fewer than two states.
+
+    Example:
+        >>> model = dvae.DynamicalVAE(
+        ...     "p(k_t | k_{t-1}) p(x_t | k_t)", "", {"k": dvae.Discrete(3), "x": 2}
+        ... )
+        >>> model.summed, model.latents
+        (('k',), ())
+    """
+
+    def __new__(cls, states: int) -> Self:
+        """Create the size for a number of states."""
+        if int(states) != states or states < 2:
+            raise ValueError(f"a discrete latent has at least two states, a whole number of them, not {states}")
+        return super().__new__(cls, states)
+
+    def __repr__(self) -> str:
+        return f"Discrete({self})"
+
+    __str__ = int.__repr__
+
+
+@dataclass(frozen=True)
+class Window:
+    """The summed-out latents that a factor reads.
+
+    Args:
+        factor: the factor.
+        statics: names of the static latents that it reads.
+        chain: names of the local latents that it reads.
+        low, high: smallest and largest lag of the local ones.
+    """
+
+    factor: Factor
+    statics: tuple[str, ...]
+    chain: tuple[str, ...]
+    low: int = 0
+    high: int = 0
+
+    @property
+    def period(self) -> int:
+        """Period of the state sequences at which the factor is evaluated."""
+        return self.high - self.low + 1
+
+
+@dataclass(frozen=True)
+class EnumerationPlan:
+    """The structure of the sum over a model's discrete latents.
+
+    Args:
+        generative: the generative factorization.
+        sizes: name to number of states of the latents that are summed out.
+
+    Raises:
+        ValueError: if the sum has too many states; the message states their number.
+    """
+
+    generative: Factorization
+    sizes: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        states = self.n_static_states * self.width ** (self.lag + 1)
+        if states > LARGEST:
+            each = ", ".join(f"{name} has {size}" for name, size in self.sizes.items())
+            raise ValueError(
+                f"at every step {states:,} states would be summed over, of {self.lag + 1} steps ({each}), and at most "
+                f"{LARGEST:,} are; take fewer states, or shorter lags"
+            )
+
+    @cached_property
+    def statics(self) -> tuple[str, ...]:
+        """Names of the static latents."""
+        return tuple(name for name in self.sizes if not self.generative.local(name))
+
+    @cached_property
+    def chain(self) -> tuple[str, ...]:
+        """Names of the local latents."""
+        return tuple(name for name in self.sizes if self.generative.local(name))
+
+    @cached_property
+    def width(self) -> int:
+        """K, number of joint states of the local latents at one step."""
+        return math.prod(self.sizes[name] for name in self.chain)
+
+    @cached_property
+    def n_static_states(self) -> int:
+        """M, number of joint states of the static latents."""
+        return math.prod(self.sizes[name] for name in self.statics)
+
+    @cached_property
+    def windows(self) -> dict[str, Window]:
+        """Windows by child, for the factors of summed-out latents and their readers, in the order of the model."""
+        ordered = (self.generative.factor(name) for block in self.generative.blocks for name in block.names)
+        found = {factor.child: self._window(factor) for factor in ordered}
+        return {name: w for name, w in found.items() if name in self.sizes or w.statics or w.chain}
+
+    @cached_property
+    def readers(self) -> tuple[str, ...]:
+        """Names of variables that read summed-out latents and are not summed out themselves."""
+        return tuple(name for name in self.windows if name not in self.sizes)
+
+    @cached_property
+    def lag(self) -> int:
+        """L, the largest lag."""
+        return max((window.high for window in self.windows.values()), default=0)
+
+    def require_data(self, replaced: Collection[str]) -> None:
+        """Check that the model does not read data that are replaced by its own means or by noise.
+
+        Raises:
+            ValueError: if it does, since the replacements depend on the states.
+        """
+        read = {parent.name for factor in self.generative.factors for parent in factor.parents}
+        if fed := sorted(read.intersection(replaced)):
+            raise ValueError(
+                f"{', '.join(self.sizes)} cannot be summed out where the model reads its own means, or noise, in place "
+                f"of {', '.join(fed)}, as of missing entries and in scheduled sampling: these depend on the states; "
+                "fill the entries in, or let no factor read them"
+            )
+
+    def _window(self, factor: Factor) -> Window:
+        statics, chain, lags = [], [], [0]
+        for parent in factor.parents:
+            if parent.name not in self.sizes:
+                continue
+            if parent.relation is None:
+                statics.append(parent.name)
+                continue
+            ends = [end for interval in parent.relation.intervals or [(-math.inf, 0)] for end in interval]
+            if not factor.local or not all(-math.inf < end <= 0 for end in ends):
+                raise ValueError(
+                    f"{factor} reads {parent}: {parent.name} cannot be summed out, since that takes its "
+                    f"{self.sizes[parent.name]}^T states at all T steps at once; of a discrete latent a factor reads a "
+                    f"few steps up to its own, such as {parent.name}_t or {parent.name}_{{t-1}}"
+                )
+            chain.append(parent.name)
+            lags = [*(lags if len(chain) > 1 else []), *(int(-end) for end in ends)]
+        return Window(factor, tuple(statics), tuple(chain), min(lags), max(lags))
+
+    def state_sequences(self, length: int) -> dict[str, Tensor]:
+        """Return all state sequences: name to one-hot values (C, T, states), or (C, states) for a static latent.
+
+        Raises:
+            ValueError: if there are too many to enumerate.
+        """
+        sizes = [self.sizes[name] for name in self.sizes for _ in range(length if name in self.chain else 1)]
+        if (count := math.prod(sizes)) > COURSES:
+            raise ValueError(
+                f"{', '.join(self.sizes)} may take {count:.3g} courses in {length} steps, and at most {COURSES:,} are "
+                "counted one by one; take fewer steps"
+            )
+        digits = np.stack(np.unravel_index(np.arange(count), sizes)).T
+        found = {}
+        for name, size in self.sizes.items():
+            own, digits = np.split(digits, [length if name in self.chain else 1], 1)
+            values = one_hot(torch.from_numpy(own.astype(np.int64)), size).double()
+            found[name] = values if name in self.chain else values[:, 0]
+        return found
+
+    def patterns(self, window: Window, length: int) -> dict[str, Tensor]:
+        """Return the states at which a factor is evaluated: name to integers (n, T), or (n,) for static latents."""
+        sizes = [self.sizes[name] for name in window.statics]
+        sizes += [self.sizes[name] for name in window.chain for _ in range(window.period)]
+        digits = np.stack(np.unravel_index(np.arange(math.prod(sizes)), sizes or [1])).astype(np.int64)
+        found = {name: torch.from_numpy(row) for name, row in zip(window.statics, digits, strict=False)}
+        repeated = np.arange(length) % window.period
+        for name, rows in zip(
+            window.chain, np.split(digits[len(window.statics) :], len(window.chain) or 1), strict=False
+        ):
+            found[name] = torch.from_numpy(rows.T[:, repeated].copy())
+        return found
+
+    def places(self, window: Window, length: int) -> Tensor:
+        """Return the index (T, J) of the pattern that a factor sees in each joint state.
+
+        For a factor of a summed-out latent, the index includes its own state. The J joint states enumerate the static
+        latents, then the chain at lags L to 0; the last one varies fastest.
+        """
+        names: list[tuple[str, int | None]] = [(name, None) for name in self.statics]
+        names += [(name, lag) for lag in range(self.lag, -1, -1) for name in self.chain]
+        sizes = [self.sizes[name] for name, _ in names]
+        digits = dict(zip(names, np.unravel_index(np.arange(math.prod(sizes)), sizes or [1]), strict=False))
+        t = np.arange(length)[:, None] if window.factor.local else np.zeros((1, 1), int)
+        place = np.zeros((len(t), math.prod(sizes)), np.int64)
+        for name in window.statics:
+            place = place * self.sizes[name] + digits[name, None]
+        for name in window.chain:
+            for residue in range(window.period):  # the lag, seen from t, of the step with this residue
+                lag = window.low + (t - window.low - residue) % window.period
+                rows = np.stack([digits[name, own] for own in range(window.low, window.high + 1)])
+                place = place * self.sizes[name] + rows[lag[:, 0] - window.low]
+        own = window.factor.child
+        if own in self.sizes:
+            place = place * self.sizes[own] + digits[own, 0 if window.factor.local else None]
+        return torch.from_numpy(place)
+
+    @torch.inference_mode(False)
+    def placed(self, window: Window, length: int, device: torch.device) -> tuple[dict[str, Tensor], Tensor]:
+        """Return patterns and places on a device; each transfer happens once."""
+        key = window.factor.child, length, device
+        if key not in self._placed:
+            told = {name: value.to(device) for name, value in self.patterns(window, length).items()}
+            self._placed[key] = told, self.places(window, length).to(device)
+        return self._placed[key]
+
+    @cached_property
+    def _placed(self) -> dict[Any, tuple[dict[str, Tensor], Tensor]]:
+        return {}
+
+
+class Enumeration:
+    """The sum over discrete latents in one run, given all other variables.
+
+    Args:
+        sums: structure of the sum.
+        rollout: run (`Rollout`) with values of all variables that the latents and their readers read.
+
+    Raises:
+        ValueError: if the model reads its own means or noise instead of data, since these depend on the states.
+    """
+
+    def __init__(self, sums: EnumerationPlan, rollout: Any):
+        self.sums, self.rollout, self.values = sums, rollout, dict(rollout.values)
+        sums.require_data(rollout.hidden.keys() | rollout.noisy)
+        logs = {name: self._logs(name, window) for name, window in sums.windows.items()}
+        self._static = {name: value for name, value in logs.items() if not sums.generative.local(name)}
+        self._local = {name: value for name, value in logs.items() if sums.generative.local(name)}
+        none = like(next(iter(rollout.conditionals.values()))).new_zeros(())
+        shape = (rollout.batch, rollout.length, sums.n_static_states, sums.width**sums.lag, sums.width)
+        self._start = sum(self._static.values(), none).expand(shape[0], sums.n_static_states)
+        self._steps = sum(self._local.values(), none).expand(shape)
+
+    def _logs(self, name: str, window: Window) -> Tensor:
+        """Return log densities or probabilities in all joint states, (B or 1, T, M, K^L, K), or (B or 1, M)."""
+        sums, run, local = self.sums, self.rollout, window.factor.local
+        conditional, own = run.conditionals[name], name in sums.sizes
+        told, places = sums.placed(window, run.length, like(conditional).device)
+        count = len(next(iter(told.values()))) if told else 1
+        values = {n: one_hot(v, sums.sizes[n]).to(like(conditional)) for n, v in told.items()}
+        if values.keys() == {*conditional.parents}:  # equal for all sequences
+            parameters = conditional(values, count, run.length)
+        else:
+            again = run.repeat(count)
+            again.values |= {n: v.repeat_interleave(run.batch, 0) for n, v in values.items()}
+            parameters = conditional(again.known, again.batch, run.length, again.lengths)
+        distribution = conditional.distribution(tuple(p.unflatten(0, (count, -1)) for p in parameters))
+        if own:
+            logs = distribution.logits  # type: ignore[attr-defined]
+        else:
+            mask = run.mask(name)
+            logs = distribution.log_prob(conditional.scored(run.values[name], mask))
+            logs = logs if mask is None else torch.where(mask, logs, 0.0)
+            logs = logs if conditional.whole else logs.sum(-1)
+        logs = logs.reshape(count, -1, len(places), self.sums.sizes.get(name, 1)).permute(1, 2, 0, 3).flatten(2)
+        logs = logs.gather(2, places.expand(len(logs), -1, -1))
+        shape = (sums.n_static_states, sums.width**sums.lag, sums.width)
+        return logs.unflatten(2, shape) if local else logs[:, 0].unflatten(1, shape)[..., 0, 0]
+
+    @cached_property
+    def shares(self) -> dict[str, Tensor]:
+        """Log density of each reader given all earlier variables, by name: (B, T), or (B,) if static."""
+        before = self._filtered(self._start, self._steps)[:, :-1, ..., None].expand_as(self._steps)
+        found = {}
+        for logs, sofar in ((self._static, torch.zeros_like(self._start)), (self._local, before)):
+            states = tuple(range(1 if logs is self._static else 2, sofar.dim()))
+            for name, each in logs.items():
+                last, sofar = sofar, sofar + each
+                if name not in self.sums.sizes:
+                    found[name] = sofar.logsumexp(states) - last.logsumexp(states)
+        return found
+
+    def _filtered(self, start: Tensor, steps: Tensor) -> Tensor:
+        """Return the log joint (B, T + 1, M, K^L) of states and variables so far, up to a constant per step."""
+        alpha = start[..., None].expand(*start.shape, self.sums.width**self.sums.lag)
+        steps = steps - steps.detach().amax((2, 3, 4), keepdim=True)  # a large sum would lose digits
+        if not self.sums.lag:  # no transition depends on earlier states
+            return torch.cat([alpha[:, None], alpha[:, None] + steps.logsumexp(-1).cumsum(1)], 1)
+        return forward_sums(alpha, steps)
+
+    @torch.no_grad()
+    def draw(self) -> dict[str, Tensor]:
+        """Draw states from their posterior given all other variables, one-hot: (B, T, C), or (B, C) if static."""
+        width, rows = self.sums.width, torch.arange(len(self._start), device=self._start.device)
+        joint = (self._filtered(self._start, self._steps)[:, :-1, ..., None] + self._steps).flatten(3)
+        last = _drawn(joint[:, -1].flatten(1))
+        static, window = last // joint.shape[-1], last % joint.shape[-1]
+        symbols = [window % width]
+        for t in reversed(range(joint.shape[1] - 1)):  # the window of the next step contains all but the oldest state
+            known = window // width
+            oldest = _drawn(joint[rows, t, static].unflatten(1, (width, -1))[rows, :, known])
+            window = oldest * width**self.sums.lag + known
+            symbols.append(window % width)
+        found = {}
+        for names, number in ((self.sums.statics, static), (self.sums.chain, torch.stack(symbols[::-1], 1))):
+            for name in reversed(names):
+                found[name] = one_hot(number % self.sums.sizes[name], self.sums.sizes[name]).to(self._start)
+                number = number // self.sums.sizes[name]
+        return found
+
+    @torch.enable_grad()
+    def probabilities(self) -> dict[str, Tensor]:
+        """Return posterior probabilities (B, T, C), or (B, C) if static, as gradients of the log density."""
+        parts = [part.detach().contiguous().requires_grad_() for part in (self._start, self._steps)]
+        total = self._filtered(*parts)[:, -1].flatten(1).logsumexp(1).sum()
+        static, steps = torch.autograd.grad(total, parts)
+        found = {}
+        for names, each in ((self.sums.statics, static), (self.sums.chain, steps.sum((2, 3)))):
+            apart = each.unflatten(-1, [self.sums.sizes[name] for name in names] or [1])
+            first = each.dim() - 1
+            for place, name in enumerate(names):
+                others = [first + other for other in range(len(names)) if other != place]
+                found[name] = apart.sum(others) if others else apart
+        return found
+
+
+def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
+    """Run the forward algorithm and return log sums (..., B, T + 1, M, W).
+
+    Long sequences run in blocks (`distributions.scan`) from each of the W states: a block is a step from W states to W.
+
+    Args:
+        start: log weights (..., B, M, W) of the states at the start.
+        steps: log densities (B, T, M, W, K) of each step from each of the W states.
+    """
+    batch, length, kept, window, width = steps.shape
+    if length >= 4 * BLOCK and batch * kept * window**2 * width <= WIDE:
+        padded = torch.cat([steps, steps.new_zeros(batch, -length % BLOCK, kept, window, width)], 1)
+        blocks = padded.unflatten(1, (-1, BLOCK)).flatten(0, 1)
+        never = torch.finfo(steps.dtype).min / 1000  # infinite values have no gradient
+        each = torch.full_like(steps[0, 0, 0, :, :1].expand(-1, window), never).fill_diagonal_(0.0)
+        own = forward_sums(each[:, None, None].expand(-1, len(blocks), kept, -1), blocks)[:, :, 1:]
+        own = own.unflatten(1, (batch, -1))  # (W, B, blocks, BLOCK, M, W)
+        starts = forward_sums(start, own[:, :, :, -1].movedim(0, 3))[:, :-1]
+        joint = starts.movedim(3, 0)[:, :, :, None, :, None] + own
+        return torch.cat([start[:, None], joint.logsumexp(0).flatten(1, 2)[:, :length]], 1)
+    alphas = [start]
+    for step in steps.unbind(1):
+        joint = alphas[-1][..., None] + step
+        alphas.append(joint.flatten(-2).unflatten(-1, (width, -1)).logsumexp(-2))
+    return torch.stack(alphas, -3)
+
+
+def _drawn(logits: Tensor) -> Tensor:
+    """Draw an index of the last dimension with these logits."""
+    return torch.multinomial(logits.softmax(-1), 1)[:, 0]

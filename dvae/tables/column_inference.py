@@ -1,0 +1,606 @@
+"""Proposals: guesses of each column's type and role, as a schema that you can edit."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections import Counter
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from reprlib import repr as brief
+from typing import Any
+
+import numpy as np
+
+from ..data.units import RESOLVED
+from ..options import nearest
+from .clocks import PERIOD, is_clock, join_times, parts_of, unit_of
+from .columns import Column, Columns, Role
+from .numerals import NEARLY_ALL, read_numbers
+from .parsing import (
+    MONTHS,
+    AmbiguousDates,
+    UnparsedDates,
+    compact,
+    dates,
+    index_levels,
+    is_duration,
+    is_number,
+    said_of_marks,
+    tabular,
+    texts,
+)
+
+CLASSES = 20
+"""Maximum number of distinct texts of a category; columns with more are ids or free text."""
+SPREAD = 1.5
+"""Ratio of variance to mean above which counts are overdispersed."""
+LARGEST = 1e30
+"""Bound on absolute values, since models compute in float32."""
+TIMES = re.compile(
+    r"(^|_)(time|date|datetime|timestamp|day|week|month|quarter|year|hour|minute|second|step|frame|t|ds)(_|$)"
+)
+IDS = re.compile(r"(^|_)(id|unique_id|series|sequence|subject|station|store|item|patient|name|key)(_|$)")
+ROWS = re.compile(r"no\.?|nr\.?|num|number|row|row_?(id|no|nr|num|number)|index|idx|obs|#", re.IGNORECASE)
+"""Names of columns that only number the rows."""
+COVERAGE = 0.6
+"""Minimum share of steps between its first and last at which a sequence has a row, if its id is text."""
+MOST_HEADERS = 4
+"""Maximum number of header rows in a file."""
+DATE = r"\d{4}|\d\W{1,2}\d|\d[-/. ]?[A-Za-z]{3}"
+"""Pattern that every date contains."""
+PART_OF_TIME = re.compile(r"\d{1,3}:\d\d([:.]\d+)*\s?([ap]\.?m\.?)?", re.IGNORECASE)
+"""Times of day, and minutes with seconds, which contain no date."""
+QUANTITY = re.compile(r"([^\w\s.,+-]{0,3})\s?[-+−]?[.,]?\d[\d.,'’\s]*([^\d\s]\D{0,11})?")
+"""A number, optionally with a unit before or after it."""
+NUMBERED = 5
+"""Minimum number of columns, named alike with a number, that suggest a table with one column per step."""
+DATED_NAME = re.compile(
+    r"\d{4}([-/.]\d{1,2}){0,2}([T ]\d.*)?|\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{4}[-_ ]?[QM]\d{1,2}|"
+    rf"({'|'.join(MONTHS)})[a-z]*[-/ .]?\d{{2,4}}",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class ColumnHints:
+    """Roles of columns given by the user; a column is "name", "name:family" or "name:family:unit".
+
+    Args:
+        columns: targets; by default all columns without another role.
+        covariates: covariates known in the future, such as a plan or a calendar.
+        past: covariates known up to the present.
+        static: covariates with one value per sequence.
+        id: columns that identify sequences.
+        time: column of dates or numbers, or columns that are joined to one time.
+        group: column that is constant within a sequence.
+        split: column with values "train", "validation" or "test".
+        zone: time zone of dates, such as "Europe/Berlin".
+        na_values: texts or numbers that mark missing values, in addition to empty cells and NaN.
+        decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
+    """
+
+    columns: tuple[str, ...] = ()
+    covariates: tuple[str, ...] = ()
+    past: tuple[str, ...] = ()
+    static: tuple[str, ...] = ()
+    id: tuple[str, ...] = ()
+    time: str | tuple[str, ...] | None = None
+    group: str | None = None
+    split: str | None = None
+    zone: str | None = None
+    na_values: tuple[str, ...] = ()
+    decimal: str | None = None
+
+    def of(self, frame: Any) -> Columns:
+        """Return the schema of a frame; entries that are not given are inferred, as in `infer_columns`.
+
+        Raises:
+            ValueError: if columns do not exist, families are unknown, or cells are ambiguous.
+        """
+        levels, frame = [name for name, _ in index_levels(frame)], tabular(frame)
+        if not len(frame):
+            raise ValueError("the table has no rows")
+        known = list(frame.columns)
+        roles: dict[str, tuple[Role, str]] = {}
+        said: dict[Role, tuple[str, ...]]
+        said = {"target": self.columns, "known": self.covariates, "past": self.past, "static": self.static}
+        for role, own_words in said.items():
+            for word in own_words:
+                name = word if word in known else word.partition(":")[0]
+                if name in roles:
+                    raise ValueError(f"column {name!r} is named twice")
+                roles[name] = (role, word[len(name) + 1 :])
+        times = (self.time,) if isinstance(self.time, str) else tuple(self.time or ())
+        aside = (*self.id, *times, *filter(None, (self.group, self.split)))
+        for name in (*roles, *aside):
+            if name not in known:
+                raise ValueError(f"no column {name!r}{nearest(name, known)}; there are {', '.join(known[:20])}")
+        families = {name: words.partition(":")[0] for name, (_, words) in roles.items()}
+        found = _Inference(self, frame, levels, times, aside, families)
+        own = {name: column for name, column in found.columns.items() if name not in aside}
+        names = list(roles) if self.columns else [*(name for name in own if name not in roles), *roles]
+        columns = []
+        for name in names:
+            role, words = roles.get(name, (own[name].role, "")) if name in own else roles[name]
+            family, _, unit = words.partition(":")
+            columns.append(_told(name, role, family, unit, frame[name], own.get(name), self.na_values))
+        if not any(column.role == "target" for column in columns):
+            static = ", ".join(
+                column.name for column in columns if column.role == "static" and column.name not in roles
+            )
+            reason = f"; constant in each sequence are {static}" if static else ""
+            given = ", ".join(names[:20]) or "none"
+            raise ValueError(f"no column is a target; given are {given}{reason}; name those to model (--columns)")
+        numbers = [column for column in columns if column.family != "category"]
+        marks = [mark for column in numbers for mark in found.numbers[column.name].marks]
+        schema = Columns(
+            tuple(columns),
+            found.id,
+            found.time,
+            self.group,
+            self.split,
+            self.zone,
+            tuple(dict.fromkeys((*self.na_values, *marks))),
+            self.decimal,
+        )
+        for column in numbers:
+            if own_marks := found.numbers[column.name].marks:
+                warnings.warn(f"column {column.name!r} {said_of_marks(own_marks)}", stacklevel=3)
+        for name in (column.name for column in numbers if column.role == "target" and column.name in roles):
+            if found.is_constant(name):
+                warnings.warn(
+                    f"column {name!r} is constant, {_first(frame[name])}, and a target as it is named; there is "
+                    "nothing to forecast, and scores over all columns count it",
+                    stacklevel=3,
+                )
+        found.warn(schema, all_named=not self.columns)
+        return schema
+
+
+def _told(
+    name: str, role: Role, family: str, unit: str, values: Any, guess: Column | None, na_values: Collection[str]
+) -> Column:
+    """Return a column with a given role, and possibly a given family and unit."""
+    family = family or (guess.family if guess else "real")
+    if role != "target" and family != "category":
+        family = "real"
+    return Column(name, role, family, unit, _classes(values, na_values) if family == "category" else ())
+
+
+def _classes(values: Any, na_values: Collection[str]) -> tuple[str, ...]:
+    return tuple(sorted({*texts(values).dropna()} - {*na_values}))
+
+
+def infer_columns(frame: Any) -> Columns:
+    """Propose a schema for a pandas frame in the long form.
+
+    The rules are:
+
+    - Time: the first column with dates or with the name of a time. A date and a clock, or year, month, day and hour,
+      are joined if one column alone leaves several rows at the same time.
+    - Ids: repeated texts, and integers with the name of an id, if with them no two rows of a sequence have the same
+      time.
+    - Static: columns that are constant within each of several sequences.
+    - Targets: all other columns. Integers from 0 are counts, two values are binary, few texts are a category, and
+      numbers above 0 whose standard deviation exceeds half their mean are positive.
+
+    A warning names the remaining columns, such as constant ones, which are omitted.
+
+    Args:
+        frame: table.
+
+    Raises:
+        ValueError: if no column can be a target, cells are ambiguous, or the table is not in the long form.
+    """
+    return ColumnHints().of(frame)
+
+
+class _Inference:
+    """The inferred id, time and column families of a frame, without those that are given.
+
+    Args:
+        told: roles given by the user.
+        frame: table in the long form.
+        levels: names of columns that are levels of its index.
+        times: columns of the time, if given.
+        aside: columns with a given role other than data.
+        families: given columns with their family, "" if none is given.
+    """
+
+    def __init__(
+        self,
+        told: ColumnHints,
+        frame: Any,
+        levels: list[str],
+        times: tuple[str, ...],
+        aside: tuple[str, ...],
+        families: Mapping[str, str],
+    ):
+        self.frame, self.index, self.levels = frame, levels, levels if len(levels) > 1 else []
+        self.na_values, hint = told.na_values, frame.attrs.get("decimal")
+        self.numbers = {name: read_numbers(frame[name], told.na_values, told.decimal, hint) for name in frame}
+        numerals = {
+            name: read.values
+            for name, read in self.numbers.items()
+            if read.is_numeric and not is_number(frame[name]) and not self._holds_codes(name)
+        }
+        self.plain = frame.assign(**numerals)
+        """The frame with numeric texts converted to numbers."""
+        self.undecided: dict[str, str] = {}
+        """Columns that could be the time, but with ambiguous dates, and a description of their content."""
+        if not told.columns:
+            self._refuse_layout(aside)
+        free = [name for name in frame if name not in families and name not in aside and not self._numbers_rows(name)]
+        free += [name for name in self.levels if name not in free and name not in aside]
+        self.id: tuple[str, ...] = told.id
+        self.time = times
+        self._find_id_and_time(free)
+        taken = {*aside, *self.id, *self.time, *self.undecided}
+        if not self.id:  # a panel of one sequence
+            named = (name for name in free if name not in taken and IDS.search(name.lower()))
+            self.id = tuple(name for name in named if frame[name].nunique(dropna=False) == 1)
+        taken = ({*taken, *self.id} | {*self.levels}) - {*families}
+        wanted = (name for name in frame if name in families or (name in free and not told.columns))
+        found = (self._column(name, families.get(name, "")) for name in wanted if name not in taken)
+        columns = {column.name: column for column in found if column is not None}
+        if (
+            columns
+            and self.id
+            and len(groups := self.plain.groupby(self._keys(self.id), observed=True, dropna=False)) > 1
+        ):
+            changing = groups[[*columns]].nunique().max() > 1
+            columns = {name: each if changing[name] else _static(each) for name, each in columns.items()}
+        if not columns and not families:
+            reasons = ", ".join(f"{name!r} ({self.reason(name)})" for name in [*frame][:20])
+            single = "; separators are , ; tab and |, others are named by a first line such as sep=:"
+            raise ValueError(f"no column can be a target: {reasons}{single if frame.shape[1] == 1 else ''}")
+        self.columns = columns
+
+    def _holds_codes(self, name: str) -> bool:
+        """Return whether texts are classes or codes, such as 007, although they could be parsed as numbers."""
+        values = self.frame[name]
+        if str(values.dtype) == "category":
+            return True
+        return not TIMES.search(name.lower()) and bool(texts(values).str.fullmatch(r"0\d+").any())
+
+    def _find_id_and_time(self, free: list[str]) -> None:
+        """Choose the time with the fewest rows of a sequence at the same time; the first one among equals."""
+        found = []
+        for time in [self.time] if self.time else self._times(free):
+            try:
+                step = join_times(self.frame, time) if len(time) > 1 else self.plain[time[0]]
+            except ValueError:
+                if self.time:
+                    raise
+                continue
+            id, twice = self._find_id(free, time, step)
+            found.append((twice, id, time))
+            if not twice:
+                break
+        if found:
+            _, self.id, self.time = min(found, key=lambda each: each[0])
+        elif self.undecided:  # ambiguous dates still distinguish rows
+            self.id, _ = self._find_id(free, (*self.undecided,), self.frame[next(iter(self.undecided))])
+        elif not self.id:
+            self.id = tuple(self.levels) or self._ids_in_runs(free)
+
+    def _times(self, free: list[str]) -> list[tuple[str, ...]]:
+        """Return columns that may be the time, the most likely first."""
+        frame = self.frame
+        clocks = [name for name in free if is_clock(frame[name])]
+        dated = [name for name in free if name not in clocks and (self._is_time(name) or self._is_compact(name))]
+        dated.sort(key=lambda name: name not in self.levels)
+        rest = [name for name in free if name not in self.undecided]
+        numbers = [name for name in rest if is_number(self.plain[name])]
+        if dated:
+            hours = {unit_of(name, frame[name]): name for name in reversed(rest) if name != dated[0]}
+            fine = clocks[:1] or [hours[unit] for unit in ("hour", "minute", "second") if unit in hours]
+            return [(dated[0],), *([(dated[0], *fine)] if fine else [])]
+        spans = [] if self.undecided else [name for name in (*self.levels, *rest) if is_duration(frame[name])]
+        levels = [name for name in self.levels if name in numbers]
+        named = [name for name in (*levels, *numbers) if TIMES.search(name.lower())]
+        parts = parts_of(frame, [name for name in rest if name not in clocks])
+        joint = [parts] if len(parts) > 1 else []
+        return [*joint, *((name,) for name in dict.fromkeys((*spans, *named, *levels[-1:])))]
+
+    def _find_id(self, free: list[str], time: tuple[str, ...], step: Any) -> tuple[tuple[str, ...], int]:
+        """Return the columns that identify sequences, and the number of rows that repeat a time within a sequence."""
+        steps = step.to_numpy()
+        rows = self.frame.assign(**{" step": steps})
+
+        def twice(ids: Collection[str]) -> int:
+            return int(rows.duplicated([*ids, " step"]).sum())
+
+        if self.id:
+            return self.id, twice(self.id)
+        others = [name for name in self.levels if name not in time]
+        if others:
+            if len(others) > 1 and others[-1].startswith("level_") and is_number(self.plain[others[-1]]):
+                others = others[:-1] if not twice(others[:-1]) else others
+            return tuple(others), twice(others)
+        left = [name for name in free if name not in time and name not in self.undecided]
+        if not twice(()):
+            return self._ids_in_runs(left), 0
+        named = [name for name in left if self._is_named_id(name) and is_number(self.plain[name])]
+        ids: list[str] = []
+        for name in (*named, *(name for name in left if self._may_be_id(name))):
+            if not (before := twice(ids)):
+                break
+            if twice([*ids, name]) < before:
+                ids.append(name)
+        for name in tuple(ids):  # drops ids that a later one makes redundant
+            fewer = [other for other in ids if other != name]
+            ids = ids if twice(fewer) else fewer
+        if not all(map(self._is_named_id, ids)) and not self._in_runs(ids) and self._coverage(ids, steps) < COVERAGE:
+            return (), twice(())
+        return tuple(ids), twice(ids)
+
+    def _keys(self, ids: Collection[str]) -> list[Any]:
+        """Return the original id columns, as keys for grouping."""
+        return [self.frame[name].rename(None) for name in ids]
+
+    def _is_named_id(self, name: str) -> bool:
+        """Return whether a column contains integers or texts and has the name of an id."""
+        values = self.plain[name]
+        named = IDS.search(name.lower()) is not None or name in self.index
+        return named and (not is_number(values) or _is_whole(values))
+
+    def _may_be_id(self, name: str) -> bool:
+        """Return whether a column contains repeated texts, or codes such as 007, and no parts of a time."""
+        values = self.frame[name]
+        different = values.dropna().unique()
+        if is_number(self.plain[name]) or len(different) == len(values):
+            return False
+        if all(PERIOD.fullmatch(str(each).strip()) for each in different):
+            return False
+        return IDS.search(name.lower()) is not None or not (TIMES.search(name.lower()) or is_clock(values))
+
+    def _ids_in_runs(self, names: Collection[str]) -> tuple[str, ...]:
+        """Return columns with the name of an id where the rows of each value are adjacent."""
+        return tuple(name for name in names if self._is_named_id(name) and self._in_runs([name]))
+
+    def _in_runs(self, ids: list[str]) -> bool:
+        """Return whether the rows of each sequence are adjacent, and some sequence has several."""
+        codes = self.frame.groupby(self._keys(ids), sort=False, dropna=False, observed=True).ngroup().to_numpy()
+        runs = 1 + int((np.diff(codes) != 0).sum())
+        return 1 < runs == len(np.unique(codes)) < len(codes)
+
+    def _coverage(self, ids: list[str], steps: np.ndarray) -> float:
+        """Return the mean share of steps with a row, from the first to the last step of a sequence."""
+        import pandas as pd
+
+        moments = pd.Series(steps)
+        with suppress(TypeError, ValueError):
+            moments = moments if is_number(moments) else dates(moments)
+        place = pd.Series(pd.factorize(moments, sort=True)[0], self.frame.index)
+        spans = place.groupby(self._keys(ids), dropna=False, observed=True).agg(["min", "max"])
+        return len(place) / float((spans["max"] - spans["min"] + 1).sum())
+
+    def _is_time(self, name: str) -> bool:
+        """Return whether a column contains dates; records ambiguous ones in `undecided`."""
+        try:
+            if is_date(self.plain[name]):
+                return True
+            cells = self.frame[name]
+            if 2 * (~np.isnan(self.numbers[name].values)).sum() >= cells.count():
+                return False
+            known = (cells.notna() & texts(cells).str.contains(DATE, na=False)).to_numpy(bool, copy=True)
+            if known.sum() < NEARLY_ALL * cells.count():
+                return False
+            try:
+                dates(cells[known])
+            except UnparsedDates as error:
+                known[known] = ~error.wrong
+            except AmbiguousDates:
+                raise
+            except (TypeError, ValueError):
+                return False
+            if NEARLY_ALL * cells.count() <= known.sum() < cells.count():
+                row = int(np.argmax(cells.notna().to_numpy() & ~known))
+                raise ValueError(
+                    f"column {name!r}: {known.sum()} of {cells.count()} values are dates; row {row} is "
+                    f"{brief(cells.iloc[row])}; correct it, or leave the row out"
+                )
+        except AmbiguousDates as error:
+            self.undecided[name] = str(error)
+        return False
+
+    def _is_compact(self, name: str) -> bool:
+        """Return whether numbers with the name of a time are dates such as 20241231."""
+        values = self.plain[name]
+        if not TIMES.search(name.lower()) or not _is_whole(values) or values.isna().any():
+            return False
+        return compact(values.to_numpy(np.float64)) is not None
+
+    def _numbers_rows(self, name: str) -> bool:
+        """Return whether a column numbers the rows, such as an unnamed index that pandas wrote to a CSV."""
+        values = self.plain[name]
+        if name == "Unnamed: 0":
+            return _is_whole(values) and bool(values.is_unique)
+        if ROWS.fullmatch(name.strip()) is None or not _is_whole(values):
+            return False
+        return bool((np.diff(values.to_numpy(np.float64, na_value=np.nan)) == 1).all())
+
+    def _refuse_layout(self, aside: Collection[str]) -> None:
+        """Raise an error for a table with dates as column names, or with several header rows."""
+        names = [name for name in self.frame if name not in aside]
+        dated = [name for name in names if DATED_NAME.fullmatch(name) and is_number(self.plain[name])]
+        if len(dated) > 2 and 2 * len(dated) >= len(names):
+            rest = [name for name in self.frame if name not in dated]
+            raise ValueError(
+                f"{len(dated)} columns are named by dates, {dated[0]!r} to {dated[-1]!r}, so each row is a sequence; "
+                f"write a row for each step, as frame.melt({rest}, var_name='time', value_name='value') does"
+            )
+        firsts, odd = [len(self.frame)], False
+        for read in (self.numbers[name] for name in names):
+            if (known := ~np.isnan(read.values)).any():
+                firsts.append(int(np.argmax(known)))
+                odd |= bool(read.wrong[: firsts[-1]].any())
+        count, top = min(firsts), self.frame.iloc[: min(*firsts, MOST_HEADERS)][names].astype(object)
+        if (
+            odd
+            and 0 < count < MOST_HEADERS
+            and not any(re.match(r"\s*\d", str(cell)) for cell in top.to_numpy().ravel())
+        ):
+            said = [str(value) for value in self.frame.iloc[:count].to_numpy().ravel() if value == value]
+            raise ValueError(
+                f"above the numbers are {count + 1} rows of names, also {', '.join(map(brief, said[:6]))}; "
+                "write one row of names, such as 'power MW', or read the table with pandas.read_csv("
+                f"…, header={[*range(count + 1)]}) and join them"
+            )
+
+    def _column(self, name: str, family: str) -> Column | None:
+        """Guess the family of a column; None if it cannot be a target, such as texts that are all different."""
+        read, values = self.numbers[name], self.plain[name]
+        if values.dtype.kind == "c":
+            raise ValueError(
+                f"column {name!r} holds complex numbers; give their real and imaginary parts as two columns"
+            )
+        if family:
+            return None  # the family is given
+        if not is_number(values):
+            known = self.frame[name].dropna()
+            count = int((~np.isnan(read.values)).sum())
+            if not self._holds_codes(name) and count and count >= NEARLY_ALL * (count + read.wrong.sum()):
+                read.check(values, "or declare the column as an id or a category, or leave it out (--columns)")
+            classes = _classes(known, self.na_values)
+            return Column(name, family="category", classes=classes) if 2 <= len(classes) <= CLASSES else None
+        if read.ambiguous:
+            read.check(self.frame[name], "")
+        numbers = read.values[~np.isnan(read.values)]
+        if not len(numbers) or self.is_constant(name):
+            return None
+        if set(np.unique(numbers)) == {0.0, 1.0}:
+            return Column(name, family="binary")
+        if not (np.abs(numbers) < LARGEST).all():
+            return Column(name)  # reading raises an error
+        whole = (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2
+        if whole and numbers.std() > RESOLVED * numbers.mean():
+            return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
+        if (numbers.astype(np.float32) > 0).all() and numbers.std() > 0.5 * numbers.mean():
+            return Column(name, family="positive")
+        return Column(name)
+
+    def is_constant(self, name: str) -> bool:
+        """Return whether all values except missing ones are equal, in at least two rows."""
+        read, known = self.numbers[name], self.frame[name].dropna()
+        values = known if read.wrong.any() or self._holds_codes(name) else read.values[~np.isnan(read.values)]
+        return len(values) > 1 and len(set(values)) == 1
+
+    def reason(self, name: str) -> str:
+        """Return why a column is not proposed."""
+        read, values = self.numbers[name], self.frame[name].dropna()
+        if name in self.undecided:
+            return f"perhaps the time: {self.undecided[name]}"
+        if name in (*self.time, *self.id):
+            return "the time" if name in self.time else "an id"
+        if self._numbers_rows(name):
+            return "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
+        if name in self.levels:
+            return "a level of the index that tells no sequences apart"
+        if not read.wrong.any() and np.isnan(read.values).all():
+            return "empty: all its values are missing"
+        if self.is_constant(name):
+            return f"constant: {_first(values)}"
+        odd = self.frame[name][read.wrong] if read.wrong.any() else values
+        if values.astype(str).str.strip().str.fullmatch(PART_OF_TIME).all():
+            return f"perhaps a time, such as {_first(odd)}; write it with its date, or as a duration such as 02:30:00"
+        sign = f"; remove {unit!r}" if (unit := _unit(str(odd.iloc[0]))) else ""
+        return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(odd)}{sign}"
+
+    def warn(self, columns: Columns, all_named: bool) -> None:
+        """Warn of columns of the frame that the schema omits."""
+        lacking = () if columns.time else self.undecided
+        aside = [name for name in self.frame if name not in columns.needed and (all_named or name in lacking)]
+        said = [f"{name!r} ({self.reason(name)})" for name in aside]
+        if said:
+            warnings.warn(f"left out of what is proposed: {', '.join(said)}", stacklevel=4)
+        for column in columns.columns:
+            self._warn_of_classes(column.name)
+        if all_named and not columns.time and not self.undecided:
+            self._warn_of_steps_in_columns(columns)
+
+    def _warn_of_classes(self, name: str) -> None:
+        """Warn of a proposed category whose classes may be numbers with a unit, or marks."""
+        if name not in self.columns or self._holds_codes(name):
+            return
+        classes = self.columns[name].classes
+        units = [unit for each in classes if (unit := _unit(each)) is not None]
+        if "" in units or len(units) > len(classes) / 2:
+            signs = "".join(f", remove {unit!r}" for unit in dict.fromkeys(filter(None, units)))
+            warnings.warn(
+                f"column {name!r} is proposed as a category, and some of its classes may be numbers: "
+                f"{', '.join(map(brief, classes[:5]))}; correct them{signs}, list those that mark missing values in "
+                f"na_values (--na-values), or declare {name}:category (--columns)",
+                stacklevel=5,
+            )
+
+    def _warn_of_steps_in_columns(self, columns: Columns) -> None:
+        """Warn of a table without a time whose rows may be sequences with one column per step."""
+        stems = Counter(re.sub(r"\d+$", "", name) for name in columns.names if re.search(r"\d$", name))
+        stem, count = max(stems.items(), key=lambda each: each[1], default=("", 0))
+        labels = [name for name in self.frame if self._labels_rows(name)]
+        if count >= NUMBERED and (count > len(self.frame) or labels):
+            numbered = [name for name in columns.names if re.fullmatch(re.escape(stem) + r"\d+", name)]
+            rest = [name for name in self.frame if name not in numbered]
+            warnings.warn(
+                f"there is no time, and {count} columns, {numbered[0]!r} to {numbered[-1]!r}, are numbered; if each "
+                f"row is a sequence, write a row for each step, as frame.melt({rest}, var_name='time', "
+                "value_name='value') does",
+                stacklevel=5,
+            )
+
+    def _labels_rows(self, name: str) -> bool:
+        """Return whether a column contains a different text in each row."""
+        values = self.frame[name]
+        if is_number(self.plain[name]) or values.isna().any() or not values.is_unique:
+            return False
+        return not values.astype(str).str.strip().str.fullmatch(PART_OF_TIME).all()
+
+
+def _first(values: Any) -> str:
+    """Return the first value that is not missing, abbreviated."""
+    return brief(str(values.dropna().iloc[0]))
+
+
+def _static(column: Column) -> Column:
+    family = "category" if column.family == "category" else "real"
+    return replace(column, role="static", family=family)
+
+
+def _unit(cell: str) -> str | None:
+    """Return the unit of a number in text, "" if it has none, or None for other texts."""
+    found = QUANTITY.fullmatch(cell.strip())
+    return None if found is None else (found[1] + (found[2] or "")).strip()
+
+
+def _is_whole(values: Any) -> bool:
+    return is_number(values) and bool((values.dropna() % 1 == 0).all())
+
+
+def is_date(values: Any) -> bool:
+    """Return whether a column contains dates, or texts of them.
+
+    Raises:
+        Undecided: if dates are ambiguous.
+    """
+    import pandas as pd
+
+    if pd.api.types.is_datetime64_any_dtype(values) or isinstance(values.dtype, pd.PeriodDtype):
+        return True
+    known = values.dropna()
+    if is_number(values) or not len(known):
+        return False
+    some = known.iloc[:: max(len(known) // 50, 1)].astype(str)
+    if not some.str.contains(DATE).all():
+        return False
+    for part in (some, known):
+        try:
+            return bool(dates(part).notna().all())
+        except AmbiguousDates as error:  # other cells may resolve it
+            undecided = error
+        except (TypeError, ValueError):
+            return False
+    raise undecided

@@ -1,0 +1,371 @@
+"""Semi-amortized guides: the best guide per sequence that the guide's family and edges allow, without amortization.
+
+    q_n(v | parents) = N(m + s_0 (b_n + sum_u W_nu (u - c_u) / d_u),  s exp(a_n))
+
+m and s are the output of the guide's own conditional, given the data and the latents that it reads. b_n, a_n and W_nu
+are free parameters for every sequence n, every step of v and every step u of the latents that v may read. They start at
+0, where q_n is the guide, and maximise the evidence lower bound of their sequence. s_0, c_u and d_u are units computed
+from draws of the guide: mean conditional deviations of v, and means and deviations of u.
+
+The corrections can represent any function of the data that a network could compute, including the guide itself. The
+dependence on latents can change only by a linear function. A guide that reads no latents becomes the best product of
+normals for the sequence, as in Cremer, Li and Duvenaud (2018, arXiv 1801.03558); a linear one becomes the best linear
+one.
+
+Gradients are path derivatives (Roeder, Wu and Duvenaud, 2017, arXiv 1703.09194), which have no noise if the guide is
+the posterior.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from pyro import poutine
+from torch import Tensor, nn
+
+from ...distributions.base import Parameters
+from ...distributions.families import Gaussian
+from ...factorization.graph import audit
+from ...factorization.notation import Factor, Factorization, Parent
+from ...networks.loop import memoizing
+from ...program.batch import AnyBatch, repeat
+from ...program.conditional import Conditional
+from ...program.model import DynamicalVAE
+from ..evaluation.evaluation_windows import seeded_evaluation
+from .elbo import joint_and_guide, require_data, require_latents, require_likelihood, sites_of
+
+UNITS = 32
+"""Number of draws from the guide for the units."""
+NAT = 1.0
+"""Epsilon of Adam, in nats per deviation: much smaller gradients are followed in proportion, larger ones by sign.
+
+With steps by sign alone, the usual behaviour of Adam, the noise of zero gradients would be followed too, and many edges
+have such gradients.
+"""
+
+
+@dataclass(frozen=True)
+class Link:
+    """Linear dependence of the location of a latent at S steps on another latent, for B sequences.
+
+    Args:
+        parent: name of the latent that is read.
+        to, of: indices (P,) among the S steps, in order, and steps of the parent, 0 for a static one.
+        weight: weights (B, P, E, D), in units.
+        centre, deviation: mean and standard deviation (B, P, E) of the values that are read.
+    """
+
+    parent: str
+    to: np.ndarray
+    of: np.ndarray
+    weight: Tensor
+    centre: Tensor
+    deviation: Tensor
+
+    def moves(self, values: Sequence[Tensor], steps: int) -> Tensor:
+        """Return shifts (k, B, S, D) in units, from values (k B, E) of the parent by step."""
+        read = torch.stack([values[s] for s in self.of.tolist()], 1).unflatten(0, (-1, len(self.weight)))
+        read = (read - self.centre) / self.deviation
+        if steps == 1:
+            return (read.flatten(2).transpose(0, 1) @ self.weight.flatten(1, 2)).transpose(0, 1).unsqueeze(2)
+        each = torch.einsum("kbpe,bped->kbpd", read, self.weight)
+        to = torch.as_tensor(self.to, device=each.device)
+        return each.new_zeros(*each.shape[:2], steps, each.shape[3]).index_add(2, to, each)
+
+    def by_step(self, steps: int) -> list[Link | None]:
+        """Return one link for each of the steps, None if nothing is read there."""
+        counts = np.bincount(self.to, minlength=steps)
+        places = np.split(self.of, counts.cumsum()[:-1])
+        # split rather than slice: the gradient of a slice is as large as the whole tensor
+        tensors = (each.split(counts.tolist(), 1) for each in (self.weight, self.centre, self.deviation))
+        parts = zip(places, *tensors, strict=True)
+        return [Link(self.parent, of * 0, of, *rest) if len(of) else None for of, *rest in parts]
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Correction of a conditional of the guide at S steps (1 for a static latent), for B sequences.
+
+    Args:
+        unit: standard deviations (B, S, D).
+        shift: shift (B, S, D) of the location, in units.
+        stretch: shift (B, S, D) of the logarithm of the scale.
+        links: links to latents that are read.
+    """
+
+    unit: Tensor
+    shift: Tensor
+    stretch: Tensor
+    links: tuple[Link, ...]
+
+    def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]]) -> Parameters:
+        """Return location and scale (k B, S, D), given the guide's own and the latents by step."""
+        if len(parameters[0]) % len(self.unit):
+            raise ValueError(
+                f"this guide is of {len(self.unit)} sequences of its own, and the batch has {len(parameters[0])} rows; "
+                "give it the sequences that it was fitted to, in their order"
+            )
+        loc, scale = (each.unflatten(0, (-1, len(self.unit))) for each in parameters)
+        moved = self.shift
+        for link in self.links:
+            moved = moved + link.moves(values[link.parent], loc.shape[2])
+        loc, scale = loc + self.unit * moved, scale * self.stretch.exp()
+        return loc.flatten(0, 1), scale.flatten(0, 1)
+
+    def by_step(self) -> list[Correction]:
+        """Return one correction for each step."""
+        steps = self.unit.shape[1]
+        links = zip(*(link.by_step(steps) for link in self.links), strict=True) if self.links else [()] * steps
+        tensors = (each.split(1, 1) for each in (self.unit, self.shift, self.stretch))
+        parts = zip(*tensors, links, strict=True)
+        return [Correction(unit, shift, stretch, tuple(filter(None, own))) for unit, shift, stretch, own in parts]
+
+    @property
+    def free(self) -> list[tuple[Tensor, int]]:
+        """Free parameters, each with the number of its entries that affect one location or scale."""
+        linked = [(link.weight, np.bincount(link.to).max() * link.weight.shape[2]) for link in self.links]
+        return [(self.shift, 1), (self.stretch, 1), *linked]
+
+    def freed(self, change: Callable[[Tensor], Tensor]) -> Correction:
+        """Return a copy with changed free parameters."""
+        links = tuple(replace(link, weight=change(link.weight)) for link in self.links)
+        return replace(self, shift=change(self.shift), stretch=change(self.stretch), links=links)
+
+
+class CorrectedConditional(nn.Module):
+    """Corrected conditional of the guide, which replaces the original one.
+
+    Args:
+        own: conditional of the guide.
+        factor: factor with the present parents.
+        correction: correction of the conditional.
+    """
+
+    def __init__(self, own: Conditional, factor: Factor, correction: Correction):
+        super().__init__()
+        self.own, self.factor, self.correction = own, factor, correction
+        self.parents = [parent.name for parent in factor.parents]
+
+    def __getattr__(self, name: str) -> Any:
+        """Return attributes that are not corrected from the guide's conditional."""
+        return super().__getattr__(name) if name == "own" else getattr(self.own, name)
+
+    def forward(self, parents: Mapping[str, Tensor], *arguments: Any) -> Parameters:
+        """Return the corrected parameters; same arguments as in `Conditional`."""
+        values = {link.parent: _by_step(parents[link.parent]) for link in self.correction.links}
+        own = self.own(parents, *arguments)
+        if self.factor.local:
+            return self.correction(own, values)
+        return _alone(self.correction(_with_step(own), values))
+
+    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """Return the state of the guide's loop, or its parameters by step if it reads no drawn variable."""
+        known = {link.parent: _by_step(given[link.parent]) for link in self.correction.links if link.parent in given}
+        steps = self.correction.by_step()
+        if all(name in given for name in self.own.parents):
+            return tuple(p.unbind(1) for p in self.own(given, batch, length, lengths)), None, known, steps
+        return None, self.own.start(given, batch, length, lengths), known, steps
+
+    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
+        """Return the corrected parameters; same arguments as in `Conditional`."""
+        fixed, inner, known, steps = state
+        if fixed is None:
+            own, inner = self.own.step(inner, t, drawn, count)
+        else:
+            own = tuple(p[t] for p in fixed)
+        return _alone(steps[t](_with_step(own), {**drawn, **known})), (fixed, inner, known, steps)
+
+    def chain(self, *_: Any) -> None:
+        """Return None, as no fused loop exists."""
+
+
+def _by_step(value: Tensor) -> Sequence[Tensor]:
+    return value.unbind(1) if value.dim() == 3 else (value,)
+
+
+def _with_step(parameters: Parameters) -> Parameters:
+    return tuple(p[:, None] for p in parameters)
+
+
+def _alone(parameters: Parameters) -> Parameters:
+    return tuple(p[:, 0] for p in parameters)
+
+
+@torch.inference_mode(False)
+def semi_amortized_guide(
+    model: DynamicalVAE,
+    batch: AnyBatch,
+    *,
+    missing: bool = False,
+    steps: int = 300,
+    rate: float = 0.2,
+    draws: int = 4,
+    reach: int | None = None,
+    seed: int = 0,
+    progress: Callable[[], object] = lambda: None,
+) -> DynamicalVAE:
+    """Return the model with a semi-amortized guide, fitted to the bound of each of these sequences (see the module).
+
+    Args:
+        model: model with its guide; for a result of this function, the search continues.
+        batch: sequences to fit. The returned model accepts only these sequences in this order, or whole repetitions of
+            them (`iwae_bound` and `annealed_bound` with a `chunk` that covers all).
+        missing: whether the guide also reads the latents that the posterior depends on and it ignores, in its order of
+            drawing (`audit`).
+        steps: number of steps of Adam, with a learning rate that falls to 0.
+        rate: learning rate of the first step, in deviations of the guide; the weights of one location share it.
+        draws: number of draws of every sequence in each step.
+        reach: largest distance in steps between local latents with a linear dependency; None for all that the edges
+            allow.
+        seed: seed of the draws.
+        progress: function called after each step.
+
+    Raises:
+        ValueError: when the model has no latents or likelihood, a latent is not normal or shared by sequences, a number
+            is below 1, or data are missing in the batch.
+
+    Example:
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
+        >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
+        >>> x, oracle = model.sample(3, 4)["x"], dvae.Oracle(model, 4)
+        >>> local = dvae.semi_amortized_guide(model, x, missing=True, rate=0.5)
+        >>> (oracle.evidence(x) - dvae.iwae_bound(local, x, 16).bound).abs().max() < 0.05
+        tensor(True)
+    """
+    if min(steps, draws) < 1 or (reach is not None and reach < 0) or not rate > 0:
+        raise ValueError(
+            f"steps and draws are at least 1, the reach at least 0 and the rate above 0, got {steps}, {draws}, {reach} "
+            f"and {rate}"
+        )
+    require_local(model)
+    data = model.read(batch)
+    if model.grouped and data.group is not None:
+        raise ValueError("sequences of a group share latents, and have no guide of their own; leave 'group' out")
+    require_data(model, data)
+    with seeded_evaluation(model, seed):
+        found, corrections = _start(model, data, missing, reach)
+        rows, free = repeat(data, draws), [each for c in corrections.values() for each in c.free]
+        frozen = _with(found, {name: each.freed(Tensor.detach) for name, each in corrections.items()})
+        optimiser = torch.optim.Adam([{"params": [each], "lr": rate / width} for each, width in free], eps=NAT)
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+        for _ in range(steps):
+            with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False), memoizing():
+                joint, own = joint_and_guide(frozen, rows, found.guide(rows))
+                slopes = torch.autograd.grad((own - joint).sum() / draws, [each for each, _ in free])
+            for (each, _), slope in zip(free, slopes, strict=True):
+                each.grad = slope.nan_to_num(0.0, 0.0, 0.0)
+            optimiser.step()
+            falling.step()
+            progress()
+    return frozen
+
+
+def require_local(model: DynamicalVAE) -> None:
+    """Refuse a model without latents that allow semi-amortized guides.
+
+    Raises:
+        ValueError: when the model has no latents or no likelihood, or a latent is not normal in the guide.
+    """
+    require_likelihood(model)
+    require_latents(model)
+    for name in model.latents:
+        if not isinstance(model.encoder[name].head, Gaussian):
+            raise ValueError(
+                "local guides are normals, of a location and a scale, but the distribution of "
+                f"{model.inference.factor(name)} "
+                f"is a {type(model.encoder[name].head).__name__}"
+            )
+
+
+def missing_latents(model: DynamicalVAE) -> dict[str, tuple[Parent, ...]]:
+    """Return for each latent those that its guide ignores and the posterior depends on, in the guide's order."""
+    found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing_parents
+    lacking = {name: tuple(p for p in parents if p.name in model.latents) for name, parents in found.items()}
+    return {name: parents for name, parents in lacking.items() if parents}
+
+
+def _start(
+    model: DynamicalVAE, data: Mapping[str, Any], missing: bool, reach: int | None
+) -> tuple[DynamicalVAE, dict[str, Correction]]:
+    """Return the model with initial corrections, and these corrections."""
+    added = missing_latents(model) if missing else {}
+    drawn = _Drawn(model, data)
+    corrections = {}
+    for name in model.latents:
+        own, factor = model.encoder[name], model.inference.factor(name)
+        now = own.correction if isinstance(own, CorrectedConditional) else drawn.correction(factor, reach)
+        more = drawn.links(replace(factor, parents=added.get(name, ())), reach)
+        corrections[name] = replace(now, links=(*now.links, *more)).freed(lambda t: t.clone().requires_grad_())
+    factors = tuple(replace(f, parents=_joined(f.parents, added.get(f.child, ()))) for f in model.inference.factors)
+    return _with(model, corrections, Factorization("q", factors)), corrections
+
+
+def _joined(parents: Sequence[Parent], added: Sequence[Parent]) -> tuple[Parent, ...]:
+    """Return parents with additional ones; parents of the same name are merged."""
+    found = {parent.name: parent for parent in parents}
+    for parent in added:
+        own = found.get(parent.name, parent).relation
+        relation = parent.relation if own is None or parent.relation is None else own | parent.relation
+        found[parent.name] = replace(parent, relation=relation)
+    return tuple(found.values())
+
+
+def _with(
+    model: DynamicalVAE, corrections: Mapping[str, Correction], inference: Factorization | None = None
+) -> DynamicalVAE:
+    """Return a copy of the model with a corrected guide; the model does not change."""
+    found = copy.copy(model)
+    found.inference = inference or model.inference
+    encoder = {}
+    for name, correction in corrections.items():
+        own = model.encoder[name]
+        encoder[name] = CorrectedConditional(
+            own.own if isinstance(own, CorrectedConditional) else own, found.inference.factor(name), correction
+        )
+    found.__dict__.pop("encoder", None)  # present if the guide is the prior
+    found._modules = {**model._modules, "encoder": nn.ModuleDict(encoder)}
+    return found
+
+
+class _Drawn:
+    """Draws of the guide, and the units computed from them."""
+
+    def __init__(self, model: DynamicalVAE, data: Mapping[str, Any]):
+        sites = sites_of(poutine.trace(model.guide).get_trace(repeat(data, UNITS)))
+        self.values: dict[str, Tensor] = {}
+        self.units: dict[str, Tensor] = {}
+        for name in model.latents:
+            site, local = sites[name], model.inference.local(name)
+            distribution = site["fn"].steps(site["value"]) if local else site["fn"]
+            for kept, each in ((self.values, site["value"]), (self.units, distribution.stddev)):
+                kept[name] = (each if local else each[:, None]).unflatten(0, (UNITS, -1))
+
+    def correction(self, factor: Factor, reach: int | None) -> Correction:
+        unit = self.units[factor.child].mean(0)
+        return Correction(unit, torch.zeros_like(unit), torch.zeros_like(unit), self.links(factor, reach))
+
+    def links(self, factor: Factor, reach: int | None) -> tuple[Link, ...]:
+        """Return links to the latents among the parents, with zero weights."""
+        _, size, _, width = self.values[factor.child].shape
+        length = max(value.shape[2] for value in self.values.values())
+        found = []
+        for parent in factor.parents:
+            if parent.name not in self.values:
+                continue
+            mask = factor.mask(parent.name, length)
+            if factor.local and parent.local and reach is not None:
+                steps = np.arange(length)
+                mask = mask & (abs(steps[:, None] - steps) <= reach)
+            to, of = np.nonzero(mask)
+            if len(to):
+                values = self.values[parent.name][:, :, of]
+                weight = values.new_zeros(size, len(to), values.shape[-1], width)
+                deviation = values.std(0)
+                deviation = torch.where(deviation > 0, deviation, 1.0)  # zero at padding
+                found.append(Link(parent.name, to, of, weight, values.mean(0), deviation))
+        return tuple(found)

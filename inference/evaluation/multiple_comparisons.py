@@ -1,0 +1,339 @@
+"""Comparison of many models: all paired differences, the model confidence set, and sample sizes.
+
+With many pairs, some 95 % intervals exclude 0 by chance alone. `pairs` has p-values adjusted by Holm's step-down
+procedure (1979), which are valid for all pairs at once under any dependence. `confidence_set` is the model confidence
+set (Hansen, Lunde and Nason, 2011): models that are not significantly worse than one another. It repeatedly drops the
+model that is most clearly worse, and contains the best model with at least its level. The less informative the data,
+the more models it contains. `required` computes the power of a paired difference for other numbers of seeds and clips.
+
+Errors are computed as in `estimates`: over clips, which models share, and over training seeds, which they do not.
+Variances over few seeds are uncertain, and if they are small by chance, differences look significant that are not. The
+null distribution of the confidence set therefore draws variances first, each the measured one times f over chi-squared
+with its f degrees of freedom. For a single difference this is Student's t (the fiducial distribution of Behrens and
+Fisher). The paper's block bootstrap is not possible with two or three seeds. Each pair has its own null distribution,
+and the smallest of these p-values is compared with its null distribution (Westfall and Young, 1993); the paper uses the
+largest t of all pairs.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+import scipy
+
+from .estimates import Estimate, TwoWayErrors, number
+from .result import Displayed, Table
+
+
+def holm(p_values: Sequence[float]) -> np.ndarray:
+    """Return p-values adjusted for all hypotheses by Holm's step-down procedure; a NaN stays NaN and is not counted.
+
+    Args:
+        p_values: unadjusted p-values (N,).
+
+    Returns:
+        Adjusted p-values (N,) in the same order, each at least the unadjusted one.
+
+    >>> holm([0.01, 0.04, 0.03]).round(2).tolist()
+    [0.03, 0.06, 0.06]
+    """
+    found = np.array(p_values, dtype=float)
+    known = np.flatnonzero(~np.isnan(found))
+    ascending = known[np.argsort(found[known], kind="stable")]
+    factors = np.arange(len(ascending), 0, -1)
+    found[ascending] = np.minimum(np.maximum.accumulate(factors * found[ascending]), 1.0)
+    return found
+
+
+@dataclass(frozen=True, repr=False)
+class Pairs(Displayed):
+    """All paired differences of some models, first minus second.
+
+    Attributes:
+        differences: estimate for each (first, second).
+        p_values: p-value of no difference for each (first, second), adjusted for all pairs (`holm`).
+    """
+
+    differences: dict[tuple[str, str], Estimate]
+    p_values: dict[tuple[str, str], float]
+
+    def table(self) -> Table:
+        """Return a table with a row for each pair, in the order of p-values."""
+        table = Table(
+            title="paired differences",
+            caption="mean ± standard error over sequences ± over seeds; p: for all pairs at once, by Holm's procedure",
+        )
+        for name in ("first", "minus second", "difference", "95 %", "p"):
+            table.add_column(name, justify="left" if name in ("first", "minus second") else "right")
+        for pair in sorted(self.differences, key=lambda pair: (math.isnan(self.p_values[pair]), self.p_values[pair])):
+            low, high = map(number, self.differences[pair].interval())
+            reach = low if low == "–" else f"{low} to {high}"
+            table.add_row(*pair, str(self.differences[pair]), reach, number(self.p_values[pair]))
+        return table
+
+
+def pairs(contenders: Mapping[str, TwoWayErrors]) -> Pairs:
+    """Return all paired differences, with p-values adjusted for their number.
+
+    Args:
+        contenders: score on the same clips for each name.
+
+    Returns:
+        Differences of each model with all later ones; p-values are NaN if a model has one seed.
+    """
+    found = {
+        (first, second): contenders[first].estimate(contenders[second]) for first, second in combinations(contenders, 2)
+    }
+    adjusted = holm([estimate.p_value() for estimate in found.values()])
+    return Pairs(found, dict(zip(found, map(float, adjusted), strict=True)))
+
+
+@dataclass(frozen=True, repr=False)
+class ConfidenceSet(Displayed):
+    """Models that may be the best.
+
+    Attributes:
+        p_values: p-value of each model by name, in the order of elimination: a model is in the set of level L if p >= 1
+            - L. The last remaining model has 1.
+        level: level of `members`.
+    """
+
+    p_values: dict[str, float]
+    level: float
+
+    @property
+    def members(self) -> list[str]:
+        """Names of the models that may be the best, the likeliest first."""
+        return [name for name, p in reversed(self.p_values.items()) if p >= 1 - self.level]
+
+    def table(self) -> Table:
+        """Return a table with a row for each model, those that may be the best first."""
+        table = Table(
+            title=f"models that may be the best, at {100 * self.level:g} %",
+            caption=f"p: of none being the worse, when it would be left out; in the set from {1 - self.level:.3g} on",
+        )
+        for name in ("model", "p", "in the set"):
+            table.add_column(name, justify="right" if name == "p" else "left")
+        for name, p in reversed(self.p_values.items()):
+            table.add_row(name, number(p), "yes" if name in self.members else "no")
+        return table
+
+
+def confidence_set(
+    contenders: Mapping[str, TwoWayErrors],
+    better: str = "lower",
+    level: float = 0.9,
+    *,
+    over_seeds: bool = True,
+    draws: int = 10_000,
+    seed: int = 0,
+) -> ConfidenceSet:
+    """Return the model confidence set, based on the differences of all remaining pairs.
+
+    Args:
+        contenders: score on the same clips for each name.
+        better: "lower" or "higher".
+        level: probability that the best model is in the set.
+        over_seeds: whether to account for other training seeds; if False, the set is for these weights only.
+        draws: number of draws of the null distribution.
+        seed: seed of the draws.
+
+    Raises:
+        ValueError: when `contenders` is empty, `level` is not between 0 and 1, or `better` is neither "lower" nor
+            "higher". Also when scores are on one clip, on different clips or not finite, or a model has one seed with
+            `over_seeds`.
+    """
+    if not contenders or not 0 < level < 1 or draws < 1:
+        raise ValueError(
+            f"a confidence set is of some models, at a level between 0 and 1, not of {len(contenders)} at {level}"
+        )
+    if better not in ("lower", "higher"):
+        raise ValueError(
+            f"of a score of which neither the lower nor the higher is better, no model is the best: {better!r}"
+        )
+    names, rows = list(contenders), list(contenders.values())
+    if over_seeds and (single := [name for name in names if math.isnan(contenders[name].seeds)]):
+        raise ValueError(
+            f"of {', '.join(single)} there is one training seed, which tells nothing of others; give more, or take "
+            "over_seeds=False for these very weights"
+        )
+    clips = _check(contenders)
+    if clips < 2:
+        raise ValueError("all windows are of one clip: there is no error over clips; give more clips")
+    means = np.array([row.mean for row in rows]) * (1 if better == "lower" else -1)
+    deviations = np.stack([row.deviations for row in rows]) * math.sqrt(clips / (clips - 1))
+    between, rest = (
+        np.array([getattr(row, part) if over_seeds else 0.0 for row in rows]) for part in ("seeds", "rest")
+    )
+    freedom = np.array([min(row.count - 1, 10**9) if over_seeds else 10**9 for row in rows])
+
+    random = np.random.default_rng(seed)
+    wider = np.sqrt((clips - 1) / random.chisquare(clips - 1, (draws, 1)))
+    together = wider * (random.standard_normal((draws, clips)) @ deviations.T)
+    variances = np.maximum(between * freedom / random.chisquare(freedom, (draws, len(rows))) - rest, 0)
+    drawn = together + np.sqrt(variances) * random.standard_normal((draws, len(rows)))
+
+    worse, other = (places.ravel() for places in np.indices((len(rows), len(rows))))  # all ordered pairs of models
+    null = drawn[:, worse] - drawn[:, other]
+    single = (null >= means[worse] - means[other]).mean(0)
+    null = scipy.stats.rankdata(-null, "max", axis=0) / draws
+    left, p_values, running = np.ones(len(rows), bool), {}, 0.0
+    while left.sum() > 1:
+        (pairs_left,) = np.nonzero(left[worse] & left[other] & (worse != other))
+        worst = pairs_left[np.lexsort(((means[other] - means[worse])[pairs_left], single[pairs_left]))[0]]
+        running = max(running, float((null[:, pairs_left].min(1) <= single[worst]).mean()))
+        p_values[names[worse[worst]]] = running
+        left[worse[worst]] = False
+    p_values[names[int(left.argmax())]] = 1.0
+    return ConfidenceSet(p_values, level)
+
+
+def _check(rows: Mapping[str, TwoWayErrors]) -> int:
+    """Return the number of clips of comparable scores.
+
+    Raises:
+        ValueError: when scores are on different clips, or not finite.
+    """
+    counts = {name: len(row.deviations) for name, row in rows.items()}
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"scores to compare are on the same clips, but there are {counts}")
+    for name, row in rows.items():
+        if not (math.isfinite(row.mean) and np.isfinite(row.deviations).all()):
+            raise ValueError(f"the score of {name} is not finite: its mean is {row.mean}")
+    return next(iter(counts.values()))
+
+
+@dataclass(frozen=True, repr=False)
+class Requirement(Displayed):
+    """Numbers of seeds and clips that are needed to distinguish two models.
+
+    Attributes:
+        difference: difference to detect.
+        power: probability of detecting it.
+        level: level of the two-sided interval that must exclude 0.
+        clips: number of clips for each number of training seeds per model, infinite if no number is enough.
+        now: present numbers of clips, and of seeds of the two models.
+        achieved: power with the present numbers; for the measured difference it follows from the p-value and adds no
+            information.
+    """
+
+    difference: float
+    power: float
+    level: float
+    clips: dict[int, float]
+    now: tuple[int, int, int]
+    achieved: float
+
+    def table(self) -> Table:
+        """Return a table with a row for each number of seeds."""
+        clips, *seeds = self.now
+        table = Table(
+            title=f"to find a difference of {number(self.difference, 4)} with a probability of {100 * self.power:g} %",
+            caption=f"with {clips} clips and {' and '.join(map(_seeds, seeds))} it is {100 * self.achieved:.0f} %, "
+            f"at a level of {100 * self.level:g} %",
+        )
+        for name in ("seeds of each", "clips"):
+            table.add_column(name, justify="right")
+        for count, needed in self.clips.items():
+            table.add_row(str(count), f"{needed:.0f}" if math.isfinite(needed) else "no number is enough")
+        return table
+
+
+def _seeds(count: int) -> str:
+    return "none that is trained" if count == sys.maxsize else f"{count} seeds"
+
+
+def required(
+    first: TwoWayErrors,
+    second: TwoWayErrors,
+    *,
+    difference: float | None = None,
+    power: float = 0.8,
+    level: float = 0.95,
+    seeds: Sequence[int] = (2, 3, 4, 5, 7, 10, 15, 20),
+) -> Requirement:
+    """Return how many training seeds and clips would distinguish two models, from their measured variances.
+
+    The variances are estimates themselves: with three seeds, a variance may well be off by a factor of two. New clips
+    are assumed to be as long as the present ones.
+
+    Args:
+        first, second: scores of two models on the same clips, with at least two seeds each.
+        difference: difference to detect; the measured one by default.
+        power: probability of detecting it.
+        level: level of the interval that must exclude 0.
+        seeds: numbers of seeds per model in the result.
+
+    Raises:
+        ValueError: when a model has one seed, or scores are on different clips or not finite. Also when the difference
+            is 0 or not finite, seeds are below 2, or power or level is not between 0 and 1.
+    """
+    if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
+        raise ValueError(
+            f"power and level are between 0 and 1 and seeds whole numbers from 2 on, not {power}, {level}, {[*seeds]}"
+        )
+    count = _check({"the first": first, "the second": second})
+    measured = first.estimate(second)
+    sought = abs(measured.mean if difference is None else difference)
+    if math.isnan(measured.total) or not 0 < sought < math.inf:
+        raise ValueError(
+            "both models need two seeds or more and several clips, and a finite difference that is not 0: "
+            f"it is {sought}, with a standard error of {measured.total}"
+        )
+    rows = (first, second)
+    rest = [row.rest * row.count * count for row in rows]  # variances of single seeds and clips
+    own = [max(row.count * row.seeds - r / count, 0.0) for row, r in zip(rows, rest, strict=True)]
+    common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
+
+    def reached(clips: int, *numbers: int) -> float:
+        """Return the mean power over the errors and degrees of freedom that `TwoWayErrors.estimate` may measure."""
+        both = [*zip(rest, own, numbers, strict=True)]
+        over = (common + sum(r / n for r, _, n in both)) / clips
+        between = [(o + r / clips) / n for r, o, n in both]
+        shared = sum(r / n for r, _, n in both) / clips
+        of_clips, *others = _ranks()
+        found = over * scipy.special.chdtri(clips - 1, of_clips) / (clips - 1)
+        of_seeds = [
+            v * scipy.special.chdtri(n - 1, ranks) / (n - 1)
+            for v, (*_, n), ranks in zip(between, both, others, strict=True)
+        ]
+        total = np.maximum(found + sum(of_seeds) - shared, np.maximum(found, sum(of_seeds)))
+        uncertain = found**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            freedom = np.maximum(np.nan_to_num(total**2 / uncertain, nan=1e9), min(clips, *numbers) - 1)
+        beyond = scipy.special.stdtrit(np.minimum(freedom, 1e9), (1 + level) / 2) * np.sqrt(total)
+        scale = math.sqrt(over + sum(o / n for _, o, n in both))
+        if not scale:
+            return 1.0
+        tails = scipy.special.ndtr((np.array([[sought], [-sought]]) - beyond) / scale)
+        return float(tails.sum(0).mean())
+
+    def least(number: int) -> float:
+        low = high = FEWEST
+        while reached(high, number, number) < power:
+            if high > MOST_CLIPS:
+                return math.inf
+            low, high = high + 1, 2 * high
+        while low < high:
+            middle = (low + high) // 2
+            low, high = (low, middle) if reached(middle, number, number) >= power else (middle + 1, high)
+        return float(high)
+
+    now = (count, first.count, second.count)
+    return Requirement(sought, power, level, {number: least(number) for number in seeds}, now, reached(*now))
+
+
+FEWEST, MOST_CLIPS = 5, 10**7
+"""Fewest clips with an estimate of errors, and the number above which no number counts as enough."""
+
+
+@cache
+def _ranks() -> np.ndarray:
+    """Return quasi-random ranks of the variances over clips and over two models' seeds, for averaging the power."""
+    return scipy.stats.qmc.Halton(3, seed=0).random(2000).T
