@@ -301,7 +301,7 @@ def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, cap
         said = failure(capsys, "fit", name, *own)
         assert "needs to know what poses are, and was given panel, which has none; take a method for any" in said
     said = failure(capsys, "fit", "srnn", *own, "--residual", "1")
-    assert 'leave residual at 0, or give all columns one distribution that does, by emission="normal"' in said
+    assert 'leave residual at 0, or give all columns one distribution with emission="normal"' in said
     assert not (tmp_path / "run" / "config.json").exists()
 
 
