@@ -76,8 +76,8 @@ def main(
         kept: directory of brackets.
         page: where.
         count: windows of each run, and sequences of the known model.
-        fitting: steps of local guides.
-        reach: steps between latents of runs that local guides read linearly, at most.
+        fitting: steps of semi-amortized guides.
+        reach: steps between latents of runs that semi-amortized guides read linearly, at most.
         steps: of a sequence of the known model.
     """
     torch.set_num_threads(1)

@@ -29,7 +29,7 @@ from .ranking import JOINTS
 from .tuning import evaluated, seen
 
 SCORES = ("APD", "energy score")
-LAWS: dict[str, tuple[float, tuple[str, ...]]] = {
+DISTRIBUTIONS: dict[str, tuple[float, tuple[str, ...]]] = {
     "prior": (1.0, ()),
     "prior × 2": (2.0, ()),
     "common mean": (1.0, ("mean",)),
@@ -106,7 +106,7 @@ def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
         widths = [rms(mean - mean.mean(0)), rms(deviation), rms(prior_mean - prior_mean.mean(0)), rms(prior_deviation)]
         common = together(distribution(model, guide, trained.given(JOINTS[:count])))
         cells = []
-        for scale, what in LAWS.values():
+        for scale, what in DISTRIBUTIONS.values():
             with patch.object(prior, "forward", with_common(prior.forward, common, what)):
                 found = evaluated(model, windows, few, options={"temperature": scale})
             cells.append([f"{found[name]:.2f}" for name in SCORES])
@@ -127,7 +127,7 @@ def main(
         counts: of joints whose paths are given.
     """
     widths = ["posterior means", "posterior", "prior means", "prior", "z in units of the prior"]
-    header = ["", "given", *widths, *(f"{score}, {name}" for score in SCORES for name in LAWS)]
+    header = ["", "given", *widths, *(f"{score}, {name}" for score in SCORES for name in DISTRIBUTIONS)]
     write(page, table(header, [line for run in runs for line in lines(run, counts)]), name="priors")
 
 

@@ -276,7 +276,7 @@ def require_local(model: DynamicalVAE) -> None:
     for name in model.latents:
         if not isinstance(model.encoder[name].head, Gaussian):
             raise ValueError(
-                "local guides are normals, of a location and a scale, but the distribution of "
+                "semi-amortized guides are normals, of a location and a scale, but the distribution of "
                 f"{model.inference.factor(name)} "
                 f"is a {type(model.encoder[name].head).__name__}"
             )

@@ -14,7 +14,7 @@ from dvae.distributions import Shape
 from dvae.distributions.family import FAMILIES
 from dvae.networks import Recurrent
 
-LAWS = {
+DISTRIBUTIONS = {
     "normal": distributions.Normal(),
     "normal, residual": distributions.Normal(residual=True),
     "fixed": distributions.FixedNormal(scale=0.5),
@@ -29,7 +29,7 @@ SHAPE = Shape(D, D)
 
 
 def build(name):
-    distribution = LAWS[name].build(SHAPE).double()
+    distribution = DISTRIBUTIONS[name].build(SHAPE).double()
     with torch.no_grad():
         for parameter in distribution.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
@@ -40,7 +40,7 @@ def previous(distribution, *shape):
     return torch.randn(*shape, D, dtype=torch.float64) if distribution.residual else None
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_draws_have_the_mean_and_the_variance_of_the_distribution(name):
     distribution = build(name)
     parameters = distribution(torch.randn(B, T, D, dtype=torch.float64), previous(distribution, B, T))
@@ -57,10 +57,10 @@ def test_draws_have_the_mean_and_the_variance_of_the_distribution(name):
     assert z_variance.abs().max() < 5
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if "residual" in name or name == "fixed, learned"])
+@pytest.mark.parametrize("name", [name for name in DISTRIBUTIONS if "residual" in name or name == "fixed, learned"])
 @pytest.mark.parametrize("share", [1.0, 0.3])
 def test_a_residual_location_keeps_its_share_of_the_previous_value(name, share):
-    distribution = replace(LAWS[name], residual=share).build(SHAPE).double()
+    distribution = replace(DISTRIBUTIONS[name], residual=share).build(SHAPE).double()
     features, before = torch.randn(B, T, D, dtype=torch.float64), previous(distribution, B, T)
     there, here = distribution(features, before), distribution(features, torch.zeros_like(before))
     torch.testing.assert_close(there[0] - here[0], share * before)

@@ -265,7 +265,7 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
         if protocol.split_by not in clip.labels:
             raise ValueError(
                 f"protocol {protocol.name} splits by the label {protocol.split_by!r}, which clip "
-                f"{'/'.join(clip.key)} lacks: is labels.csv beside the file?"
+                f"{'/'.join(clip.key)} lacks: is labels.csv next to the file?"
             )
         return clip.labels[protocol.split_by]
 
@@ -472,7 +472,7 @@ class Windows:
                 has = "has no label" if found is None else f"has {found!r} for"
                 raise ValueError(
                     f"clip {'/'.join(clip.key)} ({self.split}) {has} {label!r}, expected one of {', '.join(classes)}: "
-                    "is labels.csv beside the file, with every clip in it and no class among held-out clips alone?"
+                    "is labels.csv next to the file, with every clip in it and no class among held-out clips alone?"
                 )
         windows = copy(self)
         found_in = [classes.index(clip.labels[label]) for clip in self.clips]

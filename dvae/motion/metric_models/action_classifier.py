@@ -75,7 +75,7 @@ class ActionClassifier(Trainable):
             known = sorted({label for clip in windows.clips for label in clip.labels})
             raise ValueError(
                 f"there is nothing to tell apart: training clips have {' and '.join(classes) or 'nothing'} for the "
-                f"label {self.label!r}; their labels are {', '.join(known) or 'none (is labels.csv beside the file?)'}"
+                f"label {self.label!r}; their labels are {', '.join(known) or 'none (is labels.csv next to the file?)'}"
             )
         return replace(self, classes=tuple(classes))
 
