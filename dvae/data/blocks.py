@@ -92,7 +92,7 @@ class ColumnSummary:
             own = cls.of_block(np.array(values, np.float64))
             found = own if found is None else found.joined(own)
         if found is None:
-            raise ValueError("there are no values to summarise")
+            raise ValueError("expected at least one value to summarise, got none")
         return found
 
     @classmethod

@@ -44,12 +44,12 @@ def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any
     """
     magic = read(8)
     if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\x00", b"\x02\x00"):
-        raise NpyError(f"no npy file of version 1 or 2 (it begins with {magic!r}); write it with numpy")
+        raise NpyError(f"not an npy file of version 1 or 2 (it begins with {magic!r}); write it with numpy")
     size = int.from_bytes(read(2 if magic[6] == 1 else 4), "little")
     text = read(size).decode("latin1") if size <= LONGEST else ""
     found = HEADER.fullmatch(text)
     if not found or None in found.groups():
-        raise NpyError(f"damaged, or no plain array: the header of its npy file is {text[:100]!r}")
+        raise NpyError(f"damaged, or not a plain array: the header of its npy file is {text[:100]!r}")
     lengths = [length.strip().removesuffix("L") for length in found["shape"].split(",") if length.strip()]
     if not all(re.fullmatch(r"\d{1,18}", length) for length in lengths):
         raise NpyError(f"damaged: its shape is ({found['shape'][:100]})")
@@ -105,10 +105,10 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
                 raise NpyError(f"holds {dtype}, expected real numbers; write it with numpy.asarray(values, float)")
             check_bytes(dtype, shape, size)
             if not size:
-                raise NpyError(f"has shape {shape}, in which there is no number")
+                raise NpyError(f"has shape {shape}, so it contains no numbers; expected at least one")
             if order == "F" and len(shape) > 1:
                 raise NpyError(
-                    "is in Fortran order, in which the numbers of a frame lie far apart; write it with "
+                    "is in Fortran order, which stores the numbers of a frame far apart; write it with "
                     "numpy.ascontiguousarray"
                 )
             found = np.memmap(file, dtype, "r", file.tell(), shape)
@@ -121,7 +121,8 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
             raise
         raise OSError(
             error.errno,
-            "every mapped file is kept open, and no more may be (ulimit -n); write fewer, longer ones",
+            "every mapped file stays open, and the limit of open files is reached (ulimit -n); write fewer, longer "
+            "ones",
             path,
         ) from error
 

@@ -118,10 +118,10 @@ class Schema:
         found = Schema(dict(data)) if isinstance(data, Mapping) else getattr(data, "schema", data)
         if not isinstance(found, cls):
             known = found.kind if isinstance(found, Schema) else type(data).__name__
-            need = f"{who} needs to know what {cls.kind} are, and was given {known}"
+            need = f"{who} needs the description of {cls.kind}, but was given {known}"
             if isinstance(found, Schema) and type(found) is not Schema:
                 raise SchemaError(f"{need}, which has none; take a method for any sequences, such as srnn")
-            raise SchemaError(f"{need}; give the windows that it is to be trained on, or their schema")
+            raise SchemaError(f"{need}; give the training windows, or their schema")
         return found
 
     def config(self) -> dict[str, Any]:

@@ -268,7 +268,7 @@ def time_since_previous(times: Tensor | np.ndarray, lengths: Tensor | None = Non
     """
     times = torch.as_tensor(times)
     if times.ndim != 2:
-        raise ValueError(f"times are (sequences, steps), but these have shape {tuple(times.shape)}")
+        raise ValueError(f"times must be (sequences, steps), but have shape {tuple(times.shape)}")
     rise = times.diff(dim=1, prepend=times[:, :1])
     bad = ~((rise > 0) & torch.isfinite(rise))
     bad[:, :1] = ~torch.isfinite(times[:, :1])
@@ -279,8 +279,8 @@ def time_since_previous(times: Tensor | np.ndarray, lengths: Tensor | None = Non
         row, step = bad.nonzero()[0].tolist()
         raise ValueError(
             f"the times of sequence {row} are {', '.join(f'{t:g}' for t in times[row, max(step - 1, 0) : step + 1])} "
-            f"at steps {max(step - 1, 0)} to {step}, counted from 0; times are finite and rise: sort them, make one "
-            "step of values at one time, and leave out steps without a time"
+            f"at steps {max(step - 1, 0)} to {step}, counted from 0; times must be finite and increase: sort them, "
+            "merge values at one time into one step, and remove steps without a time"
         )
     return rise[..., None] if rise.is_floating_point() else rise[..., None].to(torch.get_default_dtype())
 
@@ -490,16 +490,19 @@ class ArrayWindows:
             raise ValueError(f"windows must be (N, T, D), but x has shape {tuple(self.x.shape)}")
         if self.observed >= self.x.shape[1]:
             raise ValueError(
-                f"observed is {self.observed} of {self.x.shape[1]} steps of x, which leaves none to predict; give fewer"
+                f"observed is {self.observed} of {self.x.shape[1]} steps of x, and no step is left to predict; give "
+                "fewer"
             )
         if self.mask is not None and self.mask.shape != self.x.shape:
-            raise ValueError(f"the mask has shape {tuple(self.mask.shape)}, expected that of x, {tuple(self.x.shape)}")
+            raise ValueError(
+                f"the mask has shape {tuple(self.mask.shape)}, expected the shape of x, {tuple(self.x.shape)}"
+            )
         if self.clips is not None and len(self.clips) != len(self.x):
-            raise ValueError(f"{len(self.x)} windows need as many clip names, not {len(self.clips)}")
+            raise ValueError(f"{len(self.x)} windows need one clip name each, got {len(self.clips)}")
         if self.columns is not None and len(self.columns) != self.x.shape[2]:
-            raise ValueError(f"{self.x.shape[2]} coordinates need as many columns, not {', '.join(self.columns)}")
+            raise ValueError(f"{self.x.shape[2]} coordinates need one column name each, got {', '.join(self.columns)}")
         if self.season is not None and self.season < 1:
-            raise ValueError(f"a season is at least 1 frame, not {self.season}")
+            raise ValueError(f"season must be at least 1 frame, got {self.season}")
 
     @property
     def protocol(self) -> ArrayProtocol:

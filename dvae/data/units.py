@@ -121,14 +121,14 @@ class Units(nn.Module):
             ValueError: if the values do not vary or have another size, or coordinates were given their units.
         """
         if self.scale.dim():
-            raise ValueError("these coordinates have units of their own, which were given; there is nothing to fit")
+            raise ValueError("these coordinates have given units, which cannot be fitted; remove the call of fit")
         size, variance = len(self.mean), 0.0
         if alike := values.shape[-1] == size:
             known = ColumnSummary.of(block.reshape(-1, size) for block in blocks(values))
             variance = float((known.variance * known.count / (known.count - 1).clip(1)).mean())
         if not variance > 0:
             raise ValueError(
-                f"units come from values (..., {size}) that vary, not from {tuple(values.shape)}"
+                f"units need values (..., {size}) that vary, got {tuple(values.shape)}"
                 f"{' without variance' if alike else ''}"
             )
         if (scale := math.sqrt(variance)) < SMALLEST:

@@ -141,7 +141,7 @@ class Views(View):
         self.measured = ", ".join(view.measured for view in views if view.measured)
         pasts = [place for place, view in enumerate(views) if isinstance(view, Past)]
         if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
-            raise ValueError(f"{self} changes the volume of frames that nothing scores; let Past be the first")
+            raise ValueError(f"{self} changes the volume of frames without a score; let Past be the first")
 
     def __repr__(self) -> str:
         return f"Views({', '.join(map(repr, self.views))})"
@@ -202,7 +202,7 @@ class Parts(View):
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         places = sorted(place for part in self.parts.values() for place in part)
         if places != list(range(len(places))):
-            raise ValueError(f"the parts must share the coordinates 0, 1, ... of x among them, once each; got {places}")
+            raise ValueError(f"the parts must contain each coordinate 0, 1, ... of x exactly once; got {places}")
         for name, part in self.parts.items():
             if len(part) != sizes[name]:
                 raise ValueError(f"the part {name} has {len(part)} coordinates, but its size is {sizes[name]}")
@@ -257,8 +257,8 @@ class History(View):
             read = factor.parent(name)
             if read is not None and (read.relation is None or read.relation.intervals is not None):
                 raise ValueError(
-                    f"{factor} reads {read}, but {name} is the data themselves, of which a forecast has the past "
-                    f"alone; give {name} a mask of your own that hides the frames to be made, such as "
+                    f"{factor} reads {read}, but {name} is the data, and a forecast has only their past; "
+                    f"give {name} a custom mask that hides the frames to predict, such as "
                     f'{name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
                 )
 
@@ -305,11 +305,11 @@ class Past(View):
             raise ValueError("a view with `Past` requires windows of one length; remove 'lengths' from the batch")
         whole, masks, now = data[WHOLE], data.masks(), self.frames
         if whole.shape[1] < now:
-            raise ValueError(f"this model goes on from {now} frames, and was given {whole.shape[1]}")
+            raise ValueError(f"this model continues from {now} frames, but was given {whole.shape[1]}")
         for name in self.also:
             if name in data and data[name].shape[1] != whole.shape[1] > now:
                 raise ValueError(
-                    f"beside x {tuple(whole.shape)}, whose first frames are {self.name}, {name} is as long as the "
+                    f"x {tuple(whole.shape)} has {self.name} as its first frames, so {name} must cover the "
                     f"whole window, (B, {now} + T, D); got {tuple(data[name].shape)}"
                 )
         later = {name: data[name][:, now:] for name in (WHOLE, *self.also) if name in data}

@@ -85,7 +85,7 @@ class ConditionalDistribution(nn.Module):
     def __init__(self, residual: float = False):
         super().__init__()
         if not 0 <= residual <= 1:
-            raise ValueError(f"residual is {residual}; it is a share of the previous value, from 0 to 1")
+            raise ValueError(f"residual must be a share of the previous value, from 0 to 1, got {residual}")
         self.residual = float(residual)
 
     @property

@@ -49,7 +49,7 @@ class ConditionalFlow:
         """
         if self.steps < 1 or self.bound <= 0:
             raise ValueError(
-                f"a ConditionalFlow has at least one step and a positive bound, got {self.steps} and {self.bound}"
+                f"a ConditionalFlow needs at least one step and a positive bound, got {self.steps} and {self.bound}"
             )
         return ConditionalFlowModule(self, shape)
 
@@ -67,7 +67,7 @@ class ConditionalFlowModule(ConditionalDistribution):
             from .glow import Glow
         except ImportError as error:
             raise ImportError(
-                "a ConditionalFlow is made of the package zuko: pip install 'pyro-dvae[flows]'", name="zuko"
+                "a ConditionalFlow requires the package zuko: pip install 'pyro-dvae[flows]'", name="zuko"
             ) from error
         self.min_scale = spec.min_scale
         self.out = self.projection(shape.features, 2 * shape.size, shape.size)
@@ -100,7 +100,7 @@ class ConditionalFlowModule(ConditionalDistribution):
             values: (N, D), at least two.
         """
         if len(values) < 2:
-            raise ValueError(f"a flow starts at two values or more, got {len(values)}")
+            raise ValueError(f"a flow needs at least two values to start from, got {len(values)}")
         loc, scale, features = parameters
         self.flow.start_at((values - loc) / scale, _read(features))
 

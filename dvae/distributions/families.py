@@ -115,7 +115,7 @@ class FixedNormal:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if self.scale <= 0:
-            raise ValueError(f"FixedNormal's scale is positive, got {self.scale}")
+            raise ValueError(f"FixedNormal's scale must be positive, got {self.scale}")
         if self.steps and not shape.local:
             raise ValueError(
                 f"FixedNormal(steps={self.steps}) has one scale per time step, but its variable is static, with one "
@@ -161,7 +161,7 @@ class FixedNormalModule(Gaussian):
         if self.steps:
             first, end = t or 0, (t or 0) + (loc.shape[1] if loc.dim() == 3 else 1)
             if end > self.steps:
-                raise ValueError(f"FixedNormal(steps={self.steps}) was given {end} steps; build it with so many")
+                raise ValueError(f"FixedNormal(steps={self.steps}) was given {end} steps; build it with steps={end}")
             scale = scale[first:end] if loc.dim() == 3 else scale[first]
         return loc if previous is None else self.add_residual(loc, previous), scale.expand_as(loc)
 
@@ -179,7 +179,9 @@ class KnownNoise:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if shape.features <= shape.size:
-            raise ValueError(f"KnownNoise has its scale from networks.WithNoise, as a network of p({shape.name} | ...)")
+            raise ValueError(
+                f"KnownNoise needs its scale from networks.WithNoise, as a network of p({shape.name} | ...)"
+            )
         return KnownNoiseModule(self, shape)
 
 
@@ -325,7 +327,7 @@ class Directions:
         """Return the module for a variable of this shape."""
         if shape.size % 3 or not (self.project or shape.features == shape.size):
             raise ValueError(
-                f"Directions are of three coordinates each, and without projection the features themselves; "
+                f"Directions have three coordinates each and, without projection, are the features themselves; "
                 f"{shape.name} has {shape.size} coordinates and the network gives {shape.features} features"
             )
         return DirectionsModule(self, shape)

@@ -220,7 +220,7 @@ class FamilyModule(ConditionalDistribution):
         self.location_scale = bool(self.moves.keys() & self.forms.keys())
         self.centred = "loc" in self.forms and self.moves.get("loc") is _location
         if self.residual and "loc" not in self.forms:
-            raise ValueError(f"{self.kind.__name__} has no location, to which a previous value could be added")
+            raise ValueError(f"{self.kind.__name__} has no location, so a previous value cannot be added")
         widths = {name: math.prod(free) for name, (free, _, _) in self.forms.items()}
         read = [name for name in widths if name not in spec.learned]
         self.read = sorted(read, key=lambda name: name != "loc")  # `projection` expects the location first
@@ -289,7 +289,7 @@ class FamilyModule(ConditionalDistribution):
     @override
     def mean(self, parameters: Parameters) -> Tensor:
         if not self.centre:
-            raise ValueError(f"{self.kind.__name__} has no mean, to stand for entries that are missing or not drawn")
+            raise ValueError(f"{self.kind.__name__} has no mean to replace entries that are missing or not drawn")
         return getattr(self.distribution(parameters), self.centre)  # type: ignore[no-any-return]
 
     @override
@@ -318,7 +318,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
     kind, name = spec.kind, spec.kind.__name__
     constraints = kind.arg_constraints
     if not isinstance(constraints, Mapping):
-        raise ValueError(f"{name} does not say what its parameters may be; write a distribution of your own")
+        raise ValueError(f"{name} does not declare constraints of its parameters; write a custom distribution")
     taken = inspect.signature(kind.__init__).parameters
     if unknown := [own for own in (*spec.given, *spec.learned, *spec.shapes) if own not in taken]:
         raise ValueError(
@@ -334,7 +334,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
             whole = constraint.is_discrete
         if whole:
             raise ValueError(
-                f"{own} of {name} is a whole number, which no network makes; give it: given={{{own!r}: 10}}"
+                f"{own} of {name} is a whole number, which no network outputs; give it: given={{{own!r}: 10}}"
             )
         if own in spec.shapes:
             size: tuple[int, ...] = tuple(shape.size if n == -1 else n for n in spec.shapes[own])
@@ -343,7 +343,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
         to = _to(constraint)
         forms[own] = tuple(to.inverse_shape(torch.Size(size))), to, size
     if not forms:
-        raise ValueError(f"nothing of {name} is left to be read or learned; it has {', '.join(constraints)}")
+        raise ValueError(f"no parameter of {name} is left to be read or learned; it has {', '.join(constraints)}")
     return forms
 
 
@@ -354,8 +354,8 @@ def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
         yield
     except errors as error:
         raise ValueError(
-            f"{spec.kind.__name__} with given={dict(spec.given)} cannot be made of numbers that a network reads "
-            f"({error}); give what it needs, or write a distribution of your own"
+            f"{spec.kind.__name__} with given={dict(spec.given)} cannot be built from the output of a network "
+            f"({error}); give the values that it needs, or write a custom distribution"
         ) from error
 
 
@@ -390,7 +390,7 @@ class NormalMixture:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
         if self.components < 1:
-            raise ValueError(f"a mixture has at least one component, got {self.components}")
+            raise ValueError(f"a mixture needs at least one component, got {self.components}")
         return NormalMixtureModule(self, shape)
 
 

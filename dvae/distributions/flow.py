@@ -151,7 +151,7 @@ class QRFlowModule(Prior):
         self._check(values)
         values = values.detach().reshape(-1, self.size).double()
         if len(values) <= self.size:
-            raise ValueError(f"to whiten {self.size} dimensions takes more than {self.size} values, got {len(values)}")
+            raise ValueError(f"whitening {self.size} dimensions needs more than {self.size} values, got {len(values)}")
         covariance = values.T.cov().reshape(self.size, self.size)
         identity = torch.eye(self.size, dtype=values.dtype, device=values.device)
         least = 1e-9 * covariance.diagonal().mean().clamp(min=torch.finfo(torch.float32).tiny)

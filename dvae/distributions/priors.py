@@ -143,8 +143,8 @@ class VampModule(Prior):
         for name, pseudo in self.pseudo.items():
             if data[name].shape[1] < self.steps:
                 raise ValueError(
-                    f"a Vamp has pseudo-sequences of {self.steps} steps, but those of {name} that it is to start at "
-                    f"have {data[name].shape[1]}; give it at most so many steps"
+                    f"a Vamp has pseudo-sequences of {self.steps} steps, but starts at {name} with "
+                    f"{data[name].shape[1]} steps; give it at most as many steps"
                 )
             first = data[name][:, : self.steps]
             pseudo.copy_(self.guide.units[name].relative(first) if name in self.guide.units else first)

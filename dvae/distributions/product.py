@@ -46,8 +46,8 @@ class Product:
         given = sorted(place for places, _ in self.parts for place in places)
         if given != list(range(shape.size)):
             raise ValueError(
-                f"the parts of a Product share the coordinates 0 to {shape.size - 1} of {shape.name} among them, once "
-                f"each; got {given}"
+                f"the parts of a Product must contain each coordinate 0 to {shape.size - 1} of {shape.name} exactly "
+                f"once; got {given}"
             )
         return ProductModule(self, shape)
 
@@ -66,7 +66,9 @@ class ProductModule(ConditionalDistribution):
         self.places = [list(places) for places, _ in spec.parts]
         for place, part in enumerate(parts):
             if part.deterministic:
-                raise ValueError(f"the part {self.places[place]} of {shape.name} has no density; in a Product all have")
+                raise ValueError(
+                    f"the part {self.places[place]} of {shape.name} has no density; a Product needs all densities"
+                )
         self.register_buffer("order", _order(self.places), persistent=False)
         self.location_scale = any(part.location_scale for part in parts)
         own = {place: bool(parts[n].centred) for n, places in enumerate(self.places) for place in places}

@@ -154,5 +154,5 @@ def refuse_half(dtype: torch.dtype) -> None:
     """
     if dtype in (torch.bfloat16, torch.float16):
         raise ValueError(
-            f"covariances are inverted, which {dtype} cannot hold; fit with precision='bf16-mixed' or '32-true'"
+            f"covariances are inverted, which {dtype} does not support; fit with precision='bf16-mixed' or '32-true'"
         )

@@ -386,12 +386,12 @@ def alternatives(
     """
     generative, observed, summed = Factorization.parse(generative), tuple(observed), tuple(summed)
     if steps < 1:
-        raise ValueError(f"edges are counted in at least 1 step, not {steps}")
+        raise ValueError(f"steps must be at least 1 to count edges, got {steps}")
     found: dict[frozenset[Factor], Derived] = {}
     for order in orders(generative, observed, summed):
         inference = faithful_inverse(generative, observed, order, summed)
         if not inference.factors:
-            raise ValueError(f"nothing is latent in {generative.text!r}: there is no guide to derive")
+            raise ValueError(f"{generative.text!r} has no latents, so no guide can be derived")
         looped = tuple(name for block in inference.blocks if block.direction for name in block.names)
         closed = analytic_kl(generative, inference)
         closed |= {f.child: False for f in generative.factors if f.child in closed and any(map(f.parent, summed))}

@@ -178,20 +178,18 @@ def faithful_inverse(
     latents = _latents(generative, data, summed := tuple(summed))
     order = tuple(order) if order is not None else next(iter(orders(generative, data, summed)))
     if not all(isinstance(block, Block) for block in order):
-        raise TypeError(f"an order is of blocks, such as those of dvae.factorization.inversion.orders, not {order!r}")
+        raise TypeError(f"an order must consist of blocks, as in dvae.factorization.inversion.orders, got {order!r}")
     if mixed := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
-        raise ValueError(
-            f"{describe_order(mixed)} mixes static and local latents; give static ones a block of their own"
-        )
+        raise ValueError(f"{describe_order(mixed)} mixes static and local latents; give static ones a separate block")
     if sorted(name for block in order for name in block.names) != sorted(latents):
         raise ValueError(
-            f"the order '{describe_order(order)}' is not one of the latents {', '.join(latents)}, each once"
+            f"the order '{describe_order(order)}' must contain the latents {', '.join(latents)}, each once"
         )
     relations = [p.relation for f in generative.factors for p in f.parents if p.relation is not None]
     if own := [relation for relation in relations if relation.intervals is None]:
         raise ValueError(
-            f"{own[0]} is a mask of your own, known at one length at a time, and a derived guide is for every length; "
-            "write the guide, and see what it misses at yours with audit(..., steps=T)"
+            f"{own[0]} is a custom mask, known at one length at a time, but a derived guide is for every length; "
+            "write the guide, and check it at your length with audit(..., steps=T)"
         )
     reach = sum({relation.lag for relation in relations}) * max(1, len(latents))
     names = (*latents, *data, *generative.context)

@@ -662,19 +662,19 @@ def check_pair(
     latents = tuple(name for name in generative.variables if name not in (*observed, *summed))
     for name in summed:
         if name not in generative.variables or name in observed:
-            raise ValueError(f"{name} is to be summed out, but it is no latent of {generative.text!r}")
+            raise ValueError(f"{name} cannot be summed out, because it is not a latent of {generative.text!r}")
         for factor in inference.factors:
             if name == factor.child or factor.parent(name) is not None:
                 raise ValueError(
-                    f"{factor} {'draws' if name == factor.child else 'reads'} {name}, which is summed out: the guide "
-                    "knows nothing of it; remove it"
+                    f"{factor} {'draws' if name == factor.child else 'reads'} {name}, which is summed out and "
+                    "unknown to the guide; remove it"
                 )
     for name in observed:
         if name not in generative.variables:
             raise ValueError(f"the observed {name} has no factor in {generative.text!r}; add p({name}_t | ...)")
     for name in inference.variables:
         if name in observed:
-            raise ValueError(f"{inference.factor(name)}: {name} is observed and no latent; remove this factor")
+            raise ValueError(f"{inference.factor(name)}: {name} is observed and not a latent; remove this factor")
         if name not in latents:
             raise ValueError(
                 f"{inference.factor(name)}: no latent {name} in {generative.text!r}; remove this factor, "

@@ -68,7 +68,7 @@ def follow_paths(
         ValueError: `steps` is below 1.
     """
     if steps < 1:
-        raise ValueError(f"steps is at least 1, got {steps}")
+        raise ValueError(f"steps must be at least 1, got {steps}")
     covariance = smooth_covariance(len(known))
     root = CORRECTION * torch.linalg.cholesky(covariance)
     root, white, gain = (each.to(latents) for each in (root, torch.linalg.inv(root), gains(covariance, known)))

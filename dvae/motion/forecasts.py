@@ -109,14 +109,14 @@ class Forecasts:
         try:
             skeleton = Skeleton(**{field: arrays[key].tolist() for field, key in FIELDS.items()})
             if (arrays["split"].dtype.kind, arrays["clip"].dtype.kind, arrays["start"].dtype.kind) != ("U", "U", "i"):
-                raise ValueError("split and clip are text and start is a whole number; these are not")
+                raise ValueError("expected text in split and clip, and whole numbers in start")
             keys = list(zip(*(arrays[name].tolist() for name in ("split", "clip", "start")), strict=True))
             motions = [arrays[name] for name in ("forecasts", "observed", "truth")]
             if any(array.dtype.kind != "f" for array in motions):
-                raise ValueError("forecasts, observed and truth are real numbers; these are not")
+                raise ValueError("expected real numbers in forecasts, observed and truth")
             return cls(skeleton, keys, motions[0], motions[1], motions[2], str(arrays.get("emission", "")))
         except KeyError as error:
-            raise ValueError(f"{path} lacks {error}: `dvae forecast` writes files with all that is needed") from error
+            raise ValueError(f"{path} has no {error}: `dvae forecast` writes files with all that is needed") from error
         except (FloatingPointError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
 

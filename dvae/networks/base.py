@@ -124,7 +124,7 @@ class Network(nn.Module):
         """Raise an error for padded batches, in a network whose steps all read the whole sequence."""
         if lengths is not None:
             name = type(self).__name__.removesuffix("Network")
-            raise ValueError(f"{name} makes sequences of one length, but this is a ragged batch; split it by length")
+            raise ValueError(f"{name} outputs sequences of one length, but this batch is ragged; split it by length")
 
     def select(self, state: Any, rows: Tensor) -> Any:
         """Return the state with these rows (N,) of its batch; rows may repeat, as in `loop.select`."""
@@ -142,7 +142,7 @@ class FixedLengthNetwork(Network):
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         if missing := [parent.name for parent in self.inputs if parent.name not in given]:
             name = type(self).__name__.removesuffix("Network")
-            raise ValueError(f"{name} makes all steps at once; it cannot be in a loop with {', '.join(missing)}")
+            raise ValueError(f"{name} outputs all steps at once; it cannot be in a loop with {', '.join(missing)}")
         return self(given, length, lengths).unbind(1)
 
     @override
@@ -252,7 +252,7 @@ class Join(nn.Module):
     def __init__(self, sizes: Sequence[int], widths: Sequence[int], activation: str, mean: bool = False):
         super().__init__()
         if mean and len(set(sizes)) > 1:
-            raise ValueError(f"only parts of one size have a mean, not parts of {', '.join(map(str, sizes))}")
+            raise ValueError(f"parts need one size to have a mean, but have the sizes {', '.join(map(str, sizes))}")
         self.sizes = tuple(sizes)
         self.mean = mean
         self.kind = activation
@@ -315,7 +315,7 @@ def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:
     if activation not in ACTIVATIONS:
         raise ValueError(f"unknown activation {activation!r}; known: {', '.join(ACTIVATIONS)}")
     if min(widths) < 1:
-        raise ValueError(f"the widths of a perceptron are at least 1, but these are {', '.join(map(str, widths[1:]))}")
+        raise ValueError(f"the widths of a perceptron must be at least 1, got {', '.join(map(str, widths[1:]))}")
     layers: list[nn.Module] = []
     for a, b in pairwise(widths):
         layers += [nn.Linear(a, b), ACTIVATIONS[activation]()]

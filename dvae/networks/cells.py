@@ -22,7 +22,7 @@ class _Differentiable(nn.RNNBase):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         if self.dropout:
-            raise ValueError(f"dropout is {self.dropout}; a recurrent network here has none, as evaluation would, too")
+            raise ValueError(f"dropout must be 0, got {self.dropout}: this network would apply it in evaluation, too")
 
     @override
     def forward(self, *args: Any) -> Any:

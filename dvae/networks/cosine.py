@@ -168,7 +168,7 @@ class CosineDecoderNetwork(FixedLengthNetwork):
         sizes = {parent.name: parent.size for parent in over_time}
         if spec.latent not in sizes or static.size != size:
             raise ValueError(
-                f"CosineDecoder makes steps of size {size} from {spec.latent}_{{1:T}} and a first step of that size; "
+                f"CosineDecoder outputs steps of size {size} from {spec.latent}_{{1:T}} and a first step of that size; "
                 f"it was given {', '.join(f'{p.name} of size {p.size}' for p in self.inputs)}"
             )
         self.spec, self.first = spec, static.name

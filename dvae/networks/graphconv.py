@@ -67,8 +67,8 @@ class GraphConvNetwork(FixedLengthNetwork):
         self.spec, self.own, self.coordinates = spec, own, size // len(own)
         if not local or size % len(own):
             raise ValueError(
-                f"GraphConv makes the trajectories of {len(own)} nodes, all of as many coordinates, for a local "
-                f"variable {spec.child}, not of size {size}"
+                f"GraphConv outputs the trajectories of {len(own)} nodes with equal numbers of coordinates, for a "
+                f"local variable {spec.child}, not of size {size}"
             )
         self.trajectories: list[tuple[str, list[int], int]] = []
         for parent in self.inputs:
@@ -77,14 +77,14 @@ class GraphConvNetwork(FixedLengthNetwork):
             held = list(spec.nodes.get(parent.name, ()))
             if parent.size != self.coordinates * len(held):
                 raise ValueError(
-                    f"{parent.name} has size {parent.size}, but GraphConv was told of nodes {held} in it, of "
+                    f"{parent.name} has size {parent.size}, but GraphConv was given its nodes {held}, of "
                     f"{self.coordinates} coordinates"
                 )
             self.trajectories.append((parent.name, held, _seen(parent, spec.length)))
         self.trajectories.sort(key=lambda trajectory: -len(trajectory[1]))
         if not self.trajectories or sorted(self.trajectories[0][1]) != list(range(len(self.trajectories[0][1]))):
             raise ValueError(
-                "GraphConv starts from a parent that holds every node, such as the history h_{1:O}; the parents are "
+                "GraphConv starts from a parent that has every node, such as the history h_{1:O}; the parents are "
                 f"{', '.join(parent.name for parent in self.inputs)}"
             )
         cosine_basis(spec.length, coefficients)  # raises an error for too many coefficients
@@ -105,7 +105,7 @@ class GraphConvNetwork(FixedLengthNetwork):
         self.refuse_ragged(lengths)
         if length != self.spec.length:
             raise ValueError(
-                f"GraphConv(length={self.spec.length}) was given {length} steps; it makes sequences of its length"
+                f"GraphConv(length={self.spec.length}) was given {length} steps; it outputs sequences of its length"
             )
         if self.training and len(parents[self.trajectories[0][0]]) == 1:
             raise ValueError(
@@ -187,7 +187,7 @@ def _seen(parent: Input, length: int) -> int:
     count = int(mask[0].sum())
     if not count or (mask != (torch.arange(length) < count)).any():
         raise ValueError(
-            f"GraphConv reads a trajectory from its first step, the same from everywhere, as in {parent.name}_{{1:T}}; "
+            f"GraphConv reads a trajectory from its first step, the same at every step, as in {parent.name}_{{1:T}}; "
             f"not {parent.name} at {parent.relation.name}"
         )
     return count

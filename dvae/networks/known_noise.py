@@ -53,7 +53,7 @@ class WithNoise:
         if not found or (found[0].relation is not None) != (found[0].lags == (0,)) or len(inputs) < 2:
             raise ValueError(
                 f"WithNoise reads the scale {self.scale} of size {size} at t, such as p(x_t | z_t, {self.scale}_t), "
-                f"beside other parents; the parents are {', '.join(f'{p.name} ({p.size})' for p in inputs)}"
+                f"and other parents; the parents are {', '.join(f'{p.name} ({p.size})' for p in inputs)}"
             )
         inner = self.network.build([p for p in inputs if p is not found[0]], local, size)
         return WithNoiseNetwork(inner, inputs, found[0], local)
@@ -81,7 +81,7 @@ class WithNoiseNetwork(Network):
         if (bad := there & ~(values > 0)).any():
             place = bad.nonzero()[0].tolist()
             raise ValueError(
-                f"{self.name} is {values[tuple(place)].item():g} in sequence {place[0]}, and a scale of noise is "
+                f"{self.name} is {values[tuple(place)].item():g} in sequence {place[0]}, but a scale of noise must be "
                 "above 0"
             )
         return torch.where(there, values, 1.0)
@@ -94,9 +94,7 @@ class WithNoiseNetwork(Network):
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         if self.name not in given:
-            raise ValueError(
-                f"the scale {self.name} of noise is context, which a batch gives, and no variable is drawn"
-            )
+            raise ValueError(f"the scale {self.name} of noise is context, which a batch gives, and cannot be drawn")
         scales = self._scales(given[self.name], length, lengths).unbind(1)
         return self.inner.start(self._of(given), batch, length, lengths), scales
 

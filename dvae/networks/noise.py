@@ -128,7 +128,7 @@ class _MixedDecoder(nn.Module):
     def forward(self, past: Tensor, z: Tensor, chosen: Tensor | None = None) -> Tensor:
         chosen = _told(chosen)
         if z.shape[-1] != self.latent:
-            raise ValueError(f"z has {z.shape[-1]} numbers, and this code is made for {self.latent}")
+            raise ValueError(f"z has {z.shape[-1]} numbers, but this code was built for {self.latent}")
         placed = _laid_out(z, chosen < 0.5) if self.layer is None else functional.relu(self.layer(z))
         mixed, code = chosen * past + (1 - chosen) * placed, past
         if self.block is not None:

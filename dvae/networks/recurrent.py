@@ -67,7 +67,7 @@ class Recurrent:
             raise ValueError(f"unknown cell {self.cell!r}; known: {', '.join(CELLS)}")
         if self.width < 1 or self.layers < 1:
             raise ValueError(
-                f"a recurrent network has width and layers of at least 1, not {self.width} and {self.layers}"
+                f"a recurrent network needs width and layers of at least 1, got {self.width} and {self.layers}"
             )
         return RecurrentNetwork(self, inputs, local)
 

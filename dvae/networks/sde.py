@@ -132,7 +132,7 @@ class Equation(nn.Module):
         super().__init__()
         shortest, longest = times
         if not 0 < shortest <= longest < math.inf:
-            raise ValueError(f"times are positive, the shortest and the longest, but these are {times}")
+            raise ValueError(f"times must be positive, the shortest and the longest, got {times}")
         places = (torch.arange(size) + 0.5) / size
         self.log_rate = nn.Parameter(-math.log(shortest) - math.log(longest / shortest) * places)
         root = (0.5 * self.log_rate.detach()).exp()

@@ -73,7 +73,7 @@ class WholeDecoder(WholeEncoder):
 
 def _refuse(steps: int, length: int) -> None:
     if steps > length:
-        raise ValueError(f"this network is for {length} steps at most, and was given {steps}")
+        raise ValueError(f"this network supports at most {length} steps, got {steps}")
 
 
 class WholeEncoderNetwork(Network):
@@ -135,7 +135,9 @@ class WholeDecoderNetwork(FixedLengthNetwork):
         super().__init__(inputs, True, size)
         sizes = spec.sizes or {spec.name: size}
         if sizes.get(spec.name) != size:
-            raise ValueError(f"{spec.name} has {size} coordinates, and the sizes of those who share are {dict(sizes)}")
+            raise ValueError(
+                f"{spec.name} has {size} coordinates, but variables that share have the sizes {dict(sizes)}"
+            )
         ends = dict(zip(sizes, accumulate(sizes.values()), strict=True))
         self.places = slice(ends[spec.name] - size, ends[spec.name])
         self.trunk = Trunk(sum(parent.size for parent in inputs), spec, sum(sizes.values()))

@@ -82,7 +82,9 @@ class Reader:
         refuse_table(batch)
         if not isinstance(batch, Mapping):
             if len(self.observed) > 1 and not self.view.parts:
-                raise ValueError(f"a batch of {', '.join(self.observed)} is a mapping of these names, not one tensor")
+                raise ValueError(
+                    f"a batch of {', '.join(self.observed)} must be a mapping of these names, not one tensor"
+                )
             batch = {whole: batch}
         if unknown := [name for name in batch if name not in (*names, *self.extras, *Batch.reserved)]:
             raise ValueError(
@@ -190,7 +192,7 @@ class Reader:
             return
         for factor in factorization.factors:
             if factor.parent(name) is not None and factor.mask(name, length)[:, past:].any():
-                raise ValueError(f"{factor} reads more than the first {past} frames of {name}, which are all there are")
+                raise ValueError(f"{factor} reads more than the first {past} frames of {name}, but no others exist")
         values[name] = functional.pad(values[name], (0, 0, 0, length - past))
 
     def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
@@ -198,8 +200,7 @@ class Reader:
             if lacking := [p for p in factor.parents if p.name in self.context and p.name not in values]:
                 given = ", ".join(f"{p.name} (B, {'T, ' * p.local}{self.sizes[p.name]})" for p in lacking)
                 raise ValueError(
-                    f"{factor} reads {given}, context that the batch has to give; it holds "
-                    f"{shapes(values) or 'nothing'}"
+                    f"{factor} reads {given}, context that the batch must contain; it has {shapes(values) or 'nothing'}"
                 )
 
     def _check_values(
@@ -228,7 +229,7 @@ class Reader:
                 distribution, place = self.distributions[name], found.nonzero()[0].tolist()
                 raise ValueError(
                     f"{name} holds {values[name][tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}),"
-                    f" and by {distribution.factor}, {distribution.head.label}, values are "
+                    f" but under {distribution.factor}, {distribution.head.label}, values are "
                     f"{_meaning(distribution.support)}; give {name} another"
                     " distribution, move such entries inside, or hide them by the 'mask' of the batch"
                 )
@@ -369,12 +370,12 @@ def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tupl
     steps = {value.shape[1] for value in local.values()}
     if length is None:
         if not steps:
-            raise ValueError("neither a batch nor length= tells how many steps to run; pass length=")
+            raise ValueError("cannot infer the number of steps without a batch; pass length=")
         if len(steps) > 1:
             raise ValueError(f"the batch holds different numbers of steps: {shapes(local)}")
         length = max(steps)
     if length < 1:
-        raise ValueError(f"length is at least 1, got {length}")
+        raise ValueError(f"length must be at least 1, got {length}")
     return sizes.pop(), length
 
 
@@ -420,7 +421,7 @@ def in_chunks(
         ValueError: if samples or chunk is below 1.
     """
     if samples < 1 or chunk < 1:
-        raise ValueError(f"samples and chunk are at least 1, got {samples} and {chunk}")
+        raise ValueError(f"samples and chunk must be at least 1, got {samples} and {chunk}")
     found: dict[str, Tensor] = {}
     for first in range(0, max(size, 1), chunk):  # runs once for an empty batch too, so that `make` raises
         part = slice(first, min(first + chunk, size))

@@ -55,7 +55,7 @@ class Discrete(int):
     def __new__(cls, states: int) -> Self:
         """Create the size for a number of states."""
         if int(states) != states or states < 2:
-            raise ValueError(f"a discrete latent has at least two states, a whole number of them, not {states}")
+            raise ValueError(f"a discrete latent needs a whole number of states, at least two, got {states}")
         return super().__new__(cls, states)
 
     def __repr__(self) -> str:
@@ -107,8 +107,8 @@ class EnumerationPlan:
         if states > LARGEST:
             each = ", ".join(f"{name} has {size}" for name, size in self.sizes.items())
             raise ValueError(
-                f"at every step {states:,} states would be summed over, of {self.lag + 1} steps ({each}), and at most "
-                f"{LARGEST:,} are; take fewer states, or shorter lags"
+                f"every step would sum over {states:,} states, of {self.lag + 1} steps ({each}), but at most "
+                f"{LARGEST:,} are supported; use fewer states, or shorter lags"
             )
 
     @cached_property
@@ -157,9 +157,9 @@ class EnumerationPlan:
         read = {parent.name for factor in self.generative.factors for parent in factor.parents}
         if fed := sorted(read.intersection(replaced)):
             raise ValueError(
-                f"{', '.join(self.sizes)} cannot be summed out where the model reads its own means, or noise, in place "
-                f"of {', '.join(fed)}, as of missing entries and in scheduled sampling: these depend on the states; "
-                "fill the entries in, or let no factor read them"
+                f"{', '.join(self.sizes)} cannot be summed out, as the model reads its own means or noise in place "
+                f"of {', '.join(fed)}. This happens at missing entries and in scheduled sampling, and depends on the "
+                "states; fill the entries, or let no factor read them"
             )
 
     def _window(self, factor: Factor) -> Window:
@@ -173,9 +173,9 @@ class EnumerationPlan:
             ends = [end for interval in parent.relation.intervals or [(-math.inf, 0)] for end in interval]
             if not factor.local or not all(-math.inf < end <= 0 for end in ends):
                 raise ValueError(
-                    f"{factor} reads {parent}: {parent.name} cannot be summed out, since that takes its "
-                    f"{self.sizes[parent.name]}^T states at all T steps at once; of a discrete latent a factor reads a "
-                    f"few steps up to its own, such as {parent.name}_t or {parent.name}_{{t-1}}"
+                    f"{factor} reads {parent}: {parent.name} cannot be summed out, as this needs its "
+                    f"{self.sizes[parent.name]}^T states at all T steps at once. A factor can read a discrete latent "
+                    f"at a few steps up to its own, such as {parent.name}_t or {parent.name}_{{t-1}}"
                 )
             chain.append(parent.name)
             lags = [*(lags if len(chain) > 1 else []), *(int(-end) for end in ends)]
@@ -190,8 +190,8 @@ class EnumerationPlan:
         sizes = [self.sizes[name] for name in self.sizes for _ in range(length if name in self.chain else 1)]
         if (count := math.prod(sizes)) > COURSES:
             raise ValueError(
-                f"{', '.join(self.sizes)} may take {count:.3g} courses in {length} steps, and at most {COURSES:,} are "
-                "counted one by one; take fewer steps"
+                f"{', '.join(self.sizes)} have {count:.3g} state sequences in {length} steps, but at most {COURSES:,} "
+                "are enumerated; use fewer steps"
             )
         digits = np.stack(np.unravel_index(np.arange(count), sizes)).T
         found = {}

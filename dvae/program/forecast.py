@@ -99,7 +99,7 @@ def _fixed(model: Any, given: Mapping[str, Tensor], data: Batch, size: int, hori
     for name, value in given.items():
         if name not in free or free & set(model.observed) <= set(given):
             raise ValueError(
-                f"cannot fix {', '.join(given)}; some of {', '.join(sorted(free))} can be, but not all of the data"
+                f"cannot fix {', '.join(given)}; fix some of {', '.join(sorted(free))}, but not all of the data"
             )
         shape = (size, horizon, model.sizes[name]) if name in model.observed else (size, model.sizes[name])
         if value.shape != shape:
@@ -137,7 +137,7 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
 def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
     """Return probabilities of the states that are summed out, given the data and latents from the guide."""
     if not model.summed:
-        raise ValueError(f"nothing is summed out in {model.generative}; discrete latents have sizes of dvae.Discrete")
+        raise ValueError(f"{model.generative} sums out no latent; give discrete latents sizes of dvae.Discrete")
     data = model.read(batch)
     whole = model.rollout(data, guide=True)  # validates all sequences
 
@@ -164,12 +164,12 @@ def impute(
     given = Batch(batch if isinstance(batch, Mapping) else {})
     masks = given.masks(WHOLE if model.view.parts else model.observed[0])
     if not masks:
-        raise ValueError("nothing is missing in this batch; give a 'mask' that is False where entries are to be filled")
+        raise ValueError("this batch has no missing entries; give a 'mask' that is False where entries are to fill")
     drawn = model.is_drawn() if draw is None else draw
     if particles < 1 or (particles > 1 and not (drawn and model.likelihood)):
         raise ValueError(
-            f"particles is {particles}; it is at least 1, and more choose among draws (draw=True) by their likelihood, "
-            f"which {model.generative} {'has' if model.likelihood else 'lacks'}"
+            f"particles must be at least 1, got {particles}; more choose among draws (draw=True) by their likelihood, "
+            f"which {model.generative} {'has' if model.likelihood else 'does not have'}"
         )
     made = _filled(model, batch, samples, chunk, particles) if drawn else model.reconstruct(batch, samples, chunk=chunk)
     found = {}

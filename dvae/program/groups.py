@@ -110,7 +110,7 @@ class Grouped(TorchDistribution):
     def expand(self, batch_shape: Any, _instance: object = None) -> Grouped:
         """Return itself; only its own batch shape is supported."""
         if torch.Size(batch_shape) != self.batch_shape:
-            raise NotImplementedError(f"{self.batch_shape} is the batch of its groups, which is not {batch_shape}")
+            raise NotImplementedError(f"the batch of its groups is {self.batch_shape}, not {batch_shape}")
         return self
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -138,15 +138,15 @@ class DynamicalVAE(nn.Module):
         for name in self.shared:
             if name not in self.context or self.generative.local(name) or self.inference.local(name):
                 raise ValueError(
-                    f"{name} is to be drawn once for all sequences, so that it is static context: a parent without a "
-                    f"factor of its own, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
+                    f"{name} must be static context to be drawn once for all sequences: a parent without a "
+                    f"factor, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
                 )
         self.grouped = tuple(grouped)
         self._check_grouped()
         self.indicators = tuple(indicators)
         if unknown := [name for name in self.indicators if name not in observed]:
             raise ValueError(
-                f"indicators tell which data were observed, but {', '.join(unknown)} is none of {', '.join(observed)}"
+                f"indicators mark observed data, but {', '.join(unknown)} is not one of {', '.join(observed)}"
             )
         roots, rest = ([f for f in self.generative.factors if bool(f.parents) == more] for more in (False, True))
         self.generator: Any = self._conditionals(rest)
@@ -158,7 +158,7 @@ class DynamicalVAE(nn.Module):
             self.encoder: Any = guides
         self._check_latents()
         if masses := [name for name in self.observed if self.generator[name].discrete and not self.view.keeps_volume]:
-            raise ValueError(f"{self.view} changes volume, but {', '.join(masses)} is discrete and has none to change")
+            raise ValueError(f"{self.view} changes volume, but {', '.join(masses)} is discrete and has no volume")
         self.reader = Reader(
             self.sizes,
             {**_locality(self.inference), **_locality(self.generative)},
@@ -201,12 +201,12 @@ class DynamicalVAE(nn.Module):
     def _check_grouped(self) -> None:
         for name in self.grouped:
             if name not in self.latents or self.generative.local(name):
-                raise ValueError(f"groups share static latents, and {name!r} is none of {self.generative.text!r}")
+                raise ValueError(f"groups share static latents, but {name!r} is not one of {self.generative.text!r}")
             others = [p.name for p in self.generative.factor(name).parents if p.name not in self.grouped]
             if others:
                 raise ValueError(
-                    f"{self.generative.factor(name)} reads {', '.join(others)}, which sequences of a group have each "
-                    "their own; what a group shares is made of what groups share"
+                    f"{self.generative.factor(name)} reads {', '.join(others)}, which differs between sequences of a "
+                    "group; a shared latent can only read what groups share"
                 )
 
     def _check_latents(self) -> None:
@@ -225,7 +225,7 @@ class DynamicalVAE(nn.Module):
             if (distribution := self.generator[name].head.label) != "OneHotCategorical":
                 raise ValueError(
                     f"{name} is summed out over its {self.sizes[name]} states, but the distribution of "
-                    f"{self.generator[name].factor} is {distribution}; leave it to be that of categories"
+                    f"{self.generator[name].factor} is {distribution}; use the default, a categorical distribution"
                 )
 
     @torch.inference_mode(False)
@@ -421,7 +421,7 @@ class DynamicalVAE(nn.Module):
         rollout = self.rollout(self.read(batch, curriculum=curriculum), guide=True)
         for name in self.observed:
             if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
-                raise ValueError(f"the guide reads {name}, the batch holds {', '.join(rollout.values) or 'nothing'}")
+                raise ValueError(f"the guide reads {name}, but the batch has {', '.join(rollout.values) or 'nothing'}")
         values = {}
         for name in self.latents:
             n = (draws or {}).get(name, 1)
@@ -446,11 +446,11 @@ class DynamicalVAE(nn.Module):
         rows = [dict(zip(o, accumulate((draws.get(n, 1) for n in o), mul), strict=True)) for o in orders]
         if set(draws) - set(self.latents) or rows[0] != rows[1]:
             raise ValueError(
-                f"draws are of latents, in one order for model and guide; got {', '.join(draws)}, where the model "
+                f"draws must name latents, in one order for model and guide; got {', '.join(draws)}, where the model "
                 f"draws {', '.join(ours) or 'nothing'} and the guide {', '.join(self.latents) or 'nothing'}"
             )
         if any(count < 1 for count in draws.values()):
-            raise ValueError(f"draws are numbers from 1, got {dict(draws)}")
+            raise ValueError(f"draws must be numbers from 1, got {dict(draws)}")
 
     # Uses of a model -----------------------------------------------------------------------------------------------
 

@@ -129,16 +129,16 @@ class Oracle:
             )
         require(Count, steps=steps)
         if model.context:
-            raise ValueError(f"the oracle knows no distribution of the context {', '.join(model.context)}")
+            raise ValueError(f"the oracle has no distribution of the context {', '.join(model.context)}")
         if type(model).penalties is not DynamicalVAE.penalties:
-            raise ValueError(f"{type(model).__name__} adds energies to the log joint, which is not normal then")
+            raise ValueError(f"{type(model).__name__} adds energies to the log joint, which is then not normal")
         # float32 does not resolve affine functions of a variable far from 0
         self.model, self.steps = deepcopy(model).double() if model.wide else model, steps
         for name in model.summed:
             if other := [parent for parent in model.generator[name].parents if parent not in model.summed]:
                 raise ValueError(
-                    f"{model.generator[name].factor} reads {', '.join(other)}, so that states depend on what is "
-                    "continuous, and nothing of it is known exactly; the oracle knows states that read states"
+                    f"{model.generator[name].factor} reads {', '.join(other)}, so states depend on continuous "
+                    "variables and no exact result exists; the oracle needs states that read only states"
                 )
 
     def _size(self, name: str) -> int:
@@ -153,7 +153,7 @@ class Oracle:
             raise ValueError(f"the batch has {run.length} steps, but this oracle is Oracle(model, {self.steps})")
         if run.groups is not None:
             raise ValueError(
-                f"sequences of a group share {', '.join(self.model.grouped)}, and the oracle knows sequences one by "
+                f"sequences of a group share {', '.join(self.model.grouped)}, but the oracle treats sequences one by "
                 f"one; leave 'group' out of the batch"
             )
         if self.model.sums is not None:
@@ -227,8 +227,8 @@ class Oracle:
         """
         if self.model.summed:
             raise ValueError(
-                f"with {', '.join(self.model.summed)} summed out the posterior is a mixture of normals, from which the "
-                "divergence of a normal guide is not known exactly; evidence and posterior moments are"
+                f"with {', '.join(self.model.summed)} summed out, the posterior is a mixture of normals. The KL gap "
+                "of a normal guide to it is not known exactly; evidence and posterior moments are"
             )
         _, means, precision = self._mixture(None)
         return means[0, 0], precision[0]
@@ -405,7 +405,7 @@ def kl_gap(
         tensor([True])
     """
     if min(steps, seeds) < 1:
-        raise ValueError(f"a cost is of at least 1 step and 1 model, not of {steps} and {seeds}")
+        raise ValueError(f"a cost needs at least 1 step and 1 model, got {steps} and {seeds}")
     model = Factorization.parse(generative)
     read = guide(model, inference, observed)
     context = _context(model, read)
@@ -459,11 +459,11 @@ def model_kl_gap(
         tensor([True])
     """
     if min(steps, seeds) < 1:
-        raise ValueError(f"a cost is of at least 1 step and 1 model, not of {steps} and {seeds}")
+        raise ValueError(f"a cost needs at least 1 step and 1 model, got {steps} and {seeds}")
     whole, less = Factorization.parse(generative), Factorization.parse(reduced)
     if {*whole.variables} != {*less.variables}:
         names = ", ".join(whole.variables)
-        raise ValueError(f"a reduced model has the variables of the whole one, {names}, but it is {less.text!r}")
+        raise ValueError(f"a reduced model must have the variables of the whole one, {names}, got {less.text!r}")
     context = _context(whole, less)
     whole, less, data = _drawing(whole, context), _drawing(less, context), (*observed, *(f.child for f in context))
     lost = [

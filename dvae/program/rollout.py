@@ -62,7 +62,7 @@ class ScheduledSampling:
         if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1) or self.start < 0:
             raise ValueError(f"expected a probability in [0, 1], at least one pass and a start from 0, got {self}")
         if self.blocks is not None and (len(self.blocks) != 2 or min(self.blocks) < 1):
-            raise ValueError(f"blocks are numbers of frames from 1, as they are and replaced, got {self.blocks}")
+            raise ValueError(f"blocks must be numbers of kept and of replaced frames, at least 1, got {self.blocks}")
 
     def at(self, level: float) -> ScheduledSampling:
         """Return a copy with this probability, for schedules."""
@@ -104,7 +104,7 @@ class InputNoise:
 
     def __post_init__(self) -> None:
         if not 0 <= self.scale < inf:
-            raise ValueError(f"the scale of noise is finite and at least 0, got {self.scale}")
+            raise ValueError(f"the scale of noise must be finite and at least 0, got {self.scale}")
 
     def at(self, level: float) -> InputNoise:
         """Return a copy with this share of the scale, for schedules."""
@@ -598,7 +598,7 @@ class Sequence(TorchDistribution):
         if torch.Size(batch_shape) != self.batch_shape:
             raise NotImplementedError(
                 f"a Sequence of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}; "
-                "vectorised particles are had by repeating the batch (iwae_bound(particles=...))"
+                "repeat the batch for vectorised particles (iwae_bound(particles=...))"
             )
         return self
 
@@ -632,7 +632,7 @@ class Marginal(Sequence):
     def steps(self, value: Tensor) -> TorchDistribution:
         """Raise an error: with states summed out, steps depend on one another."""
         raise NotImplementedError(
-            f"with what {self.name} reads summed out, its steps have no distributions by themselves"
+            f"the variables that {self.name} reads are summed out, so its steps have no separate distributions"
         )
 
     def by_step(self, value: Tensor) -> Tensor:

@@ -47,9 +47,9 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
         missing = [c.name for c in known if np.isnan(future[:, schema.places[c.name]]).any() or len(future) < steps]
         if missing:
             without.append(
-                f"a forecast of {steps} steps needs {', '.join(missing)}, known in the future too, and sequence "
+                f"a forecast of {steps} steps needs future values of {', '.join(missing)}, but sequence "
                 f"{one.name!r} has {len(future)} rows after its last target at row {present - 1}; append rows with "
-                f"{'these' if len(missing) > 1 else 'it'} to the table, their targets empty"
+                f"{'these' if len(missing) > 1 else 'it'} to the table, and leave their targets empty"
             )
             continue
         if len(future) < steps:

@@ -147,7 +147,7 @@ def _refuse_late_days(days: np.ndarray, months: np.ndarray, label: str) -> None:
     lengths = ((months + 1).astype("datetime64[D]") - months.astype("datetime64[D]")).astype(int)
     if (days > lengths).any():
         row = int(np.argmax(days > lengths))
-        raise ValueError(f"row {row} of {label} is no date: {months[row]} has no day {days[row]:g}")
+        raise ValueError(f"row {row} of {label} is not a date: {months[row]} has no day {days[row]:g}")
 
 
 def _part(column: Any, unit: str) -> Any:

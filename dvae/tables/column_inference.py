@@ -151,8 +151,8 @@ class ColumnHints:
         for name in (column.name for column in numbers if column.role == "target" and column.name in roles):
             if found.is_constant(name):
                 warnings.warn(
-                    f"column {name!r} is constant, {_first(frame[name])}, and a target as it is named; there is "
-                    "nothing to forecast, and scores over all columns count it",
+                    f"column {name!r} is constant, {_first(frame[name])}, but was named as a target; its forecasts are "
+                    "trivial, and scores over all columns count it",
                     stacklevel=3,
                 )
         found.warn(schema, all_named=not self.columns)
@@ -499,7 +499,7 @@ class _Inference:
         if self._numbers_rows(name):
             return "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
         if name in self.levels:
-            return "a level of the index that tells no sequences apart"
+            return "a level of the index that does not distinguish sequences"
         if not read.wrong.any() and np.isnan(read.values).all():
             return "empty: all its values are missing"
         if self.is_constant(name):
@@ -516,7 +516,7 @@ class _Inference:
         aside = [name for name in self.frame if name not in columns.needed and (all_named or name in lacking)]
         said = [f"{name!r} ({self.reason(name)})" for name in aside]
         if said:
-            warnings.warn(f"left out of what is proposed: {', '.join(said)}", stacklevel=4)
+            warnings.warn(f"columns left out of the proposed schema: {', '.join(said)}", stacklevel=4)
         for column in columns.columns:
             self._warn_of_classes(column.name)
         if all_named and not columns.time and not self.undecided:
@@ -546,7 +546,7 @@ class _Inference:
             numbered = [name for name in columns.names if re.fullmatch(re.escape(stem) + r"\d+", name)]
             rest = [name for name in self.frame if name not in numbered]
             warnings.warn(
-                f"there is no time, and {count} columns, {numbered[0]!r} to {numbered[-1]!r}, are numbered; if each "
+                f"no column is a time, and {count} columns, {numbered[0]!r} to {numbered[-1]!r}, are numbered; if each "
                 f"row is a sequence, write a row for each step, as frame.melt({rest}, var_name='time', "
                 "value_name='value') does",
                 stacklevel=5,

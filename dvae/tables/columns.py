@@ -82,18 +82,18 @@ class Column:
             )
         if (self.family == "category") != bool(self.classes):
             raise ValueError(
-                f"column {self.name!r} is of family {self.family!r} and has {len(self.classes)} classes; a category, "
-                'and nothing else, has classes = ["…", "…"]'
+                f"column {self.name!r} has family {self.family!r} and {len(self.classes)} classes; a category, "
+                'and no other family, has classes = ["…", "…"]'
             )
         if len(set(self.classes)) < len(self.classes) or len(self.classes) == 1 or len(self.classes) > MOST:
             raise ValueError(
-                f"column {self.name!r} has {len(self.classes)} classes, {brief(self.classes)}; they are 2 to {MOST}, "
+                f"column {self.name!r} has {len(self.classes)} classes, {brief(self.classes)}; expected 2 to {MOST}, "
                 "all different"
             )
         if self.other and self.other not in self.classes:
             raise ValueError(
-                f"column {self.name!r} has other = {self.other!r}{nearest(self.other, self.classes)}, which is none of "
-                f"its classes, {brief(self.classes)}; add it to them"
+                f"column {self.name!r} has other = {self.other!r}{nearest(self.other, self.classes)}, which is not one "
+                f"of its classes, {brief(self.classes)}; add it to them"
             )
 
     @property
@@ -145,11 +145,11 @@ class Columns:
         if not self.targets:
             raise ValueError(f"no column is a target; given are {', '.join(self.names[:20]) or 'none'}")
         if twice := [name for name, count in Counter(names).items() if count > 1]:
-            raise ValueError(f"column {twice[0]!r} has two parts to play; every column has one")
+            raise ValueError(f"column {twice[0]!r} has two roles; every column must have one")
         if self.zone is not None:
             check_zone(self.zone)
             if self.time is None:
-                raise ValueError(f"zone is {self.zone!r}, and no column is the time; name it")
+                raise ValueError(f"zone is {self.zone!r}, but no column is the time; name the column")
 
     def of(self, *roles: Role) -> list[Column]:
         """Return the columns with one of these roles."""
@@ -276,7 +276,7 @@ def parsed(text: str) -> dict[str, Any]:
             raise RecursionError
         return tomllib.loads(text)
     except RecursionError:
-        raise ValueError("it has tables within tables, deeper than any schema") from None
+        raise ValueError("it has nested tables, deeper than any schema") from None
 
 
 def layout(told: Mapping[str, Any]) -> dict[str, Any]:

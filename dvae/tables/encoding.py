@@ -89,9 +89,9 @@ class PanelSchema(Schema):
         super().__post_init__()
         covariates = self.columns.of("known", "past", "static")
         if lost := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
-            raise ValueError(f"no mean and scale of {', '.join(sorted(lost))}, by which models read it without unit")
+            raise ValueError(f"no mean and scale of {', '.join(sorted(lost))}; models need both to standardise values")
         if lost := {c.name for c in self.columns.of("past")} - {*self.with_missing}:
-            raise ValueError(f"no indicator of {', '.join(sorted(lost))}, which ends with the present")
+            raise ValueError(f"no indicator of {', '.join(sorted(lost))}, whose values end with the present")
 
     @classmethod
     def from_data(cls, panel: Panel, cut: Cut) -> Self:
@@ -119,8 +119,8 @@ class PanelSchema(Schema):
             elif column.family not in ("binary", "category") and varies and scale < RESOLVED * abs(mean):
                 raise ValueError(
                     f"column {column.name!r} has mean {mean:.9g} and standard deviation {scale:.3g}, which float32 "
-                    f"does not resolve in the family {column.family!r}; give it the family 'real', of which models "
-                    "take the mean off in float64"
+                    f"does not resolve in the family {column.family!r}; give it the family 'real', whose mean models "
+                    "subtract in float64"
                 )
             if column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, mean or 1.0
@@ -243,7 +243,7 @@ class PanelSchema(Schema):
             known = one.values[:, place][~np.isnan(one.values[:, place])]
             if len(known) and (known != known[0]).any():
                 raise ValueError(
-                    f"column {column.name!r} is static, but changes within sequence {one.name!r}; it is known or past"
+                    f"column {column.name!r} is static, but changes within sequence {one.name!r}; make it known or past"
                 )
             values[0, place] = known[0] if len(known) else np.nan
         (found,) = self._filled(values, columns)

@@ -228,7 +228,7 @@ def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **
     """Write a table, or arrays with the sequences, steps and columns that they belong to."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
-        raise ValueError(f"{path} ends in none of {', '.join(FORMATS)}")
+        raise ValueError(f"{path} must end in one of {', '.join(FORMATS)}")
     with files.atomic_write(path) as file:
         if suffix == ".csv":
             table = found.table()

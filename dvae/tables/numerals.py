@@ -72,8 +72,8 @@ class Numbers:
         cell = brief(column.iloc[row])
         share = f"{known - count} of {known} values are numbers; " if known > count else ""
         raise ValueError(
-            f"column {column.name!r}: {share}row {row} is {cell}, which is no number; correct it, list it in na_values "
-            f"(--na-values) if it marks a missing value, {how}"
+            f"column {column.name!r}: {share}row {row} is {cell}, which is not a number; correct it, list it in "
+            f"na_values (--na-values) if it marks a missing value, {how}"
         )
 
 

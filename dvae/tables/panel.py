@@ -113,7 +113,7 @@ class Panel:
                     f"{who} has shape {one.values.shape}; expected rows of {len(self.columns.columns)} columns"
                 )
             if one.times is not None and (one.times.shape != (len(one),) or not (np.diff(one.times) > 0).all()):
-                raise ValueError(f"{who} has times that do not increase, or two rows of one time")
+                raise ValueError(f"{who} has times that do not increase, or two rows with one time")
         object.__setattr__(self, "complete", self._checked())
 
     def _checked(self) -> frozenset[str]:
@@ -225,8 +225,8 @@ class Panel:
         if isinstance(data, Panel):
             if isinstance(columns, Columns) and columns != data.columns:
                 raise ValueError(
-                    f"{data.name} is a panel of {', '.join(data.columns.names)}, whose columns are another thing than "
-                    f"{', '.join(columns.names)}; give what it was made of, or none of these"
+                    f"{data.name} is a panel with the columns {', '.join(data.columns.names)}, which differ from the "
+                    f"given {', '.join(columns.names)}; give the original data, or no columns"
                 )
             return data
         kind = type(data).__module__.partition(".")[0]
@@ -243,14 +243,14 @@ class Panel:
         arrays = [data] if hasattr(data, "ndim") and data.ndim == 2 else data
         if not isinstance(arrays, np.ndarray | torch.Tensor | list | tuple):
             raise TypeError(
-                f"a table is made of a pandas frame, an xarray Dataset, arrays (N, T, D) or a list of arrays (T, D), "
-                f"not of {type(data).__name__}"
+                f"a table is built from a pandas frame, an xarray Dataset, arrays (N, T, D) or a list of arrays (T, "
+                f"D), not of {type(data).__name__}"
             )
         for each in arrays:
             check_real(each, "the table")
             if (dtype := getattr(each, "dtype", None)) is not None and getattr(dtype, "kind", "") in ("m", "M"):
                 raise TypeError(
-                    f"the table is an array of {dtype}, which are times and no values; give a pandas frame with the "
+                    f"the table is an array of {dtype}, which are times and not values; give a pandas frame with the "
                     'times in one column and the values in others, as pandas.DataFrame({"time": times, "x": x})'
                 )
         plain = [each.detach().cpu().double().numpy() if isinstance(each, torch.Tensor) else each for each in arrays]
@@ -303,15 +303,15 @@ def plain_columns(columns: Columns | ColumnHints | Sequence[str] | None, size: i
     if isinstance(columns, ColumnHints):
         if strange := [name for name, value in vars(columns).items() if value and name != "columns"]:
             raise ValueError(
-                f"arrays have no names by which to tell {', '.join(strange)}; give a schema, in Python as "
-                "columns=Columns(...), or as FILE.toml beside the file"
+                f"arrays have no column names, so {', '.join(strange)} cannot be found; give a schema, in Python as "
+                "columns=Columns(...), or as FILE.toml next to the file"
             )
         words = (f"{word}::".split(":")[:3] for word in columns.columns)
         told = tuple(Column(name, "target", family or "real", unit) for name, family, unit in words)
         columns = Columns(told) if told else None
     if isinstance(columns, Columns):
         if strange := [name for name in ("id", "time", "group", "split") if getattr(columns, name)]:
-            raise ValueError(f"the schema names a column of {strange[0]}, and arrays have numbers alone; leave it out")
+            raise ValueError(f"the schema names a column of {strange[0]}, but arrays have only numbers; leave it out")
         return columns
     return Columns(tuple(map(Column, columns or [f"x{place}" for place in range(size)])))
 
@@ -384,11 +384,11 @@ def _of_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
         for what, all_labels in labels.items():
             if len(said := set(all_labels[places])) > 1:
                 raise ValueError(
-                    f"sequence {name!r} has several values of {told[what]}: {', '.join(sorted(said)[:3])}; it has one"
+                    f"sequence {name!r} has several values of {told[what]}: {', '.join(sorted(said)[:3])}; expected one"
                 )
             own[what] = said.pop()
         if own.get("split") and own["split"] not in SPLITS:
-            raise ValueError(f"sequence {name!r} is of split {own['split']!r}; expected one of {', '.join(SPLITS)}")
+            raise ValueError(f"sequence {name!r} has split {own['split']!r}; expected one of {', '.join(SPLITS)}")
         found.append(Series(name, values[places], None if when is None else when[places], **own))
     return found, calendar.stepping(one.times for one in found)
 
@@ -417,13 +417,13 @@ def _ordered(when: np.ndarray, rows: np.ndarray, who: str, calendar: Calendar, c
             return rows
     order = np.argsort(when[rows], kind="stable")
     found = rows[order]
-    advice = "name the id columns that tell sequences apart"
+    advice = "name the id columns that distinguish sequences"
     if calendar.kind == "dates" and calendar.zone is None:
         advice += ', or, if clocks were set back, their zone, such as zone = "Europe/Berlin"'
     if calendar.kind == "durations":
         advice += ", or write the date before clocks that begin again at midnight"
     if (twice := np.diff(when[found]) == 0).any():
-        advice += ", or remove the row that is there twice"
+        advice += ", or remove the duplicate row"
         first, second = sorted(found[np.argmax(twice) :][:2])
         raise ValueError(f"{who} has two rows at {column} {calendar.text(when[first])}, {first} and {second}; {advice}")
     back = np.concatenate([[False, False, False], np.diff(when[rows]) < 0])

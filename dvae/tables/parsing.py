@@ -91,7 +91,7 @@ def tabular(data: Any) -> Any:
     names = [*(name for name, _ in levels), *columns]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        beside = " or an index of a column's name" if twice in dict(levels) else ""
+        beside = " or an index with the name of a column" if twice in dict(levels) else ""
         raise ValueError(f"the table has two columns {twice!r}{beside}; rename one")
     if levels:
         frame = frame.reset_index(drop=True)
@@ -152,8 +152,8 @@ def dates(column: Any) -> Any:
     known = offsets.dropna().unique()
     if len(known) and (naive := offsets.isna()).any():
         raise AmbiguousDates(
-            f"dates with an offset from UTC and others, such as {brief(str(held[naive.argmax()]))}, without one; write "
-            "it for all, or for none"
+            f"some dates have an offset from UTC, and others, such as {brief(str(held[naive.argmax()]))}, have none; "
+            "write it for all, or for none"
         )
     if not len(known):
         when = when.dt.tz_localize(None)
@@ -225,7 +225,7 @@ def _order(parts: Any, example: str) -> dict[str, str]:
         raise ValueError(f"some begin with the day and others with the month; write dates as {WANTED}")
     if not (first or second) or (parts.year.str.len() == 2).any():
         raise AmbiguousDates(
-            f"dates such as {example!r}, of which nothing tells the day from the month, or the year; "
+            f"dates such as {example!r} are ambiguous: the order of day, month and year is not known; "
             f"write them as {WANTED}"
         )
     return {"first": "day", "second": "month"} if first else {"first": "month", "second": "day"}
@@ -328,13 +328,13 @@ def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: s
         elif unknown.any():
             value = said[unknown].iloc[0]
             raise ValueError(
-                f"column {told.name!r} has {brief(value)}{nearest(value, places)}, which is none of its classes: "
-                f"{', '.join(told.classes[:10])}; a class can stand for all others: other = {told.classes[-1]!r}"
+                f"column {told.name!r} has {brief(value)}{nearest(value, places)}, which is not one of its classes: "
+                f"{', '.join(told.classes[:10])}; a class can replace all others: other = {told.classes[-1]!r}"
             )
         return said.map(places).to_numpy(np.float64)  # type: ignore[no-any-return]
     if column.dtype.kind in "mMc":
         raise ValueError(
-            f"column {told.name!r} holds {column.dtype}, which are no numbers; leave it out, or give it the family "
+            f"column {told.name!r} holds {column.dtype}, which are not numbers; leave it out, or give it the family "
             "'category'"
         )
     read = read_numbers(column, na_values, decimal, column.attrs.get("decimal"))

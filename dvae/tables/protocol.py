@@ -44,14 +44,14 @@ class Cut:
     def __post_init__(self) -> None:
         check(self)
         if (self.observed is None) != (self.horizon is None):
-            raise ValueError(f"observed is {self.observed} and horizon {self.horizon}; windows have both, or neither")
+            raise ValueError(f"observed is {self.observed} and horizon {self.horizon}; give both, or neither")
         if self.split == "time" and self.observed is None:
             raise ValueError(
-                "sequences are divided by time into windows; say how many steps are observed, and a horizon"
+                "sequences are divided by time into windows; give the number of observed steps, and a horizon"
             )
         if self.season is not None and self.season > (self.observed or 0):
             raise ValueError(
-                f"season is {self.season} and observed {self.observed}; a period is among what is observed"
+                f"season is {self.season} and observed {self.observed}; a period must be within the observed steps"
             )
         if self.validation + self.test >= 1:
             raise ValueError(f"validation {self.validation} and test {self.test} leave nothing to train on")
@@ -111,21 +111,22 @@ class Cut:
         if said and len({one.split == "" for one in panel.series}) > 1:
             silent = next(one.name for one in panel.series if not one.split)
             raise ValueError(
-                f"some sequences of {panel.name} say their split ({', '.join(sorted(set(said.values())))}) and others, "
-                f"such as {silent!r}, do not; let all, or none"
+                f"some sequences of {panel.name} state their split ({', '.join(sorted(set(said.values())))}), but "
+                f"others, such as {silent!r}, do not; give it for all, or for none"
             )
         if said:
             return [one.split for one in panel.series]
         if self.split == "group" and not any(units):
             raise ValueError(
-                f'split="group" holds out groups, and no column of {panel.name} says which group a sequence is of; '
+                f'split="group" holds out groups, but no column of {panel.name} gives the group of a sequence; '
                 'name one, such as group="region" of its columns, or --group region'
             )
         names = sorted(dict.fromkeys(units), key=lambda name: hashlib.sha256(f"{self.seed} {name}".encode()).digest())
         test, validation = (int(np.ceil(share * len(names))) for share in (self.test, self.validation))
         if len(names) < 3:
             raise ValueError(
-                f"{panel.name} has {len(names)} {self.split}s, too few to train, choose and test on some of them each; "
+                f"{panel.name} has {len(names)} {self.split}s, too few for separate training, validation and test "
+                "sets; "
                 'divide them by time: split="time", with observed and horizon'
             )
         parts = ["test"] * test + ["validation"] * validation + ["train"] * len(names)

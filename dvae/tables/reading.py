@@ -67,7 +67,7 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
     place = Path(path)
     suffix = place.suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"{place} is no table; tables end in {', '.join(SUFFIXES)}")
+        raise ValueError(f"{place} is not a table; tables end in {', '.join(SUFFIXES)}")
     content = files.read(place, LARGEST, links=True)
     if suffix == ".npz":
         return _of_arrays(place, content)
@@ -93,7 +93,7 @@ def _separated(content: bytes, separators: str) -> Any:
     if max(map(len, _rows(head, separator)), default=0) > MOST:
         raise ValueError(f"it has more than {MOST} columns")
     if b"\0" in content:
-        raise ValueError("it has bytes of 0, which are no text")
+        raise ValueError("it has null bytes, which are not text")
     read = partial(pd.read_csv, sep=separator, index_col=False, dtype=str, keep_default_na=False, na_values=[""])
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)
@@ -107,7 +107,7 @@ def _separated(content: bytes, separators: str) -> Any:
             except UnicodeDecodeError as where:
                 line = content.count(b"\n", 0, where.start) + 1
                 raise ValueError(
-                    f"line {line} is no UTF-8, but perhaps Latin-1; save it as UTF-8, as a spreadsheet can, or "
+                    f"line {line} is not UTF-8, but perhaps Latin-1; save it as UTF-8, as a spreadsheet can, or "
                     "`iconv -f latin1 -t utf-8`"
                 ) from error
             raise
@@ -175,7 +175,7 @@ def _without_empty_end(frame: Any, content: bytes) -> Any:
     held = np.flatnonzero(frame.notna().any(axis=1))
     end = int(held[-1]) + 1 if len(held) else 0
     if end and end < len(frame):
-        warnings.warn(f"{len(frame) - end} rows at the end that hold nothing are left out", stacklevel=5)
+        warnings.warn(f"{len(frame) - end} empty rows at the end are left out", stacklevel=5)
         frame = frame.iloc[:end]
     return frame
 
@@ -297,12 +297,12 @@ def _of_mapped(place: Path, columns: Columns | ColumnHints | None) -> Panel:
         files_in = sorted(islice(tables, MOST_FILES + 1))
         if others := [file for file in files_in if file.suffix.lower() != ".npy"]:
             raise ValueError(
-                f"{place} holds {others[0].relative_to(place)} beside npy files; of a folder npy files alone are read, "
-                "so write it as one, or move it elsewhere"
+                f"{place} holds {others[0].relative_to(place)} in addition to npy files; a folder must have npy files "
+                "only, so write it as one, or move it elsewhere"
             )
         if not 0 < len(files_in) <= MOST_FILES:
             many = f"more than {MOST_FILES:,}" if files_in else "none"
-            raise ValueError(f"{place} is to hold npy files, from 1 to {MOST_FILES:,}; it has {many}")
+            raise ValueError(f"{place} must have npy files, from 1 to {MOST_FILES:,}; it has {many}")
         names = [file.relative_to(place).with_suffix("").as_posix() for file in files_in]
         splits = (name.partition("/")[0] for name in names)
         found = list(zip((split if split in SPLITS else "" for split in splits), names, files_in, strict=True))
@@ -353,7 +353,7 @@ def _check_header(name: str, member: Any) -> None:
     reads = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(member)
     if version not in reads:
-        raise ValueError(f"{name} is no array of numbers")
+        raise ValueError(f"{name} is not an array of numbers")
     shape, _, _ = reads[version](member)
     if 8 * math.prod(shape) > LARGEST:
         raise ValueError(f"{name} is {shape}; at most {LARGEST // 8} numbers are read")
@@ -372,7 +372,7 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | ColumnHints |
             try:
                 return read_schema(files.read(file, LARGEST_SCHEMA, links=True).decode())
             except (UnicodeDecodeError, ValueError, TypeError) as error:
-                raise ValueError(f"{file} is no schema of a table: {error}") from error
+                raise ValueError(f"{file} is not the schema of a table: {error}") from error
     return None, None
 
 
@@ -382,7 +382,7 @@ def read_schema(text: str) -> tuple[Columns | ColumnHints | None, Cut | None]:
     cut = told.pop("cut", None)
     if cut is not None:
         if not isinstance(cut, dict):
-            raise ValueError("cut is a table: [cut]")
+            raise ValueError("cut must be a table: [cut]")
         known = [field.name for field in fields(Cut)]
         for name in cut:
             if name not in known:

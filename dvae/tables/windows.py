@@ -88,8 +88,8 @@ class PanelWindows:
         self._missing = any(np.isnan(schema.encoded(block)).any() for block in row_blocks(gapped))
         if unforeseen := schema.unforeseen(parts):
             warnings.warn(
-                f"the {split} part of {panel.name} lacks values of {', '.join(unforeseen)}, of which training data "
-                "lack none; the last value before, or the mean, stands for them, and no indicator tells models so",
+                f"the {split} part of {panel.name} has missing values in {', '.join(unforeseen)}, where training data "
+                "have none; the last value before, or the mean, replaces them, and models receive no indicator",
                 stacklevel=2,
             )
         self._context = {}

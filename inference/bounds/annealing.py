@@ -116,13 +116,14 @@ def annealed_bound(
     """
     if min(temperatures, chains, leaps, chunk) < 1:
         raise ValueError(
-            f"temperatures, chains, leaps and chunk are at least 1, got {temperatures}, {chains}, {leaps} and {chunk}"
+            f"temperatures, chains, leaps and chunk must be at least 1, got {temperatures}, {chains}, {leaps} and "
+            f"{chunk}"
         )
     require_likelihood(model)
     data = model.read(batch)
     require_latents(model)
     if model.grouped and data.group is not None:
-        raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
+        raise ValueError("sequences of a group have no separate evidence; remove 'group' from the batch")
     size = require_data(model, data)
     if not size:
         raise ValueError("the batch holds no sequences")
@@ -147,7 +148,7 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, A
         ValueError: when a latent is missing, or has another shape.
     """
     if lacking := [name for name in model.latents if name not in latents]:
-        raise ValueError(f"chains that go back start from all latents; missing are {', '.join(lacking)}")
+        raise ValueError(f"reverse chains need start values of all latents; missing are {', '.join(lacking)}")
     first = data[model.observed[0]]
     found = {}
     for name in model.latents:

@@ -186,7 +186,7 @@ def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
     for name, site in sites.items():
         if site["scale"] != 1.0 or site["mask"] is not None:
             raise ValueError(
-                f"the site {name} is scaled or masked by a handler; weights belong to the objective "
+                f"the site {name} is scaled or masked by a handler. Pass weights to the objective "
                 "(Evidence(kl_weight=...)), and missing entries to the batch ('mask'), so that the bound stays a bound"
             )
     return sites
@@ -286,8 +286,8 @@ def require_likelihood(model: DynamicalVAE) -> None:
     """
     if not model.likelihood:
         raise ValueError(
-            f"{model.generative} has no likelihood: its data are functions of its latents, trained by energies; there "
-            "is no bound and nothing to calibrate. Judge its forecasts, with dvae.evaluate"
+            f"{model.generative} has no likelihood: its data are functions of its latents, trained by energies. It "
+            "has no bound, and nothing to calibrate; evaluate its forecasts with dvae.evaluate"
         )
 
 
@@ -298,8 +298,8 @@ def require_latents(model: DynamicalVAE) -> None:
         ValueError: when the model has no latents except those that are summed out.
     """
     if not model.latents:
-        summed = f" but {', '.join(model.summed)}, which is summed out" if model.summed else ""
-        raise ValueError(f"nothing is latent in {model.generative}{summed}: its bound is the log evidence itself")
+        summed = f" other than {', '.join(model.summed)}, which is summed out" if model.summed else ""
+        raise ValueError(f"{model.generative} has no latents{summed}: its bound is the log evidence itself")
 
 
 def require_data(model: DynamicalVAE, data: AnyBatch) -> int:
@@ -361,7 +361,7 @@ def iwae_bound(
         torch.Size([3])
     """
     if particles < 1:
-        raise ValueError(f"particles is at least 1, got {particles}")
+        raise ValueError(f"particles must be at least 1, got {particles}")
     require_likelihood(model)
     with model.running():
         data = model.read(batch)

@@ -81,9 +81,9 @@ def fivo_bound(
         torch.Size([3])
     """
     if not isinstance(particles, int) or particles < 1:
-        raise ValueError(f"particles is a whole number, at least 1, not {particles!r}")
+        raise ValueError(f"particles must be a whole number, at least 1, got {particles!r}")
     if not 0 <= resample_below <= 1:
-        raise ValueError(f"resample_below is a share of the particles, between 0 and 1, got {resample_below}")
+        raise ValueError(f"resample_below must be a share of the particles, between 0 and 1, got {resample_below}")
     require_likelihood(model)
     with model.running():
         data = model.read(batch)
@@ -348,10 +348,10 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
     run = model.rollout(batch)
     instead = "use iwae_bound"
     if model.summed:
-        return f"{', '.join(model.summed)} is summed out, exactly, and not followed by particles; {instead}"
+        return f"{', '.join(model.summed)} is summed out exactly, not by particles; {instead}"
     if run.groups is not None:
         return (
-            f"particles are of one sequence each, but groups share {', '.join(model.grouped)}; {instead}, or leave "
+            f"particles belong to one sequence each, but groups share {', '.join(model.grouped)}; {instead}, or leave "
             "'group' out of the batch, where every sequence is a group"
         )
     for block in model.inference.blocks:
@@ -370,7 +370,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
                 if parent.name in late:
                     return (
                         f"{factor} reads {parent}, which {model.inference.factor(parent.name)} draws after all steps, "
-                        f"so that particles cannot be weighed on the way; {instead}"
+                        f"so particles cannot be weighted at each step; {instead}"
                     )
                 if parent.name in drawn and _reads_ahead(parent, run.length):
                     missing = " where entries are missing" if parent.name in hidden else ""

@@ -54,7 +54,7 @@ def predictive_bound(
     require_likelihood(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
         raise ValueError(
-            f"{type(model).__name__} forecasts in a way of its own, whose density is not known; leave the log score out"
+            f"{type(model).__name__} has a custom forecast, whose density is not known; leave the log score out"
         )
     with model.running():
         data = model.read(batch)
@@ -62,7 +62,7 @@ def predictive_bound(
         observed -= model.view.past  # the view's past frames are context, which is always given
         if model.grouped and data.group is not None:
             raise ValueError(
-                f"groups share {', '.join(model.grouped)}, and a log score is of one sequence; leave it out"
+                f"groups share {', '.join(model.grouped)}, but a log score is of one sequence; leave it out"
             )
         if data.lengths is not None:
             raise ValueError("a log score needs sequences of one length, but these have lengths")
@@ -76,7 +76,7 @@ def predictive_bound(
         log_det = torch.zeros(size, length) if data.log_det is None else data.log_det
         if log_det.dim() == 1:
             raise ValueError(
-                "the view changes the volume of whole sequences, and what of that is due to the future is not known; "
+                "the view changes the volume of whole sequences, and the share of the future in it is not known; "
                 "leave the log score out, or give the view a log_det by entry, (B, T, D)"
             )
         past = data.map(lambda value: value[:, :observed] if value.dim() == 3 else value)

@@ -44,20 +44,19 @@ class RedrawnModel(nn.Module):
         for name, distribution in distributions.items():
             if not isinstance(distribution, Distribution) or distribution.event_shape:
                 raise ValueError(
-                    f"the distribution of {name} is {distribution!r}; expected that of one number, such as Normal(50., "
-                    "7.)"
+                    f"the distribution of {name} is {distribution!r}; expected a distribution of one number, such as "
+                    "Normal(50., 7.)"
                 )
         if not distributions or not distributions.keys() <= {*model.latents}:
             raise ValueError(
-                f"latents to draw from elsewhere are some of {', '.join(model.latents)}; got "
+                f"latents with another distribution must be some of {', '.join(model.latents)}; got "
                 f"{', '.join(distributions) or 'none'}"
             )
         for name in distributions:
             if parents := model.generative.factor(name).parents:
                 raise ValueError(
-                    f"{name} follows from {', '.join(parent.name for parent in parents)}, so that there is no one "
-                    "distribution "
-                    "to replace; this is for latents that are drawn by themselves, as in p(z)"
+                    f"{name} depends on {', '.join(parent.name for parent in parents)}, so it has no single "
+                    "distribution to replace; use a latent without parents, as in p(z)"
                 )
         self.model, self.distributions = model, dict(distributions)
         self.generative, self.inference = model.generative, model.inference

@@ -107,7 +107,7 @@ class Correction:
         """Return location and scale (k B, S, D), given the guide's own and the latents by step."""
         if len(parameters[0]) % len(self.unit):
             raise ValueError(
-                f"this guide is of {len(self.unit)} sequences of its own, and the batch has {len(parameters[0])} rows; "
+                f"this guide was fitted to {len(self.unit)} sequences, but the batch has {len(parameters[0])} rows; "
                 "give it the sequences that it was fitted to, in their order"
             )
         loc, scale = (each.unflatten(0, (-1, len(self.unit))) for each in parameters)
@@ -239,13 +239,13 @@ def semi_amortized_guide(
     """
     if min(steps, draws) < 1 or (reach is not None and reach < 0) or not rate > 0:
         raise ValueError(
-            f"steps and draws are at least 1, the reach at least 0 and the rate above 0, got {steps}, {draws}, {reach} "
+            f"steps and draws must be at least 1, reach at least 0 and rate above 0, got {steps}, {draws}, {reach} "
             f"and {rate}"
         )
     require_local(model)
     data = model.read(batch)
     if model.grouped and data.group is not None:
-        raise ValueError("sequences of a group share latents, and have no guide of their own; leave 'group' out")
+        raise ValueError("sequences of a group share latents and have no separate guide; remove 'group'")
     require_data(model, data)
     with seeded_evaluation(model, seed):
         found, corrections = _start(model, data, missing, reach)
@@ -276,7 +276,7 @@ def require_local(model: DynamicalVAE) -> None:
     for name in model.latents:
         if not isinstance(model.encoder[name].head, Gaussian):
             raise ValueError(
-                "semi-amortized guides are normals, of a location and a scale, but the distribution of "
+                "semi-amortized guides are normals with a location and a scale, but the distribution of "
                 f"{model.inference.factor(name)} "
                 f"is a {type(model.encoder[name].head).__name__}"
             )

@@ -121,7 +121,7 @@ class Bracket(Result):
         """
         known = self.bounds[data]
         if lacking := [name for name in (bound, above) if name and name not in known]:
-            raise KeyError(f"there is no {lacking[0]!r} of {data} data; there are {', '.join(known)}")
+            raise KeyError(f"{data} data have no {lacking[0]!r}; they have {', '.join(known)}")
         values = known[bound] - (known[above] if above else 0.0)
         weights = self.frames if frame else np.ones(len(values))
         places = clip_index(self.keys).numpy() if data == "real" else np.arange(len(values))
@@ -222,11 +222,11 @@ class Bracket(Result):
         if self.extents != {"sequence": {len(self.keys)}} or not self.keys:
             raise ValueError(f"expected {len(self.keys)} numbers of every bound")
         if not all(np.isfinite(values).all() for values in (self.frames, *real.values(), *simulated.values())):
-            raise ValueError("bounds and numbers of frames are finite")
+            raise ValueError("bounds and numbers of frames must be finite")
         if self.equations.keys() != {"generative", "inference"}:
-            raise ValueError("equations has not the keys generative and inference")
+            raise ValueError("equations must have the keys generative and inference")
         if not all(isinstance(word, str) for word in axis_names(self.data)):
-            raise ValueError("what sequences and frames are called is no text")
+            raise ValueError("the names of sequences and frames must be text")
 
 
 def format_estimate(estimate: Estimate) -> str:
@@ -291,7 +291,7 @@ def bracket(
     """
     if min(particles, temperatures, chains, batch_size, 1 if count is None else count) < 1 or fitting < 0:
         raise ValueError(
-            "count, particles, temperatures, chains and batch_size are at least 1, fitting at least 0, not "
+            "count, particles, temperatures, chains and batch_size must be at least 1, fitting at least 0, got "
             f"{count}, {particles}, {temperatures}, {chains}, {batch_size} and {fitting}"
         )
     require_likelihood(model)
@@ -299,7 +299,7 @@ def bracket(
     data = take_split(data, "test")
     whole, notes = sequences(data).batch, []
     if whole.group is not None and model.grouped:
-        raise ValueError("sequences of a group have no evidence of their own; leave 'group' out of the batch")
+        raise ValueError("sequences of a group have no separate evidence; remove 'group' from the batch")
     windows = data if isinstance(data, HeldOutWindows) else None
     size = length_of(whole)
     keys = [("data", str(n), 0) for n in range(size)] if windows is None else clusters(windows)
@@ -358,8 +358,8 @@ def bracket(
     unknown = result.estimate("upper", "AIS", "simulated")
     if unknown.mean > max(WIDE, 2 * unknown.sequences):
         notes.append(
-            f"on simulated data the upper bound lies {format_estimate(unknown)} nats above AIS: AIS and family may be "
-            "that much too low, as where all chains stay in one mode, whatever the spread of the chains is"
+            f"on simulated data the upper bound lies {format_estimate(unknown)} nats above AIS. AIS and family may be "
+            "too low by this amount, as when all chains stay in one mode, whatever the spread of the chains is"
         )
     return result
 

@@ -199,7 +199,7 @@ class Calibration(Result):
         if len(self.names) != quantities or not count or not 1 <= self.draws <= _MOST / max(count, quantities):
             raise ValueError(f"expected ranks of {len(self.names)} quantities, and few draws, not {self.draws}")
         if (self.ranks < 0).any() or (self.ranks > self.draws).any():
-            raise ValueError(f"ranks are between 0 and {self.draws}")
+            raise ValueError(f"ranks must be between 0 and {self.draws}")
 
     @property
     def _title(self) -> str:
@@ -253,16 +253,16 @@ def calibrate(
     """
     if min(length, simulations, draws, chunk) < 1:
         raise ValueError(
-            f"length, simulations, draws and chunk are at least 1, got {length}, {simulations}, {draws} and {chunk}"
+            f"length, simulations, draws and chunk must be at least 1, got {length}, {simulations}, {draws} and {chunk}"
         )
     require_likelihood(model)
     if not model.latents:
         raise ValueError(
-            f"{model.generative} has no latents, so that its likelihood is exact and no guide to calibrate"
+            f"{model.generative} has no latents: its likelihood is exact, and it has no guide to calibrate"
         )
     kept = list(range(1, length + 1)) if steps is None else list(steps)
     if not kept or len(set(kept)) < len(kept) or not set(kept) <= set(range(1, length + 1)):
-        raise ValueError(f"steps are different numbers from 1 to {length}, got {kept}")
+        raise ValueError(f"steps must be different numbers from 1 to {length}, got {kept}")
     contexts: Mapping[str, Tensor] = context or {}
     if missing := [name for name in model.context if name not in contexts]:
         raise ValueError(f"the model reads the context {', '.join(missing)}; pass context={{name: values}}")
@@ -299,7 +299,7 @@ def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, n
         ValueError: when alpha is not between 0 and 1.
     """
     if not 0 < alpha < 1:
-        raise ValueError(f"alpha is a probability between 0 and 1, got {alpha}")
+        raise ValueError(f"alpha must be a probability between 0 and 1, got {alpha}")
     within = _tails(count, draws) > _critical(alpha, count, draws)
     points = np.arange(1, draws + 1) / (draws + 1)
     return points, within.argmax(1) / count, 1 - within[:, ::-1].argmax(1) / count
@@ -354,7 +354,7 @@ def _simulated(model: DynamicalVAE, given: Mapping[str, Tensor], count: int, len
     if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
         raise FloatingPointError(
             f"a free run of {length} steps gave {', '.join(wrong)} that are not finite; simulate fewer steps, "
-            "or see whether the model has been fitted"
+            "or check whether the model has been fitted"
         )
     return truth
 

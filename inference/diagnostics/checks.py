@@ -370,7 +370,7 @@ def predictive_checks(
     windows = held.windows
     statistics = default_statistics(windows) if statistics is None else statistics
     if not statistics:
-        raise ValueError("there is no statistic to check")
+        raise ValueError("expected at least one statistic to check, got none")
     for each in models.values():
         require_likelihood(each)
     truth = held.batch.mask_to_nan()

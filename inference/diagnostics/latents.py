@@ -66,17 +66,16 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
         conditional = model.generator[name]
         if conditional.support is not None or conditional.head.deterministic:
             raise ValueError(
-                f"the latent {name} cannot be any real number by the distribution of {conditional.factor}; gradients "
-                "lead "
-                "through posteriors on the whole line alone, such as those of distributions.Normal()"
+                f"under the distribution of {conditional.factor}, the latent {name} cannot be any real number. "
+                "Gradients only sample posteriors on the whole line, such as with distributions.Normal()"
             )
     data = model.read(batch)
     if model.grouped and data.group is not None:
-        raise ValueError("sequences of a group have one posterior together; leave 'group' out of the batch")
+        raise ValueError("sequences of a group have one joint posterior; leave 'group' out of the batch")
     size = require_data(model, data)
     chosen = range(size) if sequences is None else sequences
     if not chosen or not set(chosen) <= set(range(size)):
-        raise ValueError(f"sequences are some of 0 to {size - 1}, the rows of the batch; got {list(chosen)}")
+        raise ValueError(f"sequences must be some of 0 to {size - 1}, the rows of the batch; got {list(chosen)}")
     return [rows(data, slice(each, each + 1)) for each in chosen]
 
 
@@ -109,7 +108,7 @@ class Inferred:
         self.there = joined(there)[0]
         self.draws = self.drawn(draws)
         if not self.draws.isfinite().all():
-            raise FloatingPointError("the guide draws latents that are not finite; see whether it has been fitted")
+            raise FloatingPointError("the guide draws latents that are not finite; check whether it has been fitted")
         self._elsewhere = joined(self._like)
         self.center, self.scale = self.draws.mean(0), self.draws.std(0).clamp(min=_LEAST)
         self._repeated: tuple[int, Any] = 0, None

@@ -62,9 +62,7 @@ class Descent:
     def __post_init__(self) -> None:
         check(self)
         if self.starts > self.candidates:
-            raise ValueError(
-                f"{self.starts} starts are chosen among at least so many candidates, got {self.candidates}"
-            )
+            raise ValueError(f"{self.starts} starts need at least as many candidates, got {self.candidates}")
 
 
 @dataclass(frozen=True)
@@ -236,8 +234,8 @@ class _Search:
         finite = energies.isfinite().any(0)
         if not finite.all():
             raise FloatingPointError(
-                f"no start of sequence {int(finite.logical_not().nonzero()[0])} of these {self.size} arrived at a "
-                "finite energy; see whether what was observed of it is finite, or lower the rate"
+                f"no start of sequence {int(finite.logical_not().nonzero()[0])} of these {self.size} reached a "
+                "finite energy; check whether its observations are finite, or lower the rate"
             )
         order = energies.nan_to_num(torch.inf).argsort(0)
         best, each = order[0], torch.arange(self.size)
@@ -348,7 +346,7 @@ def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str
     if wrong := {name: tuple(log.shape) for name, log in logs.items() if log.shape != (size,) and log.dim()}:
         raise ValueError(
             f"log-densities are {wrong}, expected one for each of {size} sequences; draw in one plate over sequences, "
-            "and say of all other dimensions that they are of one event (`.to_event()`)"
+            "and declare all other dimensions as one event (`.to_event()`)"
         )
     return -torch.stack([log for log in logs.values() if log.dim()]).sum(0)  # plates have no dimensions
 
@@ -362,8 +360,8 @@ def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     root, failed = torch.linalg.cholesky_ex(prior)
     if failed.any():
         raise ValueError(
-            "the prior of the latents is not log-concave where the posterior has its mode, so that nothing says how "
-            "wide it may be; this is for priors such as normals"
+            "the prior of the latents is not log-concave at the mode of the posterior, so its width cannot be "
+            "bounded; use priors such as normals"
         )
     white = torch.linalg.solve_triangular(root, torch.eye(prior.shape[-1]).to(prior), upper=False)
     relative = white @ curvature @ white.mT

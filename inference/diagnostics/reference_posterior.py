@@ -390,7 +390,7 @@ def reference_posterior(
     """
     if min(draws, guide_draws) < 4 or chains < 2 or warmup < 1:  # arviz needs as many for R-hat
         raise ValueError(
-            f"NUTS takes at least 4 draws, 2 chains and 1 of warm-up, and the guide 4 draws; got {draws}, {chains}, "
+            f"NUTS needs at least 4 draws, 2 chains and 1 of warm-up, and the guide 4 draws; got {draws}, {chains}, "
             f"{warmup} and {guide_draws}"
         )
     with seeded_evaluation(model, seed), progress_bar(progress) as bar:
@@ -402,7 +402,7 @@ def reference_posterior(
             if len(some) * len(inferred.there) ** 2 > _MOST:
                 raise ValueError(
                     f"{len(some)} sequences with {len(inferred.there)} latent numbers have more correlations than can "
-                    "be told; take fewer sequences, or their first steps alone"
+                    "be estimated; take fewer sequences, or only their first steps"
                 )
             guides.append(_moments(inferred, inferred.draws[None]))
             if (known := _exact(model, data, inferred)) is not None:
@@ -455,7 +455,7 @@ def _nuts(
     ):
         if not log_joint.isfinite().all():
             raise FloatingPointError(
-                f"the log joint is not finite at a draw from the {kind}, from where NUTS would start; see whether the "
+                f"the log joint is not finite at a draw from the {kind}, where NUTS would start; check whether the "
                 "model has been fitted, and on data of this scale"
             )
     evaluations = 0

@@ -152,7 +152,7 @@ def stein_discrepancy(
         ((3,), True)
     """
     if draws < 2 or bootstrap < 1:
-        raise ValueError(f"draws are at least 2 and bootstrap at least 1, got {draws} and {bootstrap}")
+        raise ValueError(f"draws must be at least 2 and bootstrap at least 1, got {draws} and {bootstrap}")
     found, together = [], torch.zeros(bootstrap + 1, dtype=torch.float64)
     with seeded_evaluation(model, seed), progress_bar(progress) as bar:
         some = some_of(model, batch, sequences)
@@ -162,7 +162,7 @@ def stein_discrepancy(
             pairs = _stein(u, inferred.score(u))
             if not pairs.isfinite().all():
                 raise FloatingPointError(
-                    "the gradient of the log joint is not finite at a draw of the guide; see whether the model has "
+                    "the gradient of the log joint is not finite at a draw of the guide; check whether the model has "
                     "been fitted, and on data of this scale"
                 )
             signs = 2.0 * torch.randint(2, (bootstrap + 1, draws)).to(pairs) - 1

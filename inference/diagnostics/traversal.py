@@ -89,18 +89,18 @@ def traverse(
     chosen = tuple(range(model.sizes[latent]) if coordinates is None else coordinates)
     if not chosen or not set(chosen) <= set(range(model.sizes[latent])) or steps < 2 or draws < 2:
         raise ValueError(
-            f"coordinates of {latent} go from 0 to {model.sizes[latent] - 1}, steps is at least 2, draws at least 2; "
+            f"coordinates of {latent} must be from 0 to {model.sizes[latent] - 1}, steps and draws at least 2; "
             f"got {chosen}, {steps} and {draws}"
         )
     offsets = torch.linspace(*span, steps, dtype=torch.float64)
     offsets[offsets.abs() < 1e-9 * offsets.abs().max()] = 0
     if (offsets != 0).all():
         raise ValueError(
-            f"{steps} offsets from {span[0]:g} to {span[1]:g} leave out 0, the latent as inferred, with which others "
-            "are compared; take an odd number of steps, and a span about 0"
+            f"{steps} offsets from {span[0]:g} to {span[1]:g} leave out 0, the latent as inferred and the reference "
+            "of all others; take an odd number of steps, and a span about 0"
         )
     if unit not in ("prior", "posterior"):
-        raise ValueError(f"unit is 'prior' or 'posterior', got {unit!r}")
+        raise ValueError(f"unit must be 'prior' or 'posterior', got {unit!r}")
     _check_path(model, latent, free)
     data = on_device_of(model, model.read(batch))
     if partial := {"lengths", "mask"} & data.keys():

@@ -112,8 +112,8 @@ def compare(
     """
     if min(particles, estimates, batch_size) < 1 or min(filter_particles, contrasts, samples) < 0:
         raise ValueError(
-            "particles, estimates and batch_size are at least 1, filter_particles, contrasts and samples at least 0, "
-            f"not {particles}, {estimates}, {batch_size}, {filter_particles}, {contrasts} and {samples}"
+            "particles, estimates and batch_size must be at least 1, filter_particles, contrasts and samples at least "
+            f"0, got {particles}, {estimates}, {batch_size}, {filter_particles}, {contrasts} and {samples}"
         )
     data = take_split(data, "test")
     windows = data if isinstance(data, HeldOutWindows) else None
@@ -126,8 +126,9 @@ def compare(
         of.setdefault(model.view.measured or "the data", label)
     if len(of) > 1:
         raise ValueError(
-            "bounds compare where they are densities of the same, but here are "
-            f"{' and '.join(f'those of {label}, of {what}' for what, label in of.items())}; evaluate compares forecasts"
+            "bounds are comparable only as densities of the same data, but here are "
+            f"{' and '.join(f'bounds of {label}, of {what}' for what, label in of.items())}; evaluate compares "
+            "forecasts"
         )
     batch = sequences(data).batch
     alone = batch.group.tolist() if batch.group is not None else range(length_of(batch))
@@ -232,7 +233,7 @@ def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: 
 def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
     """Return the models of every seed by name."""
     if not isinstance(models, Mapping):
-        raise TypeError(f"models are a mapping such as {{'srnn': model}}, not {type(models).__name__}")
+        raise TypeError(f"models must be a mapping such as {{'srnn': model}}, not {type(models).__name__}")
     for name, value in models.items():
         if not isinstance(value, nn.Module | Iterable):
             raise TypeError(
@@ -243,7 +244,7 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
     }
     if not found or not all(found.values()):
         empty = next((name for name, versions in found.items() if not versions), None)
-        raise ValueError("there is nothing to compare: " + (f"{empty!r} has no model" if found else "no models"))
+        raise ValueError("expected models to compare: " + (f"{empty!r} has no model" if found else "no models"))
     for name, versions in found.items():
         for version in versions:
             if not isinstance(version, DynamicalVAE):

@@ -206,7 +206,7 @@ class Comparison(Result):
         if different := [name for name, value in ours.items() if value != theirs[name]]:
             raise ValueError(f"comparisons to join may differ in their models alone, not in {', '.join(different)}")
         if shared := self.rows.keys() & other.rows.keys():
-            raise ValueError(f"both comparisons have a model {', '.join(sorted(shared))}; name one of them otherwise")
+            raise ValueError(f"both comparisons have a model {', '.join(sorted(shared))}; rename one of them")
         return dataclasses.replace(self, rows={**self.rows, **other.rows})
 
     def table(self) -> Group:

@@ -96,7 +96,7 @@ class PredictionBands(Result):
         """
         if region not in REGIONS:
             raise ValueError(
-                f"no prediction bands of a {region!r}{nearest(region, REGIONS)}; there are {', '.join(REGIONS)}"
+                f"no prediction bands of a {region!r}{nearest(region, REGIONS)}; known are {', '.join(REGIONS)}"
             )
         shape = self.factors["number"].shape
         if forecasts.ndim != 4 or forecasts.shape[2:] != shape or len(forecasts) != self.samples:
@@ -222,7 +222,7 @@ class PredictionBands(Result):
         if [each.shape for each in given] != [shape, (shape[0], 1), (1, 1), shape][: len(given)]:
             raise ValueError("expected factors (H, D), (H, 1) and (1, 1), and a spread (H, D)")
         if not all(np.isfinite(each).all() and (each >= 0).all() for each in given):
-            raise ValueError("factors and spreads are numbers from 0 on")
+            raise ValueError("factors and spreads must be numbers from 0 on")
 
     def _spread(self, forecasts: Tensor) -> Tensor:
         """Return the spread of forecasts (B, K, H, D): (B, H, D), or the common one (H, D)."""
@@ -285,10 +285,10 @@ def conformal_bands(
     parts = {split for split, _, _ in held.keys} - {"all", "last"}
     if parts and getattr(windows.protocol, "split", None) == "time":
         raise ValueError(
-            f"these windows are the {' and '.join(sorted(parts))} part of {clip}s divided by time (split='time'); "
-            f"bands hold the future of other {clip}s as often as they say, and less often that of later steps of the "
-            f"same ones; divide whole {clip}s by split='sequence' or 'group', or calibrate on all windows of other "
-            f"{clip}s, data.windows('all')"
+            f"these windows are the {' and '.join(sorted(parts))} part of {clip}s divided by time (split='time'). "
+            f"Prediction bands have their nominal coverage for the future of other {clip}s, and less for later steps "
+            f"of the same ones. Divide whole {clip}s by split='sequence' or 'group', or calibrate on all windows of "
+            f"other {clip}s, data.windows('all')"
         )
     keys = clusters(windows) if groups is None else [("", group, 0) for group in groups]
     if len(keys) != len(held.keys):
@@ -298,9 +298,9 @@ def conformal_bands(
     if clips < needed:
         what, most = f"{clip}s" if groups is None else "groups", math.floor(100 * clips / (clips + 1))
         raise ValueError(
-            f"prediction bands of {100 * level:g} % need {needed} {what} of calibration windows, given are {clips}: of "
+            f"prediction bands of {100 * level:g} % need {needed} {what} of calibration windows, got {clips}; with "
             "fewer, the "
-            f"next one lies beyond all of them too often; take more, or {most} % at most"
+            f"next one is outside the bands too often. Use more, or {most} % at most"
         )
     with progress_bar(progress) as bar:
 
@@ -331,9 +331,8 @@ def conformal_bands(
     factors = {region: quantile(largest_by_region(far, region), places, level) for region in REGIONS}
     if not all(factor.isfinite().all() for factor in factors.values()):
         raise ValueError(
-            "these prediction bands would be of no end: forecasts have no spread where they miss the future, as points "
-            "have none "
-            f"(residuals= takes windows on which one is measured), or too few {clip}s were observed at some place"
+            "these prediction bands would be infinite: forecasts without spread miss the future, as points do "
+            f"(residuals= takes windows to estimate a spread), or too few {clip}s were observed at some place"
         )
     return PredictionBands(
         level=level,
@@ -426,5 +425,5 @@ def _fewest(level: float) -> int:
 
 def _checked(level: float) -> float:
     if not 0 < level < 1:
-        raise ValueError(f"the level of a prediction band is between 0 and 1, got {level}")
+        raise ValueError(f"the level of a prediction band must be between 0 and 1, got {level}")
     return level

@@ -88,7 +88,7 @@ def student_interval(mean: float, error: float, freedom: float, level: float = 0
         ValueError: when the level is not between 0 and 1.
     """
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, got {level}")
     reach = error * float(scipy.special.stdtrit(freedom, (1 + level) / 2)) if error else 0.0
     return mean - reach, mean + reach
 

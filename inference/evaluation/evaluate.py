@@ -172,7 +172,7 @@ def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles:
         if not isinstance(each, Forecasting):
             raise TypeError(
                 f"{name!r} is a {type(each).__name__}, not a model that forecasts, such as a DynamicalVAE; see "
-                "dvae.program.protocols.Forecasting for what one of your own needs"
+                "dvae.program.protocols.Forecasting for the methods that it needs"
             )
 
 
@@ -185,7 +185,7 @@ def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
     measures = list(scores(windows))
     names = [measure.name for measure in measures]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"scores have names of their own; two are called {', '.join(sorted(twice))}")
+        raise ValueError(f"scores must have different names; two are called {', '.join(sorted(twice))}")
     return measures
 
 

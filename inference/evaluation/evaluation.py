@@ -137,7 +137,7 @@ class Evaluation(Result):
         ours, theirs = self._both(first, second, metric)
         over, under = (self._score(metric, means).mean for means in (ours, theirs))
         if not under:
-            raise ValueError(f"the mean {metric} of {second} is 0, by which nothing can be divided")
+            raise ValueError(f"the mean {metric} of {second} is 0, so no ratio to it exists")
         return self._score(metric, over / under + (ours - over / under * theirs) / under)
 
     def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:

@@ -100,15 +100,15 @@ def prepare_windows(data: Any) -> EvaluationWindows:
     observed = windows.protocol.observed
     if observed is None:
         raise ValueError(
-            "whole sequences have no future; cut them, with observed and horizon steps, to forecast; compare compares "
-            "bounds of whole ones"
+            "whole sequences have no future; cut them, with observed and horizon steps, to forecast; compare() "
+            "compares bounds of whole ones"
         )
     if batch.lengths is not None:
         raise ValueError("evaluation needs windows of one length, but these have lengths")
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
-            f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, leave nothing to "
-            "observe or nothing to predict"
+            f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, have no frame to "
+            "observe or no frame to predict"
         )
     held = EvaluationWindows(windows, batch, observed, list(windows.keys))
     if held.mask is not None:
@@ -117,7 +117,7 @@ def prepare_windows(data: Any) -> EvaluationWindows:
                 split, name, start = held.keys[int(empty.nonzero()[0])]
                 _, frame = axis_names(windows.description)
                 raise ValueError(
-                    f"nothing was observed in the {what} of the window at {frame} {start} of {name!r} "
+                    f"the {what} of the window at {frame} {start} of {name!r} has no observation "
                     f"({split}); leave it out"
                 )
     return held

@@ -115,7 +115,7 @@ def probability_integral_transform(samples: Array, truth: Array, uniform: Array)
     uniform = torch.as_tensor(uniform, device=truth.device).double()
     if uniform.shape != truth.shape or not ((uniform >= 0) & (uniform <= 1)).all():
         raise ValueError(
-            f"a truth of shape {shape_of(truth)} needs as many uniform draws, from 0 to 1; given are "
+            f"a truth of shape {shape_of(truth)} needs as many uniform draws, from 0 to 1; got "
             f"{shape_of(uniform)} from {uniform.min():g} to {uniform.max():g}"
         )
     low, ties = _places(samples, truth)
@@ -163,7 +163,7 @@ def pit_histogram(samples: Array, truth: Array, bins: int = 20) -> Tensor:
     """
     samples, truth = as_pair(samples, truth)
     if bins < 1:
-        raise ValueError(f"a histogram has at least 1 bin, not {bins}")
+        raise ValueError(f"a histogram needs at least 1 bin, got {bins}")
     low, ties = _places(samples, truth)
     edges = [edge * (samples.shape[-3] + 1) / bins for edge in range(1, bins)]
     inner = [mean_of_known(((edge - low) / ties).clamp(0, 1), (-2, -1)) for edge in edges]
@@ -280,7 +280,7 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
         ValueError: when the order is not positive.
     """
     if not order > 0:
-        raise ValueError(f"the order of a variogram must be positive, but is {order}")
+        raise ValueError(f"the order of a variogram must be positive, got {order}")
 
     samples, truth = as_pair(samples, truth)
     *lead, steps, size = truth.shape
@@ -420,7 +420,7 @@ def _places(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 def _beyond(samples: Tensor, level: float) -> float:
     """Return how many of the K + 1 ranks lie on either side of a central interval."""
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, got {level}")
     found = (samples.shape[-3] + 1) * (1 - level) / 2  # for .9 and K = 19 not exactly 1
     return float(round(found)) if math.isclose(found, round(found)) else found
 
@@ -472,7 +472,7 @@ def as_samples(samples: Array) -> Tensor:
             "one forecast (T, D) needs an axis for K = 1"
         )
     if not samples.numel():
-        raise ValueError(f"there is nothing to score: samples (..., K, T, D) have shape {shape_of(samples)}")
+        raise ValueError(f"expected samples (..., K, T, D) with no size 0, got shape {shape_of(samples)}")
     return samples if samples.is_floating_point() else samples.double()
 
 

@@ -151,21 +151,19 @@ def confidence_set(
     """
     if not contenders or not 0 < level < 1 or draws < 1:
         raise ValueError(
-            f"a confidence set is of some models, at a level between 0 and 1, not of {len(contenders)} at {level}"
+            f"a confidence set needs models and a level between 0 and 1, got {len(contenders)} models at {level}"
         )
     if better not in ("lower", "higher"):
-        raise ValueError(
-            f"of a score of which neither the lower nor the higher is better, no model is the best: {better!r}"
-        )
+        raise ValueError(f"the best model needs a score that is better 'lower' or 'higher', got {better!r}")
     names, rows = list(contenders), list(contenders.values())
     if over_seeds and (single := [name for name in names if math.isnan(contenders[name].seeds)]):
         raise ValueError(
-            f"of {', '.join(single)} there is one training seed, which tells nothing of others; give more, or take "
+            f"{', '.join(single)} has one training seed, which gives no error over seeds; give more, or take "
             "over_seeds=False for these very weights"
         )
     clips = _check(contenders)
     if clips < 2:
-        raise ValueError("all windows are of one clip: there is no error over clips; give more clips")
+        raise ValueError("all windows are of one clip, so no error over clips exists; give more clips")
     means = np.array([row.mean for row in rows]) * (1 if better == "lower" else -1)
     deviations = np.stack([row.deviations for row in rows]) * math.sqrt(clips / (clips - 1))
     between, rest = (
@@ -202,7 +200,7 @@ def _check(rows: Mapping[str, TwoWayErrors]) -> int:
     """
     counts = {name: len(row.deviations) for name, row in rows.items()}
     if len(set(counts.values())) > 1:
-        raise ValueError(f"scores to compare are on the same clips, but there are {counts}")
+        raise ValueError(f"scores to compare must be on the same clips, but have {counts}")
     for name, row in rows.items():
         if not (math.isfinite(row.mean) and np.isfinite(row.deviations).all()):
             raise ValueError(f"the score of {name} is not finite: its mean is {row.mean}")
@@ -276,7 +274,8 @@ def required(
     """
     if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(
-            f"power and level are between 0 and 1 and seeds whole numbers from 2 on, not {power}, {level}, {[*seeds]}"
+            f"power and level must be between 0 and 1 and seeds whole numbers from 2 on, not {power}, {level}, "
+            f"{[*seeds]}"
         )
     count = _check({"the first": first, "the second": second})
     measured = first.estimate(second)

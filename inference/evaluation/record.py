@@ -166,7 +166,7 @@ def unflatten(kind: Any, record: Flat) -> Any:
         arguments = get_args(hint)
         if isinstance(mark, Dims) or get_origin(hint) in (dict, Mapping):
             if not isinstance(value, Mapping):
-                raise TypeError(f"{said} is no object")
+                raise TypeError(f"{said} is not an object")
             within = Annotated[np.ndarray, mark] if isinstance(mark, Dims) else arguments[1]
             of_models = mark == MODELS
             return {
@@ -176,11 +176,11 @@ def unflatten(kind: Any, record: Flat) -> Any:
         if is_dataclass(hint):
             hints = _hints(hint)  # type: ignore[arg-type]
             if not isinstance(value, Mapping) or value.keys() != hints.keys():
-                raise TypeError(f"{said} has not the fields {', '.join(hints)}")
+                raise TypeError(f"{said} must have the fields {', '.join(hints)}")
             return hint(**{name: of(value[name], within, (*path, name), model) for name, within in hints.items()})  # type: ignore[operator]
         if get_origin(hint) in (list, tuple):
             if not isinstance(value, list):
-                raise TypeError(f"{said} is no list")
+                raise TypeError(f"{said} is not a list")
             each = arguments if arguments[1:] and arguments[1] is not Ellipsis else arguments[:1] * len(value)
             if len(each) != len(value):
                 raise ValueError(f"{said} has {len(value)} entries; it must have {len(each)}")

@@ -103,7 +103,7 @@ def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = 
     """
     frames = observed.shape[1]
     if not 1 <= season <= frames:
-        raise ValueError(f"a season is from 1 to the {frames} observed frames, not {season}")
+        raise ValueError(f"a season must be from 1 to the {frames} observed frames, got {season}")
     last = interpolate_missing(observed, mask)[:, -season:]
     if mask is not None:
         periods = frames // season * season
@@ -157,7 +157,7 @@ def nearest_neighbours(
             f"shape {tuple(training.shape)}"
         )
     if len(training) < samples:
-        raise ValueError(f"{samples} neighbours were asked of {len(training)} training windows; use fewer")
+        raise ValueError(f"{samples} neighbours need as many training windows, got {len(training)}; use fewer")
     here = last_places(Batch(x=observed) | ({} if mask is None else {"mask": mask}), frames)
     there = last_places(Batch(x=training) | ({} if training_mask is None else {"mask": training_mask}), frames)
     nearest = distances(here[0], there[0], here[1], there[1]).topk(samples, largest=False).indices

@@ -193,7 +193,7 @@ class Result(Displayed):
         """
         try:
             if document["kind"] != cls.__name__:
-                raise ValueError(f"it is of the kind {reprlib.repr(document['kind'])}")
+                raise ValueError(f"its kind is {reprlib.repr(document['kind'])}")
             variables = {
                 str(name): Variable(tuple(each["dims"]), np.array(each["data"], float), tuple(each["path"]))
                 for name, each in document["variables"].items()

@@ -207,7 +207,7 @@ def width_at(level: float) -> Measure:
 def samples_needed(level: float) -> int:
     """Return the fewest samples that define a central interval of this level with samples outside."""
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval is between 0 and 1, got {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, got {level}")
     return math.ceil(round(2 / (1 - level) - 1, 9))
 
 
@@ -275,7 +275,9 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
 
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             if truth.shape[-1] != len(columns):
-                raise ValueError(f"{len(columns)} columns ({', '.join(columns)}) are not the {truth.shape[-1]} of x")
+                raise ValueError(
+                    f"x has {truth.shape[-1]} columns, but {len(columns)} were given ({', '.join(columns)})"
+                )
             past = Batch(past)
             mask = past.mask()
             seen = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
@@ -308,7 +310,7 @@ def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> l
     def of(place: int) -> Measure:
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             if not 1 <= place <= truth.shape[-2]:
-                raise ValueError(f"{frame} {place} is none of the {truth.shape[-2]} of the future, counted from 1")
+                raise ValueError(f"{frame} {place} is not one of the {truth.shape[-2]} of the future, counted from 1")
             return measure.function(forecasts[..., place - 1 : place, :], truth[..., place - 1 : place, :], past, index)
 
         return _part(measure, function, lambda truth: truth[..., place - 1 : place, :])

@@ -82,7 +82,7 @@ class Run:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         if not isinstance(path, str | os.PathLike):
-            raise TypeError(f"a run is a folder that fit wrote; expected its path, got {path!r}")
+            raise TypeError(f"a run must be the path of a folder that fit wrote, got {path!r}")
         self.path = Path(path)
 
     def __repr__(self) -> str:
@@ -113,9 +113,9 @@ class Run:
             if not test(state.get(name, ...))
         ]
         if not isinstance(fingerprints, dict) or not all(isinstance(value, str) for value in fingerprints.values()):
-            problem = "its fingerprints are no object of texts"
+            problem = "its fingerprints are not an object of texts"
         elif unknown := fingerprints.keys() - {BEST, LAST, OPTIMISER}:
-            problem = f"it has a fingerprint of {min(unknown)[:50]!r}, which is no file of a checkpoint"
+            problem = f"it has a fingerprint of {min(unknown)[:50]!r}, which is not a file of a checkpoint"
         elif lacking := {LAST, *([BEST] if state.get("best_step") is not None else [])} - fingerprints.keys():
             problem = f"it has no fingerprint of {' and '.join(sorted(lacking))}"
         elif wrong:
@@ -241,17 +241,17 @@ class Run:
                 content = json.loads(files.read(path, LARGEST_TEXT))
         except FileNotFoundError:
             raise CheckpointError(
-                f"{self.path} is no run directory: it has no {name}; give the folder that fit wrote (out=… in "
+                f"{self.path} is not a run directory: it has no {name}; give the folder that fit wrote (out=… in "
                 "Python, --out on the command line)"
             ) from None
         except NotADirectoryError:
             raise CheckpointError(
-                f"{self.path} is a file and no run directory; leave it out, or give the folder that fit wrote"
+                f"{self.path} is a file and not a run directory; leave it out, or give the folder that fit wrote"
             ) from None
         except (ValueError, RecursionError) as error:
             raise CheckpointError(f"{path} is damaged, it is not JSON ({error}); fit again") from error
         if _depth(content) > 32:
-            raise CheckpointError(f"{path} is damaged, it nests deeper than any that fit writes; fit again")
+            raise CheckpointError(f"{path} is damaged, it is nested deeper than any that fit writes; fit again")
         if not isinstance(content, dict):
             raise CheckpointError(f"{path} is damaged, it holds no JSON object but {type(content).__name__}; fit again")
         return content
@@ -337,7 +337,7 @@ def at_most(size: int, what: str) -> Iterator[None]:
         CheckpointError: when the limit is exceeded.
     """
     if size > LARGEST_WEIGHTS:
-        raise CheckpointError(f"{what} has {size} bytes of weights, and can have {LARGEST_WEIGHTS} at most")
+        raise CheckpointError(f"{what} has {size} bytes of weights, but at most {LARGEST_WEIGHTS} are supported")
     left, thread = size + 2**24, threading.get_ident()
 
     def count(module: nn.Module, name: str, value: Tensor | None) -> None:
@@ -346,8 +346,8 @@ def at_most(size: int, what: str) -> Iterator[None]:
             left -= value.numel()
             if left < 0:
                 raise CheckpointError(
-                    f"{what} asks for a model that is larger than its weights, which take {size} bytes; it is damaged, "
-                    "or the weights are those of another run"
+                    f"{what} describes a model that is larger than its weights of {size} bytes; it is "
+                    "damaged, or the weights are those of another run"
                 )
 
     hooks = [
@@ -366,8 +366,8 @@ def _check_names_and_shapes(model: nn.Module, tensors: Mapping[str, Tensor], pat
     found = {name: tuple(value.shape) for name, value in tensors.items()}
     if expected == found:
         return
-    problems = [f"it lacks {name} {expected[name]}" for name in expected.keys() - found.keys()]
-    problems += [f"it has {name} {found[name]}, which the model lacks" for name in found.keys() - expected.keys()]
+    problems = [f"it has no {name} {expected[name]}" for name in expected.keys() - found.keys()]
+    problems += [f"it has {name} {found[name]}, unlike the model" for name in found.keys() - expected.keys()]
     problems += [
         f"{name} is {found[name]}, the model's is {expected[name]}"
         for name in expected.keys() & found.keys()

@@ -268,11 +268,11 @@ def _prepared(recipe: Recipe, model: nn.Module, options: Mapping[str, Any]) -> d
     """Prepare a model for a recipe, unless a run is resumed, and return the options of its fit."""
     steps = sum(stage.steps for stage in recipe.stages)
     if options.get("steps", steps) != steps:
-        raise ValueError(f"this recipe is of {steps} steps, not {options['steps']}; ask the method for another")
+        raise ValueError(f"this recipe has {steps} steps, not {options['steps']}; ask the method for another")
     if options.get("scheduled_sampling", 0.0) != 0.0:
         raise ValueError(
-            f"scheduled sampling is an option of the method, which tells its recipe; instead of scheduled_sampling="
-            f"{options['scheduled_sampling']} here write dvae.method(…, scheduled_sampling=…)"
+            f"scheduled sampling is an option of the method, which sets it in its recipe; instead of "
+            f"scheduled_sampling={options['scheduled_sampling']} here write dvae.method(…, scheduled_sampling=…)"
         )
     if not options["resume"]:
         run_directory(options["out"], False, {})  # refuses a directory before a preparation that may take long
@@ -305,7 +305,7 @@ def _fit(
     source = as_source(train)
     held_out = None if validation is None else as_batches(validation)
     if training.patience is not None and held_out is None:
-        raise ValueError("patience counts validations; give validation data, or leave patience out")
+        raise ValueError("patience counts validations; give validation data, or remove patience")
     # hashing all data takes time, so only for a run that is stored
     fingerprint = train.fingerprint if out is not None and isinstance(train, Fingerprinted) else None
     record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}

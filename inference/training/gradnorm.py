@@ -70,9 +70,7 @@ class GradNorm:
     def __post_init__(self) -> None:
         check(self)
         if len(set(self.tasks)) != len(self.tasks) or len(self.tasks) < 2:
-            raise ValueError(
-                f"tasks are {', '.join(self.tasks) or 'none'}; weights need two of them or more, each once"
-            )
+            raise ValueError(f"tasks must be two or more different names, got {', '.join(self.tasks) or 'none'}")
 
     @property
     def draws(self) -> Mapping[str, int]:
@@ -105,7 +103,7 @@ class GradNorm:
         if unknown := [task for task in self.tasks if task not in costs]:
             raise ValueError(
                 f"tasks names {', '.join(map(repr, unknown))}, but the log-likelihoods and energies are "
-                f"{', '.join(costs) or 'none'}; all other terms are weighed by others"
+                f"{', '.join(costs) or 'none'}; others sets the weights of all other terms"
             )
         return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
 
@@ -161,7 +159,7 @@ class Balance:
         for task, start, now in zip(self.objective.tasks, first.tolist(), losses.tolist(), strict=True):
             if asymmetry and (start <= 0 or now < 0):
                 raise ValueError(
-                    f"the loss of {task} is {now:.4g}, {start:.4g} at first, and has no training rate, a ratio of "
+                    f"the loss of {task} is {now:.4g}, {start:.4g} at first. Its training rate needs a ratio of "
                     "losses above 0; give asymmetry=0, which needs none"
                 )
         self.first = first
@@ -209,7 +207,7 @@ class Balance:
         if all(gradient is None for gradient in found):
             raise ValueError(
                 f"the loss of {task} has no gradient by the parameters whose names start with "
-                f"{self.objective.shared!r} (shared); name some that all tasks go through"
+                f"{self.objective.shared!r} (shared); name parameters that all tasks use"
             )
         gradients = [zero if gradient is None else gradient for gradient, zero in zip(found, none, strict=True)]
         return torch.cat([gradient.flatten() for gradient in gradients])

@@ -76,10 +76,11 @@ class Training:
                 if value not in allowed:
                     raise ValueError(f"{name} is {value}; it must be {allowed}")
         if self.momentum and self.optimizer != "sgd":
-            raise ValueError(f"momentum is an option of sgd; {self.optimizer} has its own, so leave momentum 0")
+            raise ValueError(f"momentum is an option of sgd, and {self.optimizer} has its own; set momentum to 0")
         if self.decay and isinstance(self.learning_rate, Schedule):
             raise ValueError(
-                "decay is for a learning rate that is a number; a schedule falls by itself, so leave decay 0"
+                "decay needs a constant learning rate, but learning_rate is a schedule, which decays already; set "
+                "decay to 0"
             )
 
     @property
@@ -123,7 +124,7 @@ class Stage:
             raise ValueError(f"a stage has {self.steps} steps; it needs at least 1")
         for value in () if self.curriculum is None else levels(self.curriculum):
             if value not in Range(0, 1):
-                raise ValueError(f"the curriculum of a stage is {value}; it goes from 0 to 1")
+                raise ValueError(f"the curriculum of a stage must be from 0 to 1, got {value}")
 
 
 def plan_stages(

@@ -157,9 +157,11 @@ def _check(training: Training) -> None:
     there["gpu"] = any(there.values())
     if not there.get(accelerator, True):
         found = f"torch {torch.__version__} finds none here"
-        raise ValueError(f"accelerator is {accelerator!r}, and {found}; 'auto' takes what there is")
+        raise ValueError(f"accelerator is {accelerator!r}, but {found}; 'auto' uses an available one")
     if devices > 1 and not is_torchrun() and sys.argv[0] in ("", "-", "-c"):
-        raise ValueError(f"devices={devices} starts the program as often, and this one is in no file; write it to one")
+        raise ValueError(
+            f"devices={devices} starts as many copies of the program, but it is in no file; write it to one"
+        )
 
 
 def _places(devices: int) -> tuple[int, int]:
@@ -168,7 +170,7 @@ def _places(devices: int) -> tuple[int, int]:
         return devices, 1
     here, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
     if devices not in (1, here):
-        raise ValueError(f"devices is {devices}, and torchrun has started {here} processes here; leave devices out")
+        raise ValueError(f"devices is {devices}, but torchrun has started {here} processes here; remove devices")
     return here, all_processes // here
 
 
@@ -180,8 +182,8 @@ def _answered() -> Iterator[None]:
     except RuntimeError as error:
         minutes = LONGEST_WAIT.total_seconds() / 60
         raise LostProcess(
-            f"another process of this run has ended, or has not answered for {minutes:g} minutes; its own output says "
-            "why. Resume the run with as many processes to go on from its last checkpoint"
+            f"another process of this run has ended, or has not answered for {minutes:g} minutes; its own output gives "
+            "the reason. Resume the run with as many processes to continue from its last checkpoint"
         ) from error
 
 

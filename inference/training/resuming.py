@@ -64,7 +64,7 @@ def restore(svi: SVI, run: Run) -> None:
     if stored["step"] > training.steps:
         raise ValueError(
             f"steps is {training.steps}, but {run.path} has taken {stored['step']} steps already; steps "
-            f"counts all of a run, so give more than {stored['step']} to go on"
+            f"counts all of a run, so give more than {stored['step']} to continue"
         )
     parts = _parts(run, run.optimiser_state(state_bytes(model, 4) + 2**20))
     last = run.read(LAST, state_bytes(model))
@@ -80,7 +80,7 @@ def restore(svi: SVI, run: Run) -> None:
     if count != svi.fabric.world_size:
         raise CheckpointError(
             f"{run.path} was fitted by {count} processes, not {svi.fabric.world_size}; resume with as many, as each "
-            f"has random numbers of its own: with devices={count} on one host, or by torchrun on several"
+            f"has its own random numbers: with devices={count} on one host, or by torchrun on several"
         )
     # a copy: set_state reads the whole storage, so a view would give another row's bytes, or crash
     random = {name: value[svi.fabric.global_rank].clone() for name, value in parts["random"].items()}
@@ -124,7 +124,7 @@ def _parts(run: Run, content: Mapping[str, Tensor]) -> dict[str, dict[str, Tenso
     for path, value in content.items():
         part, _, name = path.partition("/")
         if part not in parts:
-            raise _damaged(run, f"{reprlib.repr(path)} is of no {', '.join(parts)}")
+            raise _damaged(run, f"{reprlib.repr(path)} does not belong to {', '.join(parts)}")
         parts[part][name] = value
     return parts
 
@@ -140,11 +140,11 @@ def _moments(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> dict[int, dict[
     for name, value in found.items():
         place, _, key = name.partition("/")
         if place not in places:
-            raise _damaged(run, f"{reprlib.repr(f'optimizer/{name}')} is of no parameter")
+            raise _damaged(run, f"{reprlib.repr(f'optimizer/{name}')} does not belong to a parameter")
         parameter = svi.parameters[places[place]]
         if not _sound(key, value, parameter, run.state["step"]):
             shape = f"finite and of shape {tuple(parameter.shape)}"
-            raise _damaged(run, f"{reprlib.repr(f'optimizer/{name}')} is not as the optimiser writes it, {shape}")
+            raise _damaged(run, f"{reprlib.repr(f'optimizer/{name}')} is not in the optimiser's format, {shape}")
         moments.setdefault(places[place], {})[key] = value
     for at, kept in moments.items():
         if missing := _KEPT[svi.training.optimizer] - kept.keys():
@@ -163,7 +163,7 @@ def _check_random(svi: SVI, run: Run, found: Mapping[str, Tensor]) -> None:
         size = own[key].numel() if key in own else None
         known = value.dtype == torch.uint8 and value.ndim == 2
         if not known or size not in (None, value.shape[1]) or key not in ("generator", "torch", "cuda"):
-            raise _damaged(run, f"{reprlib.repr(f'random/{key}')} is no state of a random number generator")
+            raise _damaged(run, f"{reprlib.repr(f'random/{key}')} is not a state of a random number generator")
     rows = {key: len(value) for key, value in found.items()}
     if missing := {"generator", "torch"} - rows.keys():
         raise _damaged(run, f"random has no {' and no '.join(sorted(missing))}")
@@ -182,15 +182,15 @@ def _take_up(objective: StatefulObjective, run: Run, found: Mapping[str, Tensor]
         held = reprlib.repr(list(found)) if found else "none"
         raise CheckpointError(
             f"{run.path} was fitted with another objective: the state of this one is {', '.join(own)}, the run's "
-            f"{held}; resume with the objective and the stages that it was fitted with, which begin elsewhere where "
-            "steps are others"
+            f"{held}; resume with the objective and the stages of the fit. Stages begin elsewhere when their steps "
+            "change"
         )
     for name, value in own.items():
         given = found[name]
         as_written = (given.dtype, given.shape) == (value.dtype, value.shape)
         if not as_written or not torch.isfinite(given).all():
             shape = f"finite, {value.dtype} and of shape {tuple(value.shape)}"
-            raise _damaged(run, f"objective/{name} is not as the objective writes it, {shape}")
+            raise _damaged(run, f"objective/{name} is not in the objective's format, {shape}")
     try:
         objective.restore({name: value.detach().clone() for name, value in found.items()})
     except ValueError as error:

@@ -105,7 +105,7 @@ class SVI:
         self.training, self.plan = plan_stages(options, objective, stages)
         trained = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
         if not trained:
-            raise ValueError(f"{type(model).__name__} has no parameters that require gradients: nothing to fit")
+            raise ValueError(f"{type(model).__name__} has no parameters that require gradients, so it cannot be fitted")
         for name, tensor in model.state_dict(keep_vars=True).items():
             if tensor.is_meta or tensor.is_inference():
                 where = "on the meta device" if tensor.is_meta else "in `torch.inference_mode()`"
@@ -114,11 +114,11 @@ class SVI:
             if missing := [start for start in stage.frozen if not any(name.startswith(start) for name in trained)]:
                 raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
             if all(name.startswith(stage.frozen) for name in trained):
-                raise ValueError(f"a stage of {stage.steps} steps has every parameter frozen; there is nothing to fit")
+                raise ValueError(f"every parameter is frozen in a stage of {stage.steps} steps; free at least one")
             if stage.curriculum is not None and not getattr(model, "has_curriculum", False):
                 raise ValueError(
-                    f"a stage of {stage.steps} steps has a curriculum, by which nothing of {type(model).__name__} "
-                    "comes; what sequences share does (DynamicalVAE(shared=...))"
+                    f"a stage of {stage.steps} steps has a curriculum, but {type(model).__name__} "
+                    "does not support one; a model with shared context does (DynamicalVAE(shared=...))"
                 )
             if isinstance(stage.objective, AdaptiveObjective):
                 stage.objective.begin(model)  # refuse it now rather than when its stage begins
@@ -131,7 +131,7 @@ class SVI:
     def state(self) -> State:
         """State of the run, after `init`."""
         if self._state is None:
-            raise RuntimeError("the run has not begun; call init() first, which makes its optimiser")
+            raise RuntimeError("the run has not begun; call init() first, which creates its optimiser")
         return self._state
 
     @property
@@ -219,7 +219,7 @@ class SVI:
     def row(self) -> dict[str, float]:
         """Return the numbers of the last step, in nats per frame (see `trackers`)."""
         if self.state.terms is None:
-            raise RuntimeError("no step has been taken since init(), so there are no numbers of one")
+            raise RuntimeError("no step has been taken since init(), so its numbers do not exist; call step() first")
         loss, norm = self._numbers
         rates = self.rates(self.state.step - 1)
         return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_frame(_sums(self.state.terms))}

@@ -100,20 +100,20 @@ class JSONLines:
         except FileNotFoundError:
             return []
         except files.FileRefused as error:
-            raise CheckpointError(f"{error}; move it away to go on without the history of the run") from error
+            raise CheckpointError(f"{error}; move it away to continue without the history of the run") from error
         rows: list[dict[str, Any]] = []
         for number, line in enumerate(io.BytesIO(content), 1):
             if not line.endswith(b"\n"):
                 break
             if number > MOST_ROWS:
                 raise CheckpointError(
-                    f"{self.path} has more than {MOST_ROWS:,} rows; take some out, or move the file away to go on "
+                    f"{self.path} has more than {MOST_ROWS:,} rows; remove some, or move the file away to continue "
                     "without the history of the run"
                 )
             if (row := row_of(line)) is None:
                 raise CheckpointError(
-                    f"{self.path} is damaged: line {number} is no row of numbers with a step; take the line out, or "
-                    "move the file away to go on without the history of the run"
+                    f"{self.path} is damaged: line {number} is not a row of numbers with a step; remove the line, or "
+                    "move the file away to continue without the history of the run"
                 )
             rows.append(row)
         return rows

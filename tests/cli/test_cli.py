@@ -64,7 +64,7 @@ def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
     assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
     assert "exact: the guide reads everything" in shown(*EQUATIONS)
     assert "q(z_t | z_{t-1}, x_{>=t})" in shown(*EQUATIONS[:2])
-    assert "nothing is latent" in shown("--generative", "p(x_t | x_{<t})", "--inference", "")
+    assert "has no latents" in shown("--generative", "p(x_t | x_{<t})", "--inference", "")
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ def test_a_run_of_a_gpu_goes_on_without_one(people, tmp_path, capsys, monkeypatc
     assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "4", *SMALL]) == 0
     config = out / "config.json"
     config.write_text(config.read_text().replace('"accelerator": "auto"', '"accelerator": "cuda"'))
-    assert "'auto' takes what there is" in failure(capsys, "resume", str(out), "--steps", "5")
+    assert "'auto' uses an available one" in failure(capsys, "resume", str(out), "--steps", "5")
     assert main(["resume", str(out), "--steps", "5", "--accelerator", "auto"]) == 0
 
 
@@ -388,8 +388,8 @@ def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path
     state = json.loads((run / "state.json").read_text())
     (run / "state.json").write_text(json.dumps({**state, "status": "failed"}))
     assert f"dvae resume {run} --learning-rate 0.0001; or" in failure(capsys, *again)
-    assert "is no run directory" in failure(capsys, "resume", str(tmp_path / "none"))
-    assert "is no run directory" in failure(capsys, "evaluate", str(tmp_path))
+    assert "is not a run directory" in failure(capsys, "resume", str(tmp_path / "none"))
+    assert "is not a run directory" in failure(capsys, "evaluate", str(tmp_path))
 
 
 def test_a_damaged_run_is_refused(capsys, run):
@@ -574,7 +574,7 @@ def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, 
                 {score: value.mean for score, value in forms[name].items()}, rel=1e-4, abs=1e-6
             )
     capsys.readouterr()
-    assert "bounds compare where they are densities of the same" in failure(
+    assert "bounds are comparable only as densities of the same" in failure(
         capsys, "compare", *runs, "--data", str(npz)
     )
     page, futures = tmp_path / "page.html", str(tmp_path / "f.npz")

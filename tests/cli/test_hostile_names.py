@@ -157,7 +157,7 @@ def test_clips_labels_and_skeletons_in_what_a_file_holds(name):
 
 @pytest.mark.parametrize("name", [LINES, COLOURED])
 def test_names_that_cannot_be_printed_are_not_written(name, tmp_path):
-    with pytest.raises(ValueError, match="is no name for a split and a clip: expected text that can be printed"):
+    with pytest.raises(ValueError, match="is not a name of a split and a clip: expected text that can be printed"):
         motion.save(tmp_path / "clips.npz", hostile(name))
     assert not list(tmp_path.iterdir())
 

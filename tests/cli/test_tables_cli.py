@@ -98,15 +98,16 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     assert main(["data", "info", str(path)]) == 0
     assert "overdispersed" in capsys.readouterr().out
     schema.write_text(schema.read_text().replace('family = "overdispersed"', 'unt = "people"'))
-    assert "riders.toml is no schema of a table: column 'riders' has an entry 'unt' (did you mean 'unit'?)" in failure(
-        capsys, "data", "info", path
+    assert (
+        "riders.toml is not the schema of a table: column 'riders' has an entry 'unt' (did you mean 'unit'?)"
+        in failure(capsys, "data", "info", path)
     )
     assert "--out writes the schema of one table" in failure(
         capsys, "data", "info", table, table, "--out", schema, code=2
     )
 
 
-@pytest.mark.filterwarnings("always:left out of what is proposed")
+@pytest.mark.filterwarnings("always:columns left out of the proposed schema")
 def test_what_is_proposed_of_dates_units_and_row_numbers_is_said(tmp_path, capfd):
     path, days = tmp_path / "shops.csv", pd.date_range("2024-01-01", periods=12)
     told = pd.DataFrame({"date": np.tile(days.strftime("%d/%m/%y"), 16), "sold": np.arange(16.0 * 12)})
@@ -236,7 +237,7 @@ def test_one_sequence_by_its_name(tabled, tmp_path, capsys):
 def test_beyond_the_end_of_the_table(tabled, table, tmp_path, capsys):
     run, out = tabled / "vae", tmp_path / "a.csv"
     said = failure(capsys, "forecast", run, "--out", out, "--beyond")
-    assert "a forecast of 3 steps needs plan, known in the future too, and sequence 's0' has 0 rows after" in said
+    assert "a forecast of 3 steps needs future values of plan, but sequence 's0' has 0 rows after" in said
     longer = tmp_path / "longer.csv"
     frame(future=3).to_csv(longer, index=False)
     assert main(["forecast", str(run), "--out", str(out), "--beyond", "--data", str(longer)]) == 0
@@ -275,7 +276,7 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
         (["--columns", "temp:count"], "the family 'count' is of whole numbers from 0"),
         (["--observed", "500", "--horizon", "3"], "no training window of 500 + 3 steps"),
         (["--test", "1.5"], "test is 1.5"),
-        (["--split", "group"], "no column of riders says which group a sequence is of; name one"),
+        (["--split", "group"], "no column of riders gives the group of a sequence; name one"),
         (["--skip-bad"], "--skip-bad is about motion, and vae is fitted on a table"),
         (["--protocol", "cmu8"], "--protocol is about motion, and vae is fitted on a table"),
     ],
@@ -299,7 +300,7 @@ def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, cap
     own = [*out, "--data", next(tabled.parent.glob("table*/riders.csv")), "--steps", "1"]
     for name in ("gsps", "pose-prior"):
         said = failure(capsys, "fit", name, *own)
-        assert "needs to know what poses are, and was given panel, which has none; take a method for any" in said
+        assert "needs the description of poses, but was given panel, which has none; take a method for any" in said
     said = failure(capsys, "fit", "srnn", *own, "--residual", "1")
     assert 'leave residual at 0, or give all columns one distribution with emission="normal"' in said
     assert not (tmp_path / "run" / "config.json").exists()

@@ -33,9 +33,9 @@ def test_whole_numbers_and_arrays_are_times():
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        ([[0.0, 1, 2], [0, 2, 2]], "times of sequence 1 are 2, 2 at steps 1 to 2, counted from 0; .* make one step of"),
+        ([[0.0, 1, 2], [0, 2, 2]], "times of sequence 1 are 2, 2 at steps 1 to 2, counted from 0; .* merge values"),
         ([[0.0, float("nan"), 2]], "times of sequence 0 are 0, nan at steps 0 to 1"),
-        ([0.0, 1.0], r"times are \(sequences, steps\), but these have shape \(2,\)"),
+        ([0.0, 1.0], r"times must be \(sequences, steps\), but have shape \(2,\)"),
     ],
 )
 def test_times_that_do_not_rise_are_refused(times, message):

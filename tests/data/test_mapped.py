@@ -268,22 +268,22 @@ def described(descr="'<f4'", order="False", shape="(2, 3)"):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "no npy file"),
-        (b"PK\x03\x04 an archive", "no npy file"),
-        (npy_of(described(), b"\0" * 24, version=3), "no npy file of version 1 or 2"),
+        (b"", "not an npy file"),
+        (b"PK\x03\x04 an archive", "not an npy file"),
+        (npy_of(described(), b"\0" * 24, version=3), "not an npy file of version 1 or 2"),
         (npy_of(described(), b"\0" * 23), r"shape .2, 3. of float32, holds 23 bytes, needs 24; it was cut short"),
         (npy_of(described(shape="(1000000000000, 48)"), b"\0" * 24), "holds 24 bytes"),
         (npy_of(described(shape="(99999999999999999999, 3)")), "damaged: its shape"),
-        (npy_of(described(shape="(-2, 3)"), b"\0" * 24), "no plain array"),
-        (npy_of(described(shape="(0, 3)")), "in which there is no number"),
+        (npy_of(described(shape="(-2, 3)"), b"\0" * 24), "not a plain array"),
+        (npy_of(described(shape="(0, 3)")), "so it contains no numbers"),
         (npy_of(described(shape=f"({'1, ' * 40})"), b"\0" * 4), "declares shape"),
-        (npy_of(described(shape="(__import__('os').abort(), 3)")), "no plain array"),
+        (npy_of(described(shape="(__import__('os').abort(), 3)")), "not a plain array"),
         (npy_of(described("'|O'"), b"\0" * 48), "holds object, expected real numbers"),
         (npy_of(described("'<U4'"), b"\0" * 96), "holds <U4, expected real numbers"),
-        (npy_of(described("[('x', '<f4')]"), b"\0" * 24), "no plain array"),
+        (npy_of(described("[('x', '<f4')]"), b"\0" * 24), "not a plain array"),
         (npy_of(described(order="True"), b"\0" * 24), "Fortran order"),
-        (npy_of(described() + " " * 10_000, b"\0" * 24), "no plain array"),
-        (npy_of("{" * 4000), "no plain array"),
+        (npy_of(described() + " " * 10_000, b"\0" * 24), "not a plain array"),
+        (npy_of("{" * 4000), "not a plain array"),
     ],
 )
 def test_headers_are_not_believed(tmp_path, content, message):
@@ -337,7 +337,9 @@ def test_too_many_files_are_said_to_be_too_many(tmp_path, monkeypatch):
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr(npy.np, "memmap", none_left)
-    with pytest.raises(OSError, match=r"no more may be \(ulimit -n\); write fewer, longer ones.*a\.npy"):
+    with pytest.raises(
+        OSError, match=r"the limit of open files is reached \(ulimit -n\); write fewer, longer ones.*a\.npy"
+    ):
         mapped(saved(tmp_path / "a.npy", walks()))
 
 
@@ -402,10 +404,12 @@ def test_a_folder_of_arrays_is_a_table_with_their_splits(tmp_path):
     (folder / "walk.bvh").touch()
     assert not is_table(str(folder))
     (folder / "test" / "c.csv").write_text("1,2")
-    with pytest.raises(ValueError, match=r"walks holds test.c.csv beside npy files; .* write it as one, or move it"):
+    with pytest.raises(
+        ValueError, match=r"walks holds test.c.csv in addition to npy files; .* write it as one, or move it"
+    ):
         PanelData.open(folder)
     (tmp_path / "none").mkdir()
-    with pytest.raises(ValueError, match="none is to hold npy files, from 1 to 100,000; it has none"):
+    with pytest.raises(ValueError, match="none must have npy files, from 1 to 100,000; it has none"):
         PanelData.open(tmp_path / "none")
 
 

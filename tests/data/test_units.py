@@ -30,8 +30,8 @@ def test_fitted_units_leave_mean_zero_and_mean_variance_one():
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (torch.arange(8.0).reshape(4, 2), r"units come from values \(\.\.\., 3\) that vary"),
-        (torch.ones(4, 3), r"units come from values \(\.\.\., 3\) that vary"),
+        (torch.arange(8.0).reshape(4, 2), r"units need values \(\.\.\., 3\) that vary"),
+        (torch.ones(4, 3), r"units need values \(\.\.\., 3\) that vary"),
         (
             1e-40 * torch.arange(12.0).double().reshape(4, 3),
             r"standard deviation of these values is .*e-\d+; .* multiply",
@@ -42,7 +42,7 @@ def test_fitted_units_leave_mean_zero_and_mean_variance_one():
 def test_units_come_from_values_that_vary(values, said):
     with pytest.raises(ValueError, match=said):
         Units(3).fit(values)
-    with pytest.raises(ValueError, match="units of their own, which were given"):
+    with pytest.raises(ValueError, match="given units, which cannot be fitted"):
         Units(3, [Coordinate(1.0, 2.0)] * 3).fit(values)
     with pytest.raises(ValueError, match="no variable 'y'; there are w, z, x"):
         dvae.DynamicalVAE(*PAIR, SIZES).standardise("y")

@@ -18,7 +18,9 @@ SMALL = {
 
 
 @pytest.mark.filterwarnings("ignore:.*it is shortened to:UserWarning")
-@pytest.mark.filterwarnings("ignore:left out of what is proposed. 'iso_alpha' .neither numbers nor:UserWarning")
+@pytest.mark.filterwarnings(
+    "ignore:columns left out of the proposed schema. 'iso_alpha' .neither numbers nor:UserWarning"
+)
 def test_the_commands_on_any_table_run(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")

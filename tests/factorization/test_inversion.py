@@ -133,14 +133,14 @@ def test_a_model_takes_the_word():
     [
         (lambda: faithful_inverse(DKF, order=[Block(("u",), 1)]), "latents"),
         (lambda: faithful_inverse(HIT_DVAE, order=[Block(("w", "z"), 1)]), "mixes static and local"),
-        (lambda: dvae.alternatives(DKF, steps=0), "at least 1 step"),
+        (lambda: dvae.alternatives(DKF, steps=0), "steps must be at least 1"),
         (
             lambda: faithful_inverse(
                 Factorization.parse("p(z_t | z_{own}) p(x_t | z_t)", {"own": Relation.parse("<t").mask})
             ),
-            "a mask of your own",
+            "a custom mask",
         ),
-        (lambda: dvae.alternatives("p(x_t | x_{<t})"), "nothing is latent"),
+        (lambda: dvae.alternatives("p(x_t | x_{<t})"), "has no latents"),
         (
             lambda: Factorization.parse(DKF).without("z", faithful_inverse(DKF).factors[0].parents[1]),
             "no edge from x_",

@@ -85,7 +85,7 @@ def read_changed(example, directory):
             raise AssertionError("more than may be read")
         places = [value for name, value in found.items() if name in (SURFACES, POINTS, SPOTS)] or [*found.values()]
         if not any(value.isfinite().any() for value in places):
-            raise AssertionError("nothing was seen")
+            raise AssertionError("no observations")
     if [p.name for p in directory.iterdir()] != ["seen.npz"]:
         raise AssertionError("reading left something behind")
 

@@ -250,7 +250,7 @@ def test_parameters_without_end_take_no_time(isolated, tmp_path):
         ("poses", np.zeros(3), "expected"),
         ("poses", np.full((3, 66), np.nan), "poses holds float64, expected numbers, none NaN"),
         ("poses", np.full((3, 66), "a"), "poses holds <U1"),
-        ("poses", np.full((3, 66), 1e30), "no metre, radian or rate"),
+        ("poses", np.full((3, 66), 1e30), "not a metre, radian or rate"),
         ("trans", np.zeros((0, 3)), r"trans \(0, 3\)"),
         ("trans", np.full((3, 3), np.inf), "trans holds"),
         ("offsets", np.zeros((3, 3)), r"offsets \(3, 3\), expected \(22, 3\)"),

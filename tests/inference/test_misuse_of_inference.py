@@ -81,7 +81,7 @@ BOUNDS = [
     (lambda: predictive_bound(MODEL, X, 0, 1), "observed"),
     (lambda: predictive_bound(MODEL, RAGGED, 2), "lengths"),
     (lambda: RedrawnModel(MODEL, {}), "none"),
-    (lambda: RedrawnModel(MODEL, {"z": torch.distributions.Normal(0.0, 1.0)}), "follows"),
+    (lambda: RedrawnModel(MODEL, {"z": torch.distributions.Normal(0.0, 1.0)}), "depends on"),
 ]
 DIAGNOSTICS = [
     (lambda: run(dvae.bracket, MODEL, X, particles=0), "at least 1"),
@@ -129,7 +129,7 @@ EVALUATION = [
     (lambda: metrics.probability_integral_transform(SAMPLES, TRUTH, torch.zeros(4)), "uniform"),
     (lambda: metrics.frechet_distance(torch.zeros(1, 3), TRUTH), "at least 2"),
     (lambda: metrics.average_pairwise_distance(TRUTH), "axis"),
-    (lambda: metrics.average_pairwise_distance(SAMPLES[:0]), "nothing"),
+    (lambda: metrics.average_pairwise_distance(SAMPLES[:0]), "size 0"),
     (lambda: metrics.variogram_score(SAMPLES, TRUTH, order=0), "order"),
     (lambda: confidence_set({}), "models"),
     (lambda: confidence_set({"a": ONE}, level=1.0), "between"),
@@ -145,7 +145,7 @@ TRAINING = [
     (lambda: fit(SEEN, X[:0]), "at least one"),
     (lambda: fit(SEEN, X * math.nan), "infinite"),
     (lambda: fit(SEEN, objective=GradNorm(("x", "z"), "generator")), "names"),
-    (lambda: GradNorm(("x", "x"), "generator"), "each once"),
+    (lambda: GradNorm(("x", "x"), "generator"), "different names"),
     (lambda: GradNorm("x", "generator"), "tuple"),
     (lambda: GradNorm(("x", "y"), "generator", asymmetry=-1.0), "asymmetry"),
     (lambda: from_config({"schedule": "Exponential", "rate": 0.1}), "schedules"),
@@ -156,7 +156,7 @@ TRAINING = [
     (lambda: Logistic(0.0, 1.0, steps=5, steepness=0.0), "at least"),
     (lambda: Piecewise(((5, 1.0), (4, 0.0))), "needs"),
     *(
-        (lambda options=options: Training(**options), "must|leave|unknown")
+        (lambda options=options: Training(**options), "must|set|leave|unknown")
         for options in (
             {"steps": 0},
             {"steps": 2.5},

@@ -402,7 +402,7 @@ def test_methods_that_are_not(run, message):
         run()
 
 
-NEEDS = r"missing 1 required positional argument|sizes missing for|needs to know what poses are|batch has to give"
+NEEDS = r"missing 1 required positional argument|sizes missing for|needs the description of poses|batch must contain"
 
 
 @pytest.mark.parametrize("name", dvae.methods())

@@ -139,7 +139,7 @@ def test_what_is_no_plain_file_is_refused_at_once(run, canary, name, kind):
 
 @pytest.mark.parametrize("path", [None, 3, b"run"])
 def test_a_run_is_named_by_a_path(path):
-    with pytest.raises(TypeError, match=f"a run is a folder that fit wrote; expected its path, got {path!r}"):
+    with pytest.raises(TypeError, match=f"a run must be the path of a folder that fit wrote, got {path!r}"):
         dvae.load(path)
 
 
@@ -179,7 +179,7 @@ def test_a_file_larger_than_it_can_be_is_not_read(run, name, monkeypatch):
 
 def test_a_state_names_no_file_but_those_of_a_checkpoint(run, canary):
     change(run, STATE, "fingerprints", "../mine.txt", value="0" * 64)
-    with pytest.raises(CheckpointError, match=r"a fingerprint of '../mine.txt', which is no file of a checkpoint"):
+    with pytest.raises(CheckpointError, match=r"a fingerprint of '../mine.txt', which is not a file of a checkpoint"):
         Run(run).commit(json.loads((run / STATE).read_text()), {})
 
 
@@ -196,7 +196,7 @@ def test_a_state_names_no_file_but_those_of_a_checkpoint(run, canary):
         (("method", "hidden"), [8, "8"], r"hidden\[1\] is .*; it must be a whole number"),
         (("method", "residual"), float("nan"), "residual is nan; it must be"),
         (("method", "emission"), "fixd", r"unknown emission .*did you mean .*fixed"),
-        (("method", "latent"), 4096, "asks for a model that is larger than its weights|weights of another model"),
+        (("method", "latent"), 4096, "describes a model that is larger than its weights|weights of another model"),
         (("training", "devices"), 40, "devices is 40; it must be at least 1 and at most 32"),
         (("training", "steps"), True, "steps is True; it must be a whole number"),
         (("training", "batch_size"), 10**6, "batch_size is 1000000; it must be at least 1 and at most 16384"),
@@ -244,7 +244,7 @@ def test_an_option_that_a_run_does_not_tell_is_at_its_default(run, capsys, key):
 def test_nesting_is_bounded(run):
     for depth in (40, 100_000):
         (run / CONFIG).write_text('{"a": ' * depth + "1" + "}" * depth)
-        with pytest.raises(CheckpointError, match=r"config.json is damaged, it (nests deeper|is not JSON)"):
+        with pytest.raises(CheckpointError, match=r"config.json is damaged, it (is nested deeper|is not JSON)"):
             Run(run).config
 
 
@@ -268,7 +268,7 @@ def test_a_model_is_no_larger_than_its_weights():
     with at_most(2**12, "this"):
         torch.nn.Linear(64, 16)
     with (
-        pytest.raises(CheckpointError, match="this asks for a model that is larger than its weights"),
+        pytest.raises(CheckpointError, match="this describes a model that is larger than its weights"),
         at_most(2, "this"),
     ):
         [torch.nn.Linear(4096, 4096) for _ in range(2)]
@@ -313,17 +313,17 @@ MEAN, SQUARE, STEP = (f"optimizer/0/{key}" for key in ("exp_avg", "exp_avg_sq", 
     ("change", "message"),
     [
         (lambda content: content.clear(), "random has no generator and no torch"),
-        (lambda content: content.update(mine=torch.ones(1)), "'mine' is of no optimizer, random, objective"),
+        (lambda content: content.update(mine=torch.ones(1)), "'mine' does not belong to optimizer, random, objective"),
         (
             lambda content: content.update({"optimizer/99/step": torch.ones(1)}),
-            "'optimizer/99/step' is of no parameter",
+            "'optimizer/99/step' does not belong to a parameter",
         ),
         (
             lambda content: content.update({"optimizer/00/step": torch.ones(1)}),
-            "'optimizer/00/step' is of no parameter",
+            "'optimizer/00/step' does not belong to a parameter",
         ),
         (lambda content: content.pop(MEAN), "optimizer/0 has no exp_avg"),
-        (damage(MEAN, lambda value: value[:1]), f"'{MEAN}' is not as the optimiser writes it"),
+        (damage(MEAN, lambda value: value[:1]), f"'{MEAN}' is not in the optimiser's format"),
         (damage(MEAN, lambda value: value / 0), f"'{MEAN}' is not"),
         (damage(SQUARE, lambda value: value - 1), f"'{SQUARE}' is not"),
         (damage(MEAN, lambda value: value.long()), f"'{MEAN}' is not"),
@@ -366,7 +366,7 @@ def test_a_damaged_log_is_refused_by_its_line(run, line):
     path = run / "log.jsonl"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0], line, *lines[1:]]) + "\n")
-    with pytest.raises(CheckpointError, match=f"{path} is damaged: line 2 is no row of numbers with a step"):
+    with pytest.raises(CheckpointError, match=f"{path} is damaged: line 2 is not a row of numbers with a step"):
         runs.resume(run, steps=6, progress=False)
 
 
@@ -376,7 +376,7 @@ def test_a_log_of_more_rows_than_a_run_writes_is_refused_at_the_first_beyond(tmp
     path.write_bytes(row * trackers.MOST_ROWS)
     assert len(JSONLines(path).read()) == trackers.MOST_ROWS
     path.write_bytes(row * trackers.MOST_ROWS + b"no row\n")  # is not come to
-    with pytest.raises(CheckpointError, match=f"{path} has more than 200,000 rows; take some out, or move the file"):
+    with pytest.raises(CheckpointError, match=f"{path} has more than 200,000 rows; remove some, or move the file"):
         JSONLines(path).read()
     path.write_bytes(row * (2**25 // len(row) + 1))
     monkeypatch.setattr(trackers, "row_of", lambda line: pytest.fail("a row is made"))

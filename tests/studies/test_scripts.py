@@ -431,7 +431,7 @@ def test_trajevae(folder, page):
         trajevae.main(fitted(folder, "pathless", "vae", "--warm-up", 1))
     with pytest.raises(SystemExit, match=r"no joint 'Tail'.*LWrist"):
         trajevae.main(run, joints=("Tail",))
-    with pytest.raises(SystemExit, match="nowhere is no run directory"):
+    with pytest.raises(SystemExit, match="nowhere is not a run directory"):
         trajevae.main(folder / "nowhere")
 
 

@@ -74,13 +74,15 @@ def test_a_future_that_lacks_them_says_which_and_of_which_sequence(future):
     panel = table(PLANNED, future)
     with pytest.raises(
         ValueError,
-        match=f"forecast of 3 steps needs plan, holiday, known in the future too, and sequence 's0' has {future} rows "
+        match=f"forecast of 3 steps needs future values of plan, holiday, but sequence 's0' has {future} rows "
         "after its last target at row 11; append rows with these",
     ):
         ahead(panel, PanelSchema.from_data(panel, CUT))
     panel = table(PLANNED, 3)
     panel.series[2].values[-1, 3] = NAN
-    with pytest.warns(UserWarning, match=r"1 of 4 .* needs holiday, known .* 's2' has 3 rows .* append rows with it"):
+    with pytest.warns(
+        UserWarning, match=r"1 of 4 .* needs future values of holiday, .* 's2' has 3 rows .* append rows with it"
+    ):
         windows = ahead(panel, PanelSchema.from_data(panel, CUT))
     assert [name for _, name, _ in windows.keys] == ["s0", "s1", "s3"]
 

@@ -136,7 +136,7 @@ def test_durations_are_times(spans, tmp_path):
 @pytest.mark.parametrize(("first", "second", "ends"), [(1, 1, "0.5 in row 20"), (1, -1, "18.5 in row 21"), (-1, 1, "")])
 def test_recordings_whose_clocks_overlap_are_not_mingled(first, second, ends):
     clock = np.concatenate([np.arange(20.0)[::first], 0.5 + np.arange(20)[::second]])
-    said = f"goes back from time .* to {ends}.*; name the id columns that tell sequences apart, or, .* sort its rows"
+    said = f"goes back from time .* to {ends}.*; name the id columns that distinguish sequences, or, .* sort its rows"
     with pytest.raises(ValueError, match=said):
         Panel.of(frame_of(clock))
     with pytest.raises(ValueError, match="the table panel goes back from time"):

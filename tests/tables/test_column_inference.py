@@ -36,7 +36,7 @@ def test_families_are_those_that_the_values_have():
             "nan": np.nan,
         }
     )
-    with pytest.warns(UserWarning, match="left out of what is proposed") as said:
+    with pytest.warns(UserWarning, match="columns left out of the proposed schema") as said:
         found = {name: family for name, (_, family) in families(frame).items()}
     (left_out,) = said
     assert str(left_out.message).endswith(
@@ -116,7 +116,7 @@ def test_one_day_above_12_tells_days_from_months(format):
 @pytest.mark.parametrize("freq", ["D", "MS"])
 def test_dates_whose_day_and_month_cannot_be_told_apart_are_said_to_be(format, freq):
     frame = shops(pd.date_range("2024-01-01", periods=12, freq=freq), format)
-    with pytest.warns(UserWarning, match=r"'date' \(perhaps the time: dates such as '01.01.(20)?24', .* as 2024-12-31"):
+    with pytest.warns(UserWarning, match=r"'date' \(perhaps the time: dates such as '01.01.(20)?24' .* as 2024-12-31"):
         found = infer_columns(frame)
     assert (found.id, found.time) == (("shop",), None)  # and they tell rows apart
     assert "date" not in found.names
@@ -131,9 +131,9 @@ def test_dates_whose_day_and_month_cannot_be_told_apart_are_said_to_be(format, f
 
 def test_a_constant_column_is_a_target_only_where_it_is_named():
     frame = pd.DataFrame({"y": [1.5, 2.5, -1.0], "rate": [3.5, 3.5, 3.5]})
-    with pytest.warns(UserWarning, match=r"left out of what is proposed: 'rate' \(constant: '3.5'\)"):
+    with pytest.warns(UserWarning, match=r"columns left out of the proposed schema: 'rate' \(constant: '3.5'\)"):
         assert infer_columns(frame).names == ["y"]
-    with pytest.warns(UserWarning, match="column 'rate' is constant, '3.5', and a target as it is named"):
+    with pytest.warns(UserWarning, match="column 'rate' is constant, '3.5', but was named as a target"):
         assert ColumnHints(columns=("y", "rate")).of(frame).names == ["y", "rate"]
 
 
@@ -155,7 +155,9 @@ def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
 
 def test_numbers_that_are_written_as_texts_are_named():
     prices = [f"{n},234.50 €" for n in range(10, 31)]
-    with pytest.warns(UserWarning, match="left out of what is proposed: 'price' .*, such as '10,234.50 €'; remove '€'"):
+    with pytest.warns(
+        UserWarning, match="columns left out of the proposed schema: 'price' .*, such as '10,234.50 €'; remove '€'"
+    ):
         assert "price" not in infer_columns(panel(price=prices)).names
 
 
@@ -210,7 +212,7 @@ def test_a_name_may_have_colons():
         ({"group": "x"}, "no column 'x'; there are day, riders"),
         ({"columns": ("riders",), "past": ("riders",)}, "column 'riders' is named twice"),
         ({"columns": ("riders:cout",)}, r"family 'cout' \(did you mean 'count'\?\)"),
-        ({"columns": ("riders",), "time": "riders"}, "'riders' has two parts to play"),
+        ({"columns": ("riders",), "time": "riders"}, "'riders' has two roles"),
         ({"covariates": ("riders",)}, "no column is a target"),
     ],
 )
@@ -287,7 +289,7 @@ def test_parts_that_are_no_time_are_named():
     frame = pd.DataFrame({"year": [2023, 2023], "month": [2, 2], "day": [28, 29], "hour": [0, 25], "y": [0.5, 1.5]})
     frame["minute"] = [0, 30]
     for parts, said in [
-        (("year", "month", "day"), "row 1 of year month day is no date: 2023-02 has no day 29"),
+        (("year", "month", "day"), "row 1 of year month day is not a date: 2023-02 has no day 29"),
         (("year", "month", "hour"), "row 0 of column 'hour' is 0; expected days from 1"),
         (("year", "month", "minute"), "year month minute have a minute and no larger unit before it"),
         (("year", "y"), "row 0 of column 'y' is 0.5; expected months from 1 to 12"),
@@ -533,7 +535,7 @@ def test_another_layout_is_refused_with_what_was_seen(tmp_path, layout):
 
 def test_empty_rows_at_the_end_are_left_out_and_empty_lines_are_named(tmp_path):
     (tmp_path / "a.csv").write_text("day,y\n2024-01-01,1.5\n,\n2024-01-03,2.5\n,\n,\n")
-    with pytest.warns(UserWarning, match="2 rows at the end that hold nothing are left out"):
+    with pytest.warns(UserWarning, match="2 empty rows at the end are left out"):
         assert len(read_frame(tmp_path / "a.csv")) == 3
     (tmp_path / "a.csv").write_text("y\n1.5\n\n2.5\n")
     with pytest.warns(UserWarning, match="empty lines between the values of a single column are skipped"):

@@ -75,7 +75,7 @@ def test_methods_have_guides_with_indicators_where_training_data_have_gaps(name)
 
 
 def test_what_is_hidden_in_training_is_told_where_nobody_knows_what_goes_together():
-    with pytest.raises(SchemaError, match="dkf needs to know what sequences are, and was given object"):
+    with pytest.raises(SchemaError, match="dkf needs the description of sequences, but was given object"):
         dvae.method("dkf", hide=0.2).train(object(), None, 10)
     with pytest.raises(ValueError, match="leave hide at 0"):
         dvae.method("hit-dvae", hide=0.2)

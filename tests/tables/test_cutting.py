@@ -57,7 +57,7 @@ def test_sequences_that_say_their_part_are_there():
     for part in PARTS:
         assert places(Cut(3, 2), of, part) == {n for n, own in enumerate(said) if own == part}
     with pytest.raises(
-        ValueError, match=r"some sequences of panel say their split .test, train. and others, such as 's1', do not"
+        ValueError, match=r"some sequences of panel state their split .test, train., but others, such as 's1', do not"
     ):
         Cut(3, 2).starts(panel([5] * 4, splits=["train", "", "", "test"]), "train")
 
@@ -99,8 +99,8 @@ def test_too_few_sequences_are_divided_by_time():
 @pytest.mark.parametrize(
     ("told", "said"),
     [
-        ({"observed": 3}, "windows have both, or neither"),
-        ({"split": "time"}, "say how many steps are observed, and a horizon"),
+        ({"observed": 3}, "give both, or neither"),
+        ({"split": "time"}, "give the number of observed steps, and a horizon"),
         ({"validation": 0.5, "test": 0.5}, "leave nothing to train on"),
         ({"observed": 0, "horizon": 1}, "observed is 0; it must be at least 1"),
         ({"test": 1.5}, "test is 1.5; it must be between 0 and 1"),

@@ -90,7 +90,7 @@ def test_a_cache_of_something_else_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("dvae.tables.domains.chorales.version", lambda _: "1")
     for content in ("[1]", '{"a": [[1, 2]]}', '{"a": [[300, 50, 50, 50]]}', "{", '{"a": 1e999}'):
         (tmp_path / "chorales-1.json").write_text(content)
-        with pytest.raises(ValueError, match=r"chorales-1.json does not hold the pitches of chorales; delete it"):
+        with pytest.raises(ValueError, match=r"chorales-1.json does not contain the pitches of chorales; delete it"):
             chorales(cache=tmp_path)
     (tmp_path / "chorales-1.json").write_text(json.dumps({"a": CADENCE.tolist()}))
     with pytest.raises(ValueError, match="music21 has 1 different settings, of 382"):

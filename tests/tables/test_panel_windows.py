@@ -167,7 +167,9 @@ def test_a_gap_of_which_training_knows_nothing_is_warned_of():
     for one in panel:
         if one.name in held:
             one.values[2, places["plan"]] = one.values[0, places["height"]] = NAN
-    with pytest.warns(UserWarning, match="test part of panel lacks values of plan, of which training data lack none"):
+    with pytest.warns(
+        UserWarning, match="test part of panel has missing values in plan, where training data have none"
+    ):
         PanelWindows(panel, schema, "test")
     PanelWindows(panel, schema, "train")
 
@@ -279,7 +281,7 @@ def test_whole_sequences_end_with_their_last_target():
         (lambda data: data.recut(validation=0).windows("validation"), "no validation .* its 1 .* has a share of 0"),
         (
             lambda data: data.with_data(Panel([Series("s", np.ones((9, 1)))], Columns((Column("b"),)))),
-            "of b, whose columns are",
+            "with the columns b, which differ",
         ),
     ],
 )

@@ -111,8 +111,8 @@ WIDE = ",".join(map(str, range(10**6)))
 HOSTILE = {
     "empty": ("a.csv", b"", "No columns"),
     "header": ("a.csv", "a,b\n", None),
-    "zeros": ("a.csv", b"a,b\n1,\0\n", "bytes of 0, which are no text"),
-    "latin": ("a.csv", b"a,b\n1,2\n1,\xe9\n", "line 3 is no UTF-8, but perhaps Latin-1; save it as UTF-8"),
+    "zeros": ("a.csv", b"a,b\n1,\0\n", "null bytes, which are not text"),
+    "latin": ("a.csv", b"a,b\n1,2\n1,\xe9\n", "line 3 is not UTF-8, but perhaps Latin-1; save it as UTF-8"),
     "half of UTF-16": ("a.csv", b"\xff\xfea\0,\0b", "truncated data"),
     "long row": ("a.csv", "a,b\n1,2\n1,2,3\n", "line 3 has 3 cells and the header in line 1 has 2; correct"),
     "quote": ("a.csv", 'a,"b\n1,2\n', "EOF inside string"),
@@ -132,7 +132,7 @@ HOSTILE = {
     "forged": ("a.npz", forged("(10, 10000000000, 2)"), "at most 250000000 numbers are read"),
     "forged a little": ("a.npz", forged("(3, 10000000, 2)"), "EOF"),
     "forged objects": ("a.npz", forged("(2, 3)", "[('a', '<f8'), ('b', 'O')]"), "allow_pickle"),
-    "another kind": ("a.txt", b"a,b\n1,2\n", "is no table; tables end in .csv, .tsv, .parquet, .npz"),
+    "another kind": ("a.txt", b"a,b\n1,2\n", "is not a table; tables end in .csv, .tsv, .parquet, .npz"),
 }
 
 
@@ -184,7 +184,7 @@ def test_the_schema_beside_a_file_is_the_one_of_its_name_or_of_its_folder(tmp_pa
     assert told.panel.columns.id == ("station",)
     for content in ("[columns.temp", "famly = 3", b"\xff", "[cut]\nobserved = 'a'\nhorizon = 2"):
         put(tmp_path / "riders.toml", content)
-        with pytest.raises(ValueError, match=r"riders.toml is no schema of a table: "):
+        with pytest.raises(ValueError, match=r"riders.toml is not the schema of a table: "):
             schema_beside(path)
     put(tmp_path / "riders.toml", "#" * (10**6 + 1))
     with pytest.raises(ValueError, match=r"riders.toml has 1000001 bytes"):

@@ -89,7 +89,7 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
     """
     if lacking := [clip for clip in motion if np.isnan(clip.positions).any()]:
         raise ValueError(
-            f"clip {'/'.join(lacking[0].key)} lacks joints, without which it is put onto no body; leave it out, or "
+            f"clip {'/'.join(lacking[0].key)} has missing joints and cannot be fitted to a body; remove the clip, or "
             "fill its gaps first (`dvae impute RUN --filled FILE`)"
         )
     motion = _y_up(motion)
@@ -170,7 +170,7 @@ def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
         if len(said) < parameters:
             raise ValueError(
                 f"clip {'/'.join(clip.key)} has {len(said) or 'no'} betas, expected {parameters}; files in AMASS's "
-                "layout have them, and fitted(motion, body) does without"
+                "layout contain them, and fitted(motion, body) does not need them"
             )
         found.append([float(value) for value in said[:parameters]])
     return torch.tensor(found, dtype=torch.float64)
@@ -210,7 +210,8 @@ class _Source(NamedTuple):
         ):
             if lacking := [part for part in needed if part not in found]:
                 raise ValueError(
-                    f"{what} has no {', '.join(lacking)}, by which motion is put onto a body; there are "
+                    f"{what} has no {', '.join(lacking)}, and motion is fitted to a body by these joints; its joints "
+                    "are "
                     f'{", ".join(names)[:600]}. read_motion(..., joints={{"name there": "LHip", ...}}) renames joints'
                 )
         both = there.keys() & own.keys()
@@ -387,7 +388,7 @@ def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
     size = body.parameters_of_shape
     if shapes.shape not in ((size,), (len(motion), size)):
         raise ValueError(
-            f"shapes are {tuple(shapes.shape)}, expected ({size},) or ({len(motion)}, {size}) of as many clips"
+            f"shapes are {tuple(shapes.shape)}, expected ({size},) or ({len(motion)}, {size}) with a row for each clip"
         )
     return shapes.detach().cpu().double().expand(len(motion), size)
 
@@ -425,8 +426,8 @@ def _turned_alike(motion: MotionSet, body: Body) -> bool:
 def _check(motion: MotionSet, body: Body) -> None:
     if not _turned_alike(motion, body):
         raise ValueError(
-            f"{motion.name or 'this motion'} is not on the joints of the body, or not turned from its rest pose; "
-            "dvae.motion.bodies.fit_to_body puts it there"
+            f"{motion.name or 'this motion'} does not have the joints of the body, or its rotations do not start from "
+            "its rest pose; dvae.motion.bodies.fit_to_body converts it"
         )
 
 

@@ -16,7 +16,9 @@ def vertex_error(vertices: Tensor, truth: Tensor) -> Tensor:
         Errors (...,).
     """
     if vertices.shape != truth.shape:
-        raise ValueError(f"vertices {tuple(vertices.shape)} and truth {tuple(truth.shape)} are not of one shape")
+        raise ValueError(
+            f"expected vertices and truth of one shape, got {tuple(vertices.shape)} and {tuple(truth.shape)}"
+        )
     # surfaces are strided, and the norm over strides is slow
     distances: Tensor = (vertices - truth).contiguous().norm(dim=-1)
     return distances.mean((-2, -1))

@@ -52,10 +52,10 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
     path = Path(path)
     with archive(path) as members:
         if missing := [name for name in _MEMBERS if name not in members]:
-            raise ValueError(f"{path}: no body, which has {', '.join(_MEMBERS)}; it lacks {', '.join(missing)}")
+            raise ValueError(f"{path}: not a body file with {', '.join(_MEMBERS)}; it has no {', '.join(missing)}")
         for name in _MEMBERS:
             if members[name].size > LARGEST:
-                raise ValueError(f"{path}: {name} has {members[name].size:,} bytes, of a body at most {LARGEST:,}")
+                raise ValueError(f"{path}: {name} has {members[name].size:,} bytes; a body has at most {LARGEST:,}")
         found = {name: members[name].array() for name in _MEMBERS}
     if reason := _defect(found, shapes):
         raise ValueError(f"{path}: {reason}")
@@ -84,15 +84,15 @@ def _defect(found: dict[str, np.ndarray], shapes: int) -> str:
         if not whole and not (np.abs(array) <= FURTHEST).all():
             return f"{name} holds numbers that are NaN or beyond {FURTHEST:g}"
     if sizes["V"] > MOST_VERTICES:
-        return f"it has {sizes['V']:,} vertices, of a body at most {MOST_VERTICES:,}"
+        return f"it has {sizes['V']:,} vertices; a body has at most {MOST_VERTICES:,}"
     if not 1 <= shapes <= sizes["S"]:
-        return f"it has {sizes['S']} parameters of shape, not {shapes}; say how many with shapes="
+        return f"it has {sizes['S']} parameters of shape, not {shapes}; give their number with shapes="
     parents = found["kintree_table"][0].astype(np.int64)
     if tuple(parents[1 : len(JOINTS)]) != PARENTS[1:] or not (parents[1:] < np.arange(1, len(parents))).all():
-        return f"its tree is not SMPL's, of whose joints the first are {', '.join(JOINTS)}"
+        return f"its tree is not SMPL's; expected the first joints {', '.join(JOINTS)}"
     if (parents[1:] < 0).any() or found["f"].min() < 0 or found["f"].max() >= sizes["V"]:
-        return f"a face or a joint hangs on what is not there; it has {sizes['V']} vertices"
+        return f"a face or a joint refers to an index that does not exist; it has {sizes['V']} vertices"
     for name in ("weights", "J_regressor"):
         if not np.allclose(found[name].astype(np.float64).sum(1), 1, atol=1e-3):
-            return f"{name} are shares, and do not add up to 1"
+            return f"{name} must be shares that add up to 1, but they do not"
     return ""

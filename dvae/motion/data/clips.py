@@ -142,7 +142,7 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
         kept = not missing and not defect(clip, skeleton, missing=True)
         hint = "; missing=True (--missing) keeps the clip, with these joints missing" if kept else ""
         return (
-            f"{where} has {what} positions, or none that float32 can hold: {count} joint positions in "
+            f"{where} has {what} positions, or positions beyond float32: {count} joint positions in "
             f"{frames} of {clip.frames} frames, first {skeleton.names[first[1]]} at frame {first[0]}{hint}"
         )
     if not seen:
@@ -151,7 +151,7 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
         if clip.rotations.shape != (*positions.shape[:2], 4) or clip.rotations.dtype.kind != "f":
             return f"{where} has rotations {clip.rotations.shape}, expected quaternions {(*positions.shape[:2], 4)}"
         if not all((np.abs(np.square(some).sum(-1) - 1) < 1e-3).all() for some in blocks(clip.rotations)):
-            return f"{where} has rotations that are no quaternions of unit length"
+            return f"{where} has rotations that are not unit quaternions"
     extent = float(np.median(extents(some_frames(positions)).max(axis=1)))
     if not SMALLEST <= extent <= TALLEST:
         unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
@@ -254,7 +254,7 @@ class MotionSet:
             raise ValueError(f"{what}: no clips{dropped}")
         twice = [key for key, count in Counter(clip.key for clip in single).items() if count > 1]
         if twice:
-            raise ValueError(f"{what}: clip {'/'.join(twice[0])} is there twice")
+            raise ValueError(f"{what}: clip {'/'.join(twice[0])} occurs twice")
         fields = {"clips": tuple(single), "skeleton": skeleton, "name": name, "skipped": tuple(left_out)}
         vars(self).update(
             fields, interpretation=interpretation, missing=missing, _index={clip.key: clip for clip in single}
@@ -294,7 +294,7 @@ class MotionSet:
             return self
         if lacking := [clip for clip in self if clip.rotations is None and np.isnan(clip.positions).any()]:
             raise ValueError(
-                f"clip {'/'.join(lacking[0].key)} lacks joints, without which their turns are not known; leave it out, "
+                f"clip {'/'.join(lacking[0].key)} has missing joints, so its rotations are not known; remove the clip, "
                 "or fill its gaps first (`dvae impute RUN --filled FILE`)"
             )
         found: MotionSet | None = self.__dict__.get("_turned")
@@ -338,8 +338,8 @@ class MotionSet:
         skeleton = self.skeleton
         if skeleton.rest or self.missing:
             raise ValueError(
-                f"{self.name or 'this motion'} has {'rotations' if skeleton.rest else 'missing joints'}; joints are "
-                "added where turns are still to be found, of whole poses"
+                f"{self.name or 'this motion'} has {'rotations' if skeleton.rest else 'missing joints'}; joints can "
+                "only be added to complete poses, before their rotations are computed"
             )
         names, parents, places = list(skeleton.names), list(skeleton.parents), list(range(skeleton.joints))
         for joint in skeleton.order:
@@ -390,7 +390,7 @@ class MotionSet:
             ValueError: `test` is not between 0 and 1.
         """
         if not 0 < test < 1:
-            raise ValueError(f"the part for test is {test}, expected more than 0 and less than 1")
+            raise ValueError(f"the share for test is {test}, expected more than 0 and less than 1")
         found: list[Clip] = []
         for clip in self:
             name = clip.name if clip.split == "all" else f"{clip.split}-{clip.name}".replace("/", "-")

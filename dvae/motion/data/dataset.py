@@ -191,7 +191,7 @@ class MotionData:
             return found
         if motion.skeleton.fps != known.fps:
             raise ValueError(
-                f"{found.path} has {motion.skeleton.fps:g} frames per second, and windows here have {known.fps:g}; "
+                f"{found.path} has {motion.skeleton.fps:g} frames per second, but these windows have {known.fps:g}; "
                 f"`dvae data convert {found.path} --fps {known.fps:g} --out FILE` resamples it"
             )
         try:

@@ -49,19 +49,19 @@ class ExchangedWindows:
     ):
         if not windows.given_joints or windows.protocol.observed != 1:
             raise ValueError(
-                "what is exchanged is one pose among windows with the same given joints, as in "
-                f"windows.given(['LWrist']); these have {windows.protocol.observed} observed frames and are given "
+                "poses are exchanged among windows with one observed pose and the same given joints, as in "
+                f"windows.given(['LWrist']); these have {windows.protocol.observed} observed frames, and given are "
                 f"{', '.join(windows.given_joints or ()) or 'no joints'}"
             )
         if windows.missing:
             raise ValueError(
-                "poses are exchanged whole, but these windows may lack joints; fill the gaps first (`dvae impute RUN "
-                "--filled FILE`)"
+                "only whole poses can be exchanged, but these windows may have missing joints; fill the gaps first "
+                "(`dvae impute RUN --filled FILE`)"
             )
         if not threshold > 0:
             raise ValueError(f"the threshold is {threshold}; it must be a positive distance in metres")
         if truth not in ("path", "pose"):
-            raise ValueError(f"truth is {truth!r}; expected 'path' or 'pose', whose window's motion it is")
+            raise ValueError(f"truth is {truth!r}; expected 'path' or 'pose', the window whose motion is the truth")
         self.windows, self.threshold, self.seed, self.missing = windows, threshold, seed, False
         self.own, self.truth = own, truth
         self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints

@@ -181,7 +181,7 @@ class Poses(Schema):
         found = super().of(data, who)
         if (shown := found.protocol.representation) != representation:
             raise SchemaError(
-                f"{who} reads {_said(representation)}, and under this protocol models see {_said(shown)}; choose one "
+                f"{who} reads {_said(representation)}, but under this protocol models see {_said(shown)}; choose one "
                 f"whose representation is {representation} (--representation)"
             )
         return found
@@ -245,7 +245,7 @@ def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int
         protocol = named_protocol(protocol)
     if motion.skeleton.fps != protocol.fps:
         raise ValueError(
-            f"protocol {protocol.name} counts frames at {protocol.fps:g} a second, {motion.name!r} has "
+            f"protocol {protocol.name} needs {protocol.fps:g} frames per second, but {motion.name!r} has "
             f"{motion.skeleton.fps:g}: choose another protocol or make one with dataclasses.replace"
         )
     parts = _divide(motion, protocol)
@@ -264,8 +264,8 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
             return clip.split
         if protocol.split_by not in clip.labels:
             raise ValueError(
-                f"protocol {protocol.name} splits by the label {protocol.split_by!r}, which clip "
-                f"{'/'.join(clip.key)} lacks: is labels.csv next to the file?"
+                f"protocol {protocol.name} splits by the label {protocol.split_by!r}, but clip "
+                f"{'/'.join(clip.key)} does not have it: is labels.csv next to the file?"
             )
         return clip.labels[protocol.split_by]
 
@@ -275,7 +275,7 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
     if not train and not test:
         found = ", ".join(dict.fromkeys(found for _, found in values))
         raise ValueError(
-            f"protocol {protocol.name} wants {protocol.split_by} {'/'.join(protocol.train)} for training and "
+            f"protocol {protocol.name} needs {protocol.split_by} {'/'.join(protocol.train)} for training and "
             f"{'/'.join(protocol.test)} for test; {motion.name!r} has {found}"
         )
     aside = held_out(len(train), protocol.validation)
@@ -345,7 +345,7 @@ class Windows:
             self._told = torch.from_numpy(before)  # number of usable frames before each frame
             if not len(self):
                 raise ValueError(
-                    f"{split} split of {motion.name!r} has no window that has the root beside another joint in some "
+                    f"{split} split of {motion.name!r} has no window with the root and another joint present in some "
                     "observed and in some predicted frame"
                 )
         self._weights = self._draw_weights().cumsum(0)
@@ -472,7 +472,7 @@ class Windows:
                 has = "has no label" if found is None else f"has {found!r} for"
                 raise ValueError(
                     f"clip {'/'.join(clip.key)} ({self.split}) {has} {label!r}, expected one of {', '.join(classes)}: "
-                    "is labels.csv next to the file, with every clip in it and no class among held-out clips alone?"
+                    "is labels.csv next to the file, does it list every clip, and do training clips have every class?"
                 )
         windows = copy(self)
         found_in = [classes.index(clip.labels[label]) for clip in self.clips]
@@ -541,11 +541,11 @@ class Windows:
         windows = copy(self)
         if isinstance(joints, float | int):
             if not 0 <= joints <= 1:
-                raise ValueError(f"joints are given with a probability between 0 and 1, not {joints}")
+                raise ValueError(f"the probability that joints are given must be between 0 and 1, got {joints}")
             windows._given = float(joints)
             return windows
         if isinstance(joints, str):
-            raise ValueError(f"joints are a list of names, [{joints!r}]")
+            raise ValueError(f"joints must be a list of names, such as [{joints!r}]")
         found = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
         if dropped := found - set(self.joints):
             raise ValueError(f"the protocol {self.protocol.name} drops {dropped.pop()}")

@@ -70,7 +70,7 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
         ValueError: fewer than 1 clip or 2 frames, or a test fraction outside 0 to 1.
     """
     if clips < 1 or frames < 2 or not 0 <= test <= 1:
-        raise ValueError(f"cannot simulate {clips} clips of {frames} frames with a part of {test} for test")
+        raise ValueError(f"cannot simulate {clips} clips of {frames} frames with a share of {test} for test")
     random = np.random.default_rng(seed)
     offsets = _morphology(random, clips)
     style = _style(random, clips)

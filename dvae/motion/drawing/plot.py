@@ -208,11 +208,11 @@ def make_scene(
     names = names or [f"sample {k + 1}" for k in range(len(future))]
     every = max(1, round(skeleton.fps / 25)) if every is None else every
     if len(names) != len(future):
-        raise ValueError(f"{len(names)} names for {len(future)} samples; give each its own")
+        raise ValueError(f"{len(names)} names for {len(future)} samples; give one name for each")
     if strangers := alike - set(range(skeleton.joints)):
-        raise ValueError(f"fixed names joints {sorted(strangers)}; they go from 0 to {skeleton.joints - 1}")
+        raise ValueError(f"fixed has joints {sorted(strangers)}; expected indices from 0 to {skeleton.joints - 1}")
     if every < 1:
-        raise ValueError(f"every is {every}; show each frame with 1, each second one with 2")
+        raise ValueError(f"every is {every}; expected 1 to draw each frame, 2 to draw every second one, and so on")
     known = [each for each in (past, real, future if alone else None) if each is not None]
     if not (alone or np.isfinite(future).all()) or any(np.isinf(positions).any() for positions in known):
         raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
@@ -325,11 +325,11 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
     if corners.shape[1:] != (3,) or people.ndim != 3 or people.shape[2] != 3 or not (people.size and corners.size):
         raise ValueError(f"expected faces (F, 3) and vertices (P, V, 3), got {corners.shape} and {people.shape}")
     if not (0 <= corners.min() <= corners.max() < people.shape[1]):
-        raise ValueError(f"a face has corner {corners.max()} of {people.shape[1]} vertices")
+        raise ValueError(f"a face refers to vertex {corners.max()}, but there are {people.shape[1]} vertices")
     if not np.isfinite(people).all():
-        raise ValueError("vertices have NaN or infinite places, which cannot be drawn")
+        raise ValueError("vertices have NaN or infinite positions, which cannot be drawn")
     if len(names) != len(people):
-        raise ValueError(f"{len(names)} names for {len(people)} bodies; give each its own")
+        raise ValueError(f"{len(names)} names for {len(people)} bodies; give one name for each")
     people = people if up == "z" else people[..., [0, 2, 1]] * [1, -1, 1]
     people = people - (people.min(1, keepdims=True) + people.max(1, keepdims=True)) / 2 * [1, 1, 0]
     size = np.ptp(people, axis=(0, 1)) + 0.2

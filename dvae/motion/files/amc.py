@@ -95,7 +95,7 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
         elif section == ":hierarchy" and words[0] not in ("begin", "end"):
             parent_of |= dict.fromkeys(words[1:], words[0])
     if not found:
-        raise ValueError(f"{path}: no ASF file: it has no :bonedata")
+        raise ValueError(f"{path}: not an ASF file: it has no :bonedata")
     degrees = said.get("angle", ["deg"])[:1] != ["rad"]
 
     def values(words: Sequence[str], count: int, what: str) -> np.ndarray:
@@ -107,7 +107,7 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
     bones = {}
     for name in _ordered(path, parent_of):
         if name not in found:
-            raise ValueError(f"{path}: the hierarchy has {name[:60]!r}, which is no bone")
+            raise ValueError(f"{path}: the hierarchy has {name[:60]!r}, which is not a bone")
         bone = found[name]
         length = values(bone["length"], 1, f"length of {name}")[0]
         direction = length * values(bone["direction"], 3, f"direction of {name}")
@@ -120,7 +120,7 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
         bones[name] = Bone(parent_of[name], tuple(direction.tolist()), axes, turns)
     unit = values(said.get("length", ["1"]), 1, "length")[0]
     if not 1e-6 < unit < 1e6:
-        raise ValueError(f"{path}: length {unit:g}, expected that of a unit against an inch")
+        raise ValueError(f"{path}: length {unit:g}, expected a positive ratio of the unit to an inch")
     order = " ".join(said.get("order", ["TX", "TY", "TZ", "RX", "RY", "RZ"])).lower()
     if sorted(order.split()) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
         raise ValueError(f"{path}: the root's order is {order[:60]!r}, expected TX to RZ once each")
@@ -239,7 +239,9 @@ def read_expmap(path: str | Path) -> Recording:
     names, parents, offsets = joints_of(bones)
     rows, rest = divmod(len(values), 3 + 3 * len(names))
     if rest or rows < 2:
-        raise ValueError(f"{path}: {len(values):,} numbers are no rows of {3 + 3 * len(names)}, a pose at rest first")
+        raise ValueError(
+            f"{path}: got {len(values):,} numbers, expected rows of {3 + 3 * len(names)}, the first row a pose at rest"
+        )
     check_size(path, rows, len(names))
     read = torch.from_numpy(values).reshape(rows, -1, 3)[1:]
     turns = to_matrix(-read[:, 1:], "vector")
@@ -268,7 +270,7 @@ def _ordered(path: Path, parent_of: Mapping[str, str]) -> Iterator[str]:
     for name, parent in parent_of.items():
         if parent not in reached:
             raise ValueError(
-                f"{path}: {name[:60]!r} hangs from {parent[:60]!r}, which has no place in the hierarchy before"
+                f"{path}: the parent of {name[:60]!r} is {parent[:60]!r}, which is not in the hierarchy before it"
             )
         reached.add(name)
         yield name
@@ -279,6 +281,6 @@ def _skeleton_of(path: Path) -> Path:
     own = [file for file in beside if path.stem.startswith(file.stem)]
     if len(own or beside) != 1:
         raise FileNotFoundError(
-            f"{path}: which skeleton? Expected its ASF file beside it, such as 02.asf for 02_01.amc"
+            f"{path}: which skeleton? Expected its ASF file in the same folder, such as 02.asf for 02_01.amc"
         )
     return (own or beside)[0]

@@ -130,7 +130,7 @@ def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Membe
         placed = {name: array for name, array in found.items() if array is not None}
     unpacked, limit = sum(info.file_size for info in infos if info.filename not in placed), _limit(size)
     if unpacked > limit:
-        mapped = f" beside {len(placed)} arrays that are mapped" if placed else ""
+        mapped = f" in addition to {len(placed)} arrays that are mapped" if placed else ""
         raise NpyError(f"it would unpack to {unpacked:,} bytes{mapped}, at most {limit:,} are read from {size:,}")
     if sum(info.compress_size for info in infos) > size:
         raise NpyError("damaged: its members take more bytes than it has")
@@ -147,9 +147,9 @@ def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Membe
                 f"{name} is compressed by {method}, expected deflate or none; write it with np.savez_compressed"
             )
         if not is_name(name):
-            raise NpyError(f"{name[:40]!r} is no name for a split and a clip")
+            raise NpyError(f"{name[:40]!r} is not a name of a split and a clip")
         if name in members:
-            raise NpyError(f"{name} is there twice")
+            raise NpyError(f"{name} occurs twice")
         members[name] = Member(name, file, info, placed.get(info.filename))
     return members
 
@@ -193,7 +193,7 @@ class _Stream:
 
     def read(self, size: int) -> bytes:
         if size > self.left:
-            raise EOFError(f"{size:,} bytes are announced where {self.left:,} are left")
+            raise EOFError(f"{size:,} bytes are announced, but {self.left:,} are left")
         return self._taken(self._buffered.read(size))
 
     def some(self, size: int) -> bytes:
@@ -252,7 +252,7 @@ class Member:
         if dtype.kind == "U":
             points = array.reshape(-1).view(f"{dtype.str[0]}u4")
             if ((points > 0x10FFFF) | (points >> 11 == 0xD800 >> 11)).any():
-                raise NpyError(f"{self.name}: damaged: its text has characters that are none")
+                raise NpyError(f"{self.name}: damaged: its text has invalid characters")
         return array
 
     def clips(self) -> list[tuple[str, str, np.ndarray]]:
@@ -273,7 +273,7 @@ class Member:
         if isinstance(nested, _Array):  # numpy pickles the 0-dimensional array, not its item
             nested = nested.item()
         if not isinstance(nested, dict) or not all(isinstance(clips, dict) for clips in nested.values()):
-            raise NpyError(f"{self.name} is no dictionary of dictionaries (split -> clip -> positions)")
+            raise NpyError(f"{self.name} is not a dictionary of dictionaries (split -> clip -> positions)")
         found, room = [], self._info.file_size + SMALL
         for split, clips in nested.items():
             for name, array in clips.items():
@@ -282,7 +282,7 @@ class Member:
                 found.append((split, name, array.numbers()))
                 room -= array.numbers().nbytes
                 if room < 0:
-                    raise NpyError(f"{self.name}: its clips are one array many times over, more than the file holds")
+                    raise NpyError(f"{self.name}: its clips repeat one array, and have more bytes than the file")
         return found
 
     @contextmanager
@@ -310,7 +310,7 @@ class _Type:
     def build(self, state: Any) -> None:
         plain = isinstance(state, tuple) and len(state) == 8 and all(field is None for field in state[2:5])
         if not plain or state[1] not in ("<", ">", "|", "="):
-            raise NpyError("refused a dtype of fields or of its own making: expected numbers")
+            raise NpyError("refused a structured or custom dtype: expected numbers")
         if not _is_int(state[5]) or state[5] not in (-1, self.dtype.itemsize):
             raise NpyError(f"refused a {self.dtype} that declares another size")
         self.dtype = self.dtype.newbyteorder(state[1])
@@ -333,7 +333,7 @@ class _Array:
             self._array = _of_bytes(content, kind.dtype, shape, "F" if fortran is True or fortran == 1 else "C")
             return
         if not isinstance(content, list) or len(content) != prod(_shape(shape)):
-            raise NpyError(f"refused an array of objects of shape {_shape(shape)} that is not made of as many")
+            raise NpyError(f"refused an array of objects of shape {_shape(shape)} with another number of objects")
         self._array, self._objects = np.empty((), object), content
 
     def item(self) -> Any:
@@ -358,7 +358,7 @@ def _is_int(value: Any) -> bool:
 
 def _shape(shape: Any) -> tuple[int, ...]:
     if not isinstance(shape, tuple) or len(shape) > 32 or not all(_is_int(n) and n >= 0 for n in shape):
-        raise NpyError("refused an array whose shape is none")
+        raise NpyError("refused an array with an invalid shape")
     return shape
 
 
@@ -469,7 +469,7 @@ class _Interpreter:
     def find_on_stack(self, _: Any) -> None:
         module, name = self.last(2)
         if not isinstance(module, str) or not isinstance(name, str):
-            raise NpyError("refused a function whose name is none")
+            raise NpyError("refused a function with an invalid name")
         self.find(f"{module}.{name}")
 
     def reduce(self, _: Any) -> None:
@@ -503,7 +503,7 @@ def _reconstruct(subtype: Any, shape: Any, _code: Any) -> _Array:
 
 def _scalar(kind: Any, content: Any) -> Any:
     if not isinstance(kind, _Type) or kind.dtype.hasobject:
-        raise NpyError("refused a number that is none")
+        raise NpyError("refused an invalid number")
     return _of_bytes(content, kind.dtype, (), "C").item()
 
 

@@ -191,7 +191,8 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
     """Raise an error if a split or a clip name is not printable."""
     if not all(map(is_name, key)):
         raise ValueError(
-            f"{brief(str(path or '/'.join(key)))} is no name for a split and a clip: expected text that can be printed"
+            f"{brief(str(path or '/'.join(key)))} is not a name of a split and a clip: expected text that can be "
+            "printed"
         )
 
 
@@ -232,7 +233,7 @@ def read_labels(beside: Path, labels: str | Path | None) -> dict[tuple[str | Non
         if "clip" not in header:
             raise ValueError(f"{file}: expected a column named clip, found {', '.join(header)[:200] or 'nothing'}")
         if twice := [name for name, count in Counter(header).items() if count > 1 and name]:
-            raise ValueError(f"{file}: column {twice[0]!r} is there twice")
+            raise ValueError(f"{file}: column {twice[0]!r} occurs twice")
         for _, cells in rows:
             if cells:
                 row = {name: cell for name, cell in zip(header, cells, strict=True) if name}
@@ -262,7 +263,7 @@ def _table(path: Path, *most: int) -> Iterator[tuple[list[str], Iterator[tuple[i
                 raise ValueError(f"{path}: column {unnamed[0]} is {brief(header[unnamed[0] - 1])}, expected a name")
             yield header, numbered()
         except csv.Error as error:
-            raise ValueError(f"{path}: row {reader.line_num} is no row of a csv file ({error})") from error
+            raise ValueError(f"{path}: row {reader.line_num} is not a row of a csv file ({error})") from error
 
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
@@ -289,10 +290,10 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
     """
     path = Path(path)
     if path.suffix.lower() not in (".npz", ".csv"):
-        raise ValueError(f"{path}: paths of joints are in an npz or a csv file")
+        raise ValueError(f"{path}: paths of joints must be in an npz or a csv file")
     found = read_arrays(path) if path.suffix.lower() == ".npz" else _read_columns(path)
     if not found:
-        raise ValueError(f"{path}: there is no path in it")
+        raise ValueError(f"{path}: the file has no path of a joint")
     for joint, values in found.items():
         if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
             raise ValueError(
@@ -321,7 +322,7 @@ def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[s
                 )
             places["xyz".index(axis)] = place
         if short := [joint for joint, places in columns.items() if min(places) < 0]:
-            raise ValueError(f"{path}: {short[0]} lacks a column")
+            raise ValueError(f"{path}: a column of {short[0]} is missing")
         values: list[np.ndarray] = []
         blank = 0
         for number, cells in rows:
@@ -337,7 +338,7 @@ def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[s
                 try:
                     row[place] = float(cell if cell.strip() else "nan")
                 except ValueError:
-                    raise ValueError(f"{path}: row {number}, {header[place]}: {cell[:100]!r} is no number") from None
+                    raise ValueError(f"{path}: row {number}, {header[place]}: {cell[:100]!r} is not a number") from None
             values.append(row)
     if not columns or not values:
         raise ValueError(f"{path}: expected a header and one row for each frame")

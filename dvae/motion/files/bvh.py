@@ -50,7 +50,7 @@ def read_bvh(path: str | Path) -> Recording:
     rows, rest = divmod(len(values), channels) if channels else (0, 0)
     if rest or abs(rows - frames) > 1 or not rows:
         raise ValueError(
-            f"{path}: {len(values):,} numbers follow, which are no {frames:,} frames of {channels} channels each"
+            f"{path}: {len(values):,} numbers follow, expected {frames:,} frames of {channels} channels each"
         )
     check_size(path, rows, len(joints))
     values = values.reshape(rows, channels)
@@ -106,9 +106,9 @@ def write_bvh(
     """
     for name in names:
         if not name or any(letter.isspace() or letter in "{}" for letter in name):
-            raise ValueError(f"{path}: {name!r} is no name for a joint of a BVH file: no white space, no braces")
+            raise ValueError(f"{path}: {name!r} is not a joint name for a BVH file: no white space, no braces")
         if names.count(name) > 1:
-            raise ValueError(f"{path}: {name!r} is the name of {names.count(name)} joints, expected names that differ")
+            raise ValueError(f"{path}: {names.count(name)} joints are named {name!r}, expected different names")
     children: list[list[int]] = [[] for _ in names]
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -211,7 +211,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             joints[open_[-1]].channels = [_AXES.index(channel) for channel in channels]
         else:
             raise wrong(number, "ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION or a brace")
-    raise ValueError(f"{path}: no BVH file: it has no line MOTION")
+    raise ValueError(f"{path}: not a BVH file: it has no line MOTION")
 
 
 def _is_value(word: str, _: int) -> bool:
@@ -233,5 +233,5 @@ def _header(path: Path, lines: list[str], line: int) -> tuple[int, float, int]:
         found.append(value[0])
     frames, seconds = found
     if frames != int(frames) or frames < 1 or not 1e-6 < seconds < 1e3:
-        raise ValueError(f"{path}: {frames:g} frames, {seconds:g} s each, are no recording")
+        raise ValueError(f"{path}: {frames:g} frames of {seconds:g} s each are not a recording")
     return int(frames), seconds, line

@@ -52,7 +52,7 @@ def get(name: str, out: str | Path, url: str | None = None) -> list[Path]:
         try:
             found.append(Path(fetcher.fetch(file)))
         except ValueError as error:
-            raise ValueError(f"{address}{file}: it is not the file that is known ({error})") from None
+            raise ValueError(f"{address}{file}: the file differs from the known one ({error})") from None
         except OSError as error:
-            raise OSError(f"{address}{file} cannot be had: {error}") from None
+            raise OSError(f"{address}{file} cannot be downloaded: {error}") from None
     return found

@@ -44,21 +44,21 @@ def read_c3d(path: str | Path) -> Recording:
         raise FileNotFoundError(f"{path}: no such file")
     content = files.read(path, MOST_TEXT, links=True)
     if len(content) < _BLOCK or not content[0] or content[1] != 0x50:
-        raise ValueError(f"{path}: no C3D file: it does not begin with the block of its parameters and with 80")
+        raise ValueError(f"{path}: not a C3D file: it must begin with the block of its parameters and with 80")
     try:
         parameters, order = _parameters(content)
         markers, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
         scale, start = struct.unpack_from(f"{order}fH", content, 12)
         fps = struct.unpack_from(f"{order}f", content, 20)[0]
     except (struct.error, IndexError, KeyError, UnicodeDecodeError):
-        raise ValueError(f"{path}: damaged: its parameters end early, or are none") from None
+        raise ValueError(f"{path}: damaged: its parameters end early or are not valid") from None
     check_joints(path, markers)
     kind = np.dtype(f"{order}f4" if scale < 0 else f"{order}i2")
     row = 4 * markers + analog
     there = max(len(content) - _BLOCK * (start - 1), 0) // (kind.itemsize * row) if row and start else 0
     frames = there if last == 0xFFFF else last - first + 1  # the number of frames exceeds two bytes
     if not 0 < frames <= there or not markers:
-        raise ValueError(f"{path}: it announces {markers} markers in {frames} frames and has room for {there}")
+        raise ValueError(f"{path}: it announces {markers} markers in {frames} frames, but has room for {there}")
     check_size(path, frames, markers)
     unit = "".join(parameters.get("UNITS", [])[:1]).lower()
     if unit not in METRES or not 0 < fps < 1e6 or not np.isfinite(scale):
@@ -76,7 +76,7 @@ def read_c3d(path: str | Path) -> Recording:
     seen = np.asarray(np.isfinite(places).all(2).any(0))
     kept = [n for n in named if names[n] not in outputs and seen[n]]
     if not kept:
-        raise ValueError(f"{path}: it has no markers with names that are seen")
+        raise ValueError(f"{path}: it has no named markers with observations")
     left_out = {
         "computed by a model of the body": [names[n] for n in named if names[n] in outputs],
         "never seen": [names[n] for n in named if names[n] not in outputs and not seen[n]],

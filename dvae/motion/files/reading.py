@@ -148,7 +148,7 @@ def read_motion(
             )
         clips.append(clip)
     if not clips:
-        raise ValueError(f"{path}: no file of it can be read; the first: {unread[0][2]}")
+        raise ValueError(f"{path}: none of its files can be read; the first: {unread[0][2]}")
     return collected.motion(
         clips, skip_bad=skip_bad, skipped=unread, interpretation=collected.interpretation(reader.world), missing=missing
     )
@@ -272,7 +272,7 @@ class FileReader:
             settled = rotate_up(settled, self.world.up)
         fps = self.fps or settled.fps
         if fps is None:
-            raise ValueError("it does not say its frames per second; give fps=")
+            raise ValueError("it does not state its frames per second; give fps=")
         known = self.skeleton or settled.skeleton
         if known and known.joints != len(settled.names):
             raise ValueError(f"it has {len(settled.names)} joints, skeleton {known.name!r} has {known.joints}")
@@ -373,18 +373,18 @@ class Collected:
             said = [f"{verb} {', '.join(names[:8])}" for verb, names in (("lacks", lacking), ("has", strange)) if names]
             return f"{path}: {' and '.join(said)}, other than {self._first}; joints= or onto= takes what they share"
         if first.names != skeleton.names or (first.parents != skeleton.parents and clip.rotations is not None):
-            return f"{path}: its joints stand in another order or tree than those of {self._first}; give onto="
+            return f"{path}: its joints have another order or tree than in {self._first}; give onto="
         if first.fps != skeleton.fps:
             return (
                 f"{path}: {skeleton.fps:g} frames per second, {self._first} has {first.fps:g}; give fps= if their "
-                "headers are wrong, or have `dvae data convert --fps` resample them"
+                "headers are wrong, or resample with `dvae data convert --fps`"
             )
         there = np.isfinite(bones + self._bones)  # known in both
         size = bones[there].sum() / max(self._bones[there].sum(), 1e-9)
         if there.any() and not 1 / LIKE < size < LIKE:
             return (
-                f"{path}: its body is {size:.2g} times that of {self._first}; if it is in "
-                "another unit, read it apart, by metres="
+                f"{path}: its body is {size:.2g} times as large as in {self._first}; if it is in "
+                "another unit, read it separately with metres="
             )
         other, rest = np.array(first.rest), np.array(skeleton.rest)
         self._alike &= other.shape == rest.shape and not (np.abs(other - rest) > SAME).any()

@@ -104,7 +104,7 @@ def numbers(text: str, where: str) -> np.ndarray:
             found = np.array([np.nan])
     if not np.isfinite(found).all():
         wrong = next((word for word in text.split() if not _is_finite(word)), "")
-        raise ValueError(f"{where}: {wrong[:40]!r} is no number")
+        raise ValueError(f"{where}: {wrong[:40]!r} is not a number")
     return found
 
 
@@ -125,5 +125,5 @@ def check_size(path: Path, frames: int, joints: int) -> None:
     """Raise an error if a recording would be too large for memory, even if its file is small."""
     if frames * joints > MOST_PLACES:
         raise ValueError(
-            f"{path}: {frames * joints:,} places of joints are more than {MOST_PLACES:,}; cut the recording"
+            f"{path}: {frames * joints:,} positions of joints are more than {MOST_PLACES:,}; cut the recording"
         )

@@ -93,7 +93,7 @@ def read_amass(path: str | Path) -> Recording:
         if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
             raise ValueError(f"{path}: {name} holds {values.dtype}, expected numbers, none NaN or infinite")
         if (np.abs(values.astype(np.float64)) > 1e6).any():
-            raise ValueError(f"{path}: {name} holds {np.abs(values).max():g}, which is no metre, radian or rate")
+            raise ValueError(f"{path}: {name} holds {np.abs(values).max():g}, which is not a metre, radian or rate")
     rate = next((found[name] for name in _FPS if name in found), np.zeros(0))
     fps = float(rate.reshape(-1)[0]) if rate.size == 1 else 0.0
     if not fps > 0:

@@ -103,7 +103,7 @@ def unit(recording: Recording) -> tuple[str, float]:
     name = min(fitting, key=fitting.__getitem__)
     if not fitting[name] <= log(WITHIN):
         raise ValueError(
-            f"the body is about {height:.4g} tall (median over frames), which is a person's height in none of "
+            f"the body is about {height:.4g} tall (median over frames), which is not a person's height in any of "
             f"{', '.join(UNITS)}; give the metres of the file's unit"
         )
     return name, UNITS[name]
@@ -149,7 +149,7 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
     if up not in (None, "y", "z"):
         raise ValueError(f"the up axis is {up!r}, expected 'y' or 'z'")
     if metres is not None and not 1e-6 < metres < 1e6:
-        raise ValueError(f"a unit of {metres} m, expected such as 0.01 for centimetres")
+        raise ValueError(f"the unit is {metres} m, expected a length such as 0.01 for centimetres")
     found: dict[tuple[str, float], str] = {} if metres is None else {("as given", metres): ""}
     unknown = []
     for name, recording in recordings.items() if metres is None else ():
@@ -161,7 +161,7 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
         raise ValueError(unknown[0])
     if len({known for _, known in found}) > 1:
         ((first, _), here), ((other, _), there), *_ = found.items()
-        raise ValueError(f"{here} looks as if in {first}, {there} in {other}; give the metres of the unit of all")
+        raise ValueError(f"{here} seems to be in {first}, {there} in {other}; give the metres of the unit of all")
     axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
     return World(*next(iter(found)), axis, upwards)
 

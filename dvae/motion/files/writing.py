@@ -74,8 +74,8 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
         return [path]
     if path.suffix and len(motion) > 1:
         raise ValueError(
-            f"{path}: {format} holds one clip a file, and there are {len(motion)}; name a folder (without an ending) "
-            "and the format"
+            f"{path}: {format} stores one clip per file, but there are {len(motion)}; give a folder (without an "
+            "ending) and the format"
         )
     with _staged(path) as stage:
         for clip in motion:
@@ -110,7 +110,7 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
         return
     if np.isnan(clip.positions).any():
         raise ValueError(
-            f"clip {brief('/'.join(clip.key))} lacks joints, and {format} has no gaps; fill them first "
+            f"clip {brief('/'.join(clip.key))} has missing joints, but {format} has no gaps; fill them first "
             "(`dvae impute RUN --filled FILE`), or write npz or csv, where they are NaN"
         )
     turning = motion.with_rotations()
@@ -192,11 +192,11 @@ def convert(
         written = write_motion(out, motion, format)
         return f"{len(motion)} clips in {len(written)} files; {len(motion.skipped)} skipped"
     if out.suffix and format != "npz" and len(files) > 1:
-        raise ValueError(f"{out}: {format} holds one clip a file, and there are {len(files)}; name a folder")
+        raise ValueError(f"{out}: {format} stores one clip per file, but there are {len(files)}; give a folder")
     keys = [(file.split, file.name) for file in files]
     if len(set(keys)) < len(keys):
         twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"two files are clip {'/'.join(twice)}; put them into folders of different names")
+        raise ValueError(f"two files have the clip name {'/'.join(twice)}; put them into folders of different names")
     world = infer_world(sampled(files, skip_bad), metres, up)
     reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, resampled=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
@@ -218,7 +218,7 @@ def convert(
                 else:
                     yield result[0]
         if len(skipped) == len(files):
-            raise ValueError(f"no file can be read; the first: {skipped[0]}")
+            raise ValueError(f"none of the files can be read; the first: {skipped[0]}")
 
     if format == "npz":
         save_clips(out, clips(out), lambda: collected.skeleton)

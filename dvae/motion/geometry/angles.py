@@ -176,7 +176,7 @@ class AngleLimits:
         limits = zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
         crossed = [name for name, low, high in limits if not low <= high]
         if crossed:
-            raise ValueError(f"lower limits above the upper ones, or no numbers: {', '.join(dict.fromkeys(crossed))}")
+            raise ValueError(f"lower limits exceed upper ones, or are not numbers: {', '.join(dict.fromkeys(crossed))}")
 
 
 def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
@@ -236,7 +236,7 @@ def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0
         ValueError: `poses` is empty, the quantile is not in [0, .5), or `cosines` raises it.
     """
     if not 0 <= quantile < 0.5:
-        raise ValueError(f"quantile is {quantile}, expected the part beyond each limit, from 0 to below .5")
+        raise ValueError(f"quantile is {quantile}, expected the share beyond each limit, from 0 to below .5")
     if not poses.numel():
         raise ValueError(f"no poses in a tensor of shape {tuple(poses.shape)}: limits need at least one")
     with torch.no_grad():

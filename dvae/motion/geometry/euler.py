@@ -102,15 +102,15 @@ class Angles:
         beyond = [f"{time:g}" for time, frame in zip(times, frames, strict=True) if not 1 <= frame <= last]
         if beyond or not times:
             raise ValueError(
-                f"no predicted frame is nearest to {', '.join(beyond) or 'no time'} ms: windows of {protocol.name} go "
-                f"on for {last} frames at {protocol.fps:g} a second, {1000 * last / protocol.fps:g} ms; choose others"
+                f"no predicted frame is nearest to {', '.join(beyond) or 'no time'} ms: windows of {protocol.name} "
+                f"have {last} frames at {protocol.fps:g} a second, {1000 * last / protocol.fps:g} ms; choose others"
             )
         if windows.missing:
-            raise ValueError("a joint that is missing leaves the turns of others open; fill the gaps first")
+            raise ValueError("a missing joint leaves the rotations of others undetermined; fill the gaps first")
         if not inverse and protocol.representation == "positions":
             raise ValueError(
-                f"windows of {protocol.name} are of positions, which do not tell all turns; take a protocol whose "
-                "representation is one of turns, or inverse=True for those that positions tell"
+                f"windows of {protocol.name} have positions, which do not determine all rotations; use a protocol "
+                "whose representation is a rotation, or inverse=True to compute rotations from positions"
             )
         self.windows = windows
         self.protocol = AngleProtocol(protocol.name, protocol.fps, tuple(times), frames, inverse)
@@ -192,8 +192,8 @@ class AngleModel(nn.Module):
         self.turns = next((each for each in views if isinstance(each, Rotations)), None)
         if self.turns is None and not angles.protocol.inverse:
             raise ValueError(
-                "a model of positions makes no turns; score it with inverse=True, by those that positions tell, and "
-                "what it is compared with likewise"
+                "a model of positions predicts no rotations; score it with inverse=True, which computes them from "
+                "positions, and score compared models likewise"
             )
 
     def is_drawn(self, means: bool = False) -> bool:
@@ -259,7 +259,7 @@ def euler_errors(
         ValueError: a time is beyond the windows, or windows or models have no rotations and `inverse` is not set.
     """
     if not counts or min(counts) < 1:
-        raise ValueError(f"the best is of at least one future, got {list(counts)}")
+        raise ValueError(f"the best future is chosen among at least one, got {list(counts)}")
     angles = Angles(windows, times, inverse)
     return evaluate(
         {name: AngleModel(model, angles) for name, model in models.items()},

@@ -53,13 +53,13 @@ def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[in
     for text in parts:
         name, _, members = text.partition("=")
         if not name.isidentifier() or name in found:
-            raise ValueError(f"parts have names of their own, such as lower and upper; got {', '.join(parts)}")
+            raise ValueError(f"parts must have different names, such as lower and upper; got {', '.join(parts)}")
         found[name] = places_of(skeleton, (members or name).split("+"))
     joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
     everything = sorted(place for places in found.values() for place in places)
     if everything != list(range(len(joints))):
         wrong = [name for place, name in enumerate(joints) if everything.count(place) != 1]
-        raise ValueError(f"every joint but the root is in one part; {', '.join(wrong)} are in none or in several")
+        raise ValueError(f"every joint but the root must be in one part; {', '.join(wrong)} are in none or in several")
     return found
 
 

@@ -94,7 +94,7 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
         raise ValueError(f"expected matrices (..., 3, 3), got {tuple(rotations.shape)}")
     if form not in SIZES and not _WHOLE.fullmatch(form):
         size(form)
-        raise ValueError(f"not every rotation is one as {form}; expected three axes, no two alike in a row")
+        raise ValueError(f"{form} cannot represent every rotation; expected three axes, no two alike in a row")
     if form == "matrix":
         return rotations.flatten(-2)
     if form == "6d":

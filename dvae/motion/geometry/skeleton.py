@@ -48,7 +48,7 @@ def text_of(path: Path, most: int = MOST_TEXT) -> Iterator[TextIO]:
     try:
         yield io.TextIOWrapper(io.BytesIO(files.read(path, most, links=True)), encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is no text ({error})") from error
+        raise ValueError(f"{path}: is not text ({error})") from error
 
 
 def brief(value: Any) -> str:
@@ -156,7 +156,7 @@ class Skeleton:
                     f"but joints go from 0 to {joints - 1}"
                 )
         if circling := set(range(joints)) - set(self.order):
-            raise ValueError(f"{what}: {self.names[min(circling)]} hangs on a cycle of joints")
+            raise ValueError(f"{what}: {self.names[min(circling)]} is in a cycle of joints")
         for side in ("left", "right"):
             strangers = [j for j in getattr(self, side) if not 0 <= j < joints]
             if strangers:
@@ -226,8 +226,8 @@ class Skeleton:
         """
         if not self.rest:
             raise ValueError(
-                f"skeleton {self.name!r} has no rest pose, without which rotations mean nothing; "
-                "MotionSet.with_rotations() finds both"
+                f"skeleton {self.name!r} has no rest pose, so its rotations are not defined; "
+                "MotionSet.with_rotations() computes both"
             )
         return torch.tensor(self.rest, dtype=torch.float64).reshape(-1, 3)
 
@@ -308,7 +308,7 @@ class Skeleton:
         left = [joint for joint in self.left if self.parents[joint] not in self.left]
         right = [joint for joint in self.right if self.parents[joint] not in self.right]
         if not left or not right:
-            raise ValueError(f"skeleton {self.name!r} has no left and right joints, so nobody's heading is known")
+            raise ValueError(f"skeleton {self.name!r} has no left and right joints, so headings are not defined")
         return left, right
 
     def heading(self, positions: Tensor) -> Tensor:
@@ -384,7 +384,9 @@ class Skeleton:
         missing = [key for key in ("joint_names", "parents") if not isinstance(fields, dict) or key not in fields]
         if missing:
             found = _listed(list(fields)) if isinstance(fields, dict) else brief(fields)
-            raise ValueError(f"{path}: expected JSON with joint_names and parents, lacks {missing[0]}, found {found}")
+            raise ValueError(
+                f"{path}: expected JSON with joint_names and parents; {missing[0]} is missing, found {found}"
+            )
         try:
             parents = _values(fields["parents"], Integral, "parents", "whole numbers")
             lengths = _values(fields.get("bone_lengths_m", ()), Real, "bone_lengths_m", "numbers")

@@ -68,8 +68,8 @@ class Heading(View):
                 shortest, needed = data.lengths.min(), min(self.frames, data[WHOLE].shape[-2])
                 if shortest < needed:
                     raise ValueError(
-                        f"this model turns every window by its frame {needed}, but a sequence has {shortest}; leave it "
-                        "out, or fit with heading=False"
+                        f"this model rotates every window by the heading in its frame {needed}, but a sequence has "
+                        f"{shortest}; remove it, or fit with heading=False"
                     )
             found = self._observed(seen)
         return self._turn(seen, -found) | {HEADING: found}
@@ -121,8 +121,8 @@ class Heading(View):
             window, *_, joint = mixed.nonzero()[0].tolist()
             held = [n for j, n in enumerate(skeleton.names) if j != skeleton.root or mixed.shape[-1] == skeleton.joints]
             raise ValueError(
-                f"window {window} lacks one horizontal coordinate of {held[joint]} and has the other, but this model "
-                "turns windows, which mixes them; hide both in 'mask', or fit with heading=False"
+                f"window {window} is missing one horizontal coordinate of {held[joint]} and has the other, but this "
+                "model rotates windows, which mixes them; hide both in 'mask', or fit with heading=False"
             )
 
 
@@ -182,9 +182,9 @@ class Bones(View):
     @override
     def log_det(self, data: Batch) -> Tensor:
         raise ValueError(
-            "there is no density of positions where a model sees the directions of bones: lengths are taken as given, "
-            "and a direction has two degrees of freedom in three numbers; make x a function of its parents, with "
-            "distributions.Directions(), and train by energies, or let the model see positions"
+            "a model that sees the directions of bones has no density of positions: lengths are given, and a direction "
+            "has two degrees of freedom in three numbers. Make x a function of its parents with "
+            "distributions.Directions() and train by energies, or let the model see positions"
         )
 
     def _rooted(self, joints: Tensor, x: Tensor) -> Tensor:
@@ -208,8 +208,9 @@ class Bones(View):
         if loose := [joint for joint in there - {self.skeleton.root} if self.skeleton.parents[joint] not in there]:
             names, parent = self.skeleton.names, self.skeleton.parents[loose[0]]
             raise ValueError(
-                f"this model sees the directions of bones, but {', '.join(held)} alone does not tell that of "
-                f"{names[loose[0]]}, which hangs from {names[parent]}; give the part with {names[parent]} too"
+                f"this model sees the directions of bones, but {', '.join(held)} alone does not determine the "
+                f"direction of {names[loose[0]]}, whose parent is {names[parent]}; give the part with {names[parent]} "
+                "too"
             )
         some: Tensor = data[next(iter(held))]
         whole = some.new_zeros(*some.shape[:-1], size)
@@ -230,8 +231,8 @@ class Bones(View):
             if name in (WHOLE, *self.pieces) and not mask.all():
                 window, frame, *_ = (~mask).nonzero()[0].tolist()
                 raise ValueError(
-                    f"window {window} lacks entries of frame {frame + 1}, but this model sees the directions of bones, "
-                    "of which both ends have to be there; fill them in before, or fit with bones=False"
+                    f"window {window} has missing entries in frame {frame + 1}, but this model sees the directions of "
+                    "bones, which need both ends; fill them first, or fit with bones=False"
                 )
 
 
@@ -296,8 +297,8 @@ class Rotations(View):
             )
         if data.mask() is not None:
             raise ValueError(
-                "a joint that is missing leaves the turns of others open; fit under a protocol whose representation is "
-                "positions, which may be masked"
+                "a missing joint leaves the rotations of others undetermined; fit under a protocol whose "
+                "representation is positions, which may be masked"
             )
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
         turns = data.view_inputs.get(ROTATIONS)

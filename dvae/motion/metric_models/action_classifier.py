@@ -74,7 +74,7 @@ class ActionClassifier(Trainable):
         if len(classes) < 2:
             known = sorted({label for clip in windows.clips for label in clip.labels})
             raise ValueError(
-                f"there is nothing to tell apart: training clips have {' and '.join(classes) or 'nothing'} for the "
+                f"a classifier needs two classes: training clips have {' and '.join(classes) or 'nothing'} for the "
                 f"label {self.label!r}; their labels are {', '.join(known) or 'none (is labels.csv next to the file?)'}"
             )
         return replace(self, classes=tuple(classes))
@@ -126,13 +126,13 @@ class ActionClassifierModel(nn.Module):
             ValueError: the batch has no classes, frames of another size, padded sequences or missing values.
         """
         if extra := {"lengths", "mask"} & batch.keys():
-            raise ValueError(f"a classifier reads whole windows; leave {' and '.join(sorted(extra))} out")
+            raise ValueError(f"a classifier reads whole windows; remove {' and '.join(sorted(extra))} from the batch")
         if CLASS not in batch:
-            raise ValueError(f"the batch lacks {CLASS!r}, the class of each window; Windows.classified gives it")
+            raise ValueError(f"the batch has no {CLASS!r}, the class of each window; Windows.classified adds it")
         x = batch["x"]
         observed = self.protocol.observed
         if x.shape[1] <= observed:
-            raise ValueError(f"windows of {x.shape[1]} frames have none after the {observed} observed ones")
+            raise ValueError(f"windows of {x.shape[1]} frames have no future after the {observed} observed ones")
         logits = self.logits(self.features(x[:, observed:]))
         with pyro.plate("windows", len(x)):
             return {CLASS: pyro.sample(CLASS, distributions.Categorical(logits=logits), obs=batch[CLASS])}
@@ -153,7 +153,7 @@ class ActionClassifierModel(nn.Module):
         """
         if futures.shape[-1] != self.size:
             raise ValueError(
-                f"frames have {futures.shape[-1]} numbers; this classifier was fitted to frames of {self.size}"
+                f"frames have {futures.shape[-1]} numbers, but this classifier was fitted to frames of {self.size}"
             )
         parts = futures.reshape(-1, *futures.shape[-2:]).split(IN_CACHE)
         last = torch.cat([self.gru(part)[0][:, -1] for part in parts])

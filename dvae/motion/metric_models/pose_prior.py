@@ -155,7 +155,7 @@ class PosePriorModel(nn.Module):
             ValueError: the batch has padded sequences or missing values.
         """
         if extra := {"lengths", "mask"} & batch.keys():
-            raise ValueError(f"a pose prior reads whole poses in every frame; leave {' and '.join(sorted(extra))} out")
+            raise ValueError(f"a pose prior reads whole poses in every frame; remove {' and '.join(sorted(extra))}")
         d = self.skeleton.directions(self.facing(batch["x"]))
         with pyro.plate("sequences", d.shape[0], dim=-2), pyro.plate("frames", d.shape[1], dim=-1):
             return {"d": pyro.sample("d", self.flow.prior(), obs=d)}
@@ -239,7 +239,7 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
     except (KeyError, TypeError):
         fits = False
     if not fits:
-        raise ValueError(f"{path} holds no pose prior of the skeleton {skeleton.name!r}")
+        raise ValueError(f"{path} does not contain a pose prior of the skeleton {skeleton.name!r}")
     if given != (heading, PosePrior.layers):
         raise ValueError(
             f"{path} was fitted with heading={options['heading']} and layers={options['layers']}, but this model sees "

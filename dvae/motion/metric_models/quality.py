@@ -149,7 +149,7 @@ class RealOrGeneratedModel(nn.Module):
             ValueError: the batch has padded sequences or missing values.
         """
         if extra := {"lengths", "mask"} & batch.keys():
-            raise ValueError(f"a metric model of quality reads whole windows; leave {' and '.join(sorted(extra))} out")
+            raise ValueError(f"a metric model of quality reads whole windows; remove {' and '.join(sorted(extra))}")
         logits = self.logits(batch["x"])
         with pyro.plate("windows", len(logits)):
             return {REAL: pyro.sample(REAL, distributions.Bernoulli(logits=logits), obs=batch[REAL].to(logits))}
@@ -171,7 +171,7 @@ class RealOrGeneratedModel(nn.Module):
         skeleton, size = self.skeleton, x.shape[-1]
         if size not in (3 * skeleton.joints, 3 * (skeleton.joints - 1)):
             raise ValueError(
-                f"frames have {size} numbers; those of the skeleton {skeleton.name!r} have {3 * skeleton.joints}, or "
+                f"frames have {size} numbers; expected {3 * skeleton.joints} for the skeleton {skeleton.name!r}, or "
                 f"{3 * (skeleton.joints - 1)} without the root"
             )
         if size == 3 * skeleton.joints:
@@ -316,7 +316,7 @@ def quality(
     """
     method = method or RealOrGenerated()
     if train.missing or test.missing:
-        raise ValueError("quality is of whole windows, but these lack joints; fill the gaps first (`dvae impute`)")
+        raise ValueError("quality needs whole windows, but these have missing joints; fill the gaps (`dvae impute`)")
     if (train.skeleton, train.protocol.observed, train.length) != (test.skeleton, test.protocol.observed, test.length):
         raise ValueError(f"training and test windows differ in skeleton or frames: {train} and {test}")
     if examples < 1 or not seeds:

@@ -272,8 +272,8 @@ def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Te
     names = angle_names(skeleton)
     if limits.names != names:
         raise ValueError(
-            f"limits of the angles {', '.join(dict.fromkeys(limits.names))}; expected those of skeleton "
-            f"{skeleton.name!r}, {', '.join(dict.fromkeys(names))}: estimate them from its poses"
+            f"limits of the angles {', '.join(dict.fromkeys(limits.names))}; expected the angles of skeleton "
+            f"{skeleton.name!r}, {', '.join(dict.fromkeys(names))}: estimate the limits from its poses"
         )
     low, high = limits.low.to(samples), limits.high.to(samples)
     low, high = low.masked_fill(low < -0.98, -torch.inf), high.masked_fill(high > 0.98, torch.inf)
@@ -346,6 +346,6 @@ def _check(samples: Tensor, **others: tuple[Tensor, tuple[Any, ...]]) -> None:
     for name, (tensor, expected) in others.items():
         if tensor.shape != tuple(expected):
             raise ValueError(
-                f"{name} has shape {tuple(tensor.shape)}, expected ({', '.join(map(str, expected))}) beside samples "
-                f"{tuple(samples.shape)}"
+                f"{name} has shape {tuple(tensor.shape)}, expected ({', '.join(map(str, expected))}) for samples of "
+                f"shape {tuple(samples.shape)}"
             )

@@ -95,7 +95,9 @@ def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | No
     """
     told = {new: find(names, old) for old, new in (said or {}).items()}
     if unknown := told.keys() - set(skeleton.names):
-        raise ValueError(f"skeleton {skeleton.name!r} has no joint {min(unknown)!r}, but {', '.join(skeleton.names)}")
+        raise ValueError(
+            f"skeleton {skeleton.name!r} has no joint {min(unknown)!r}; it has {', '.join(skeleton.names)}"
+        )
     if set(skeleton.names) - told.keys() <= set(names):
         told = {name: list(names).index(name) for name in skeleton.names if name not in told} | told
     there, meant = parts(names), {joint: part for part, joint in parts(skeleton.names).items()}
@@ -109,8 +111,8 @@ def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | No
             lacking.append(name)
     if lacking:
         raise ValueError(
-            f"no joint is {', '.join(lacking)} of skeleton {skeleton.name!r}; there are {', '.join(names)[:600]}. "
-            'Say which is which by joints={"name there": "name here", ...}'
+            f"no joint matches {', '.join(lacking)} of skeleton {skeleton.name!r}; there are {', '.join(names)[:600]}. "
+            'Match them with joints={"name there": "name here", ...}'
         )
     return [place for place in found if place is not None]
 
@@ -172,7 +174,7 @@ class Kept:
         for joint in joints:
             place = find(names, joint) if isinstance(joint, str) else joint
             if not 0 <= place < len(names) or place in chosen:
-                raise ValueError(f"joint {joint!r} is none of {len(names)}, or there twice")
+                raise ValueError(f"joint {joint!r} is not one of {len(names)}, or occurs twice")
             chosen.append(place)
         above = []
         for place in chosen:
@@ -182,7 +184,7 @@ class Kept:
             above.append(chosen.index(parent) if parent >= 0 else -1)
         if len(roots := [names[joint] for joint, parent in zip(chosen, above, strict=True) if parent < 0]) != 1:
             raise ValueError(
-                f"joints that are kept need one from which the others hang, such as the pelvis; these hang from "
+                f"the joints that are kept need one common ancestor among them, such as the pelvis; their roots are "
                 f"{', '.join(roots)[:600] or 'none'}"
             )
         return cls(tuple(chosen), tuple(renamed or (names[joint] for joint in chosen)), tuple(above))

@@ -81,7 +81,7 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
     """
     observed = windows.protocol.observed
     if not threshold > 0:
-        raise ValueError(f"the multimodal threshold is a distance and must be positive, but is {threshold}")
+        raise ValueError(f"the multimodal threshold must be a positive distance, got {threshold}")
     poses, seen = last_places(Batch(windows.all()), observed)
     poses = poses.double()
     found: list[Tensor] = []

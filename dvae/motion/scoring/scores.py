@@ -99,7 +99,7 @@ def scores(
     if not isinstance(windows, Windows | ExchangedWindows):
         raise TypeError(
             f"scores of motion need windows of dvae.motion, which have a skeleton, not {type(windows).__name__}; for "
-            "errors in metres alone take dvae.motion.displacements"
+            "errors in metres only, use dvae.motion.displacements"
         )
     moves = windows.protocol.root == "relative"
     found = displacements(windows, _body(windows.skeleton) if moves else lambda x: x)
@@ -405,8 +405,8 @@ def _judged(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> 
     """Return the ACC, if the class of some window is known, and the FID."""
     if windows.missing:
         raise ValueError(
-            f"ACC and FID {name} are of features of whole futures, but these windows lack joints; leave the classifier "
-            "out, or fill the gaps first (`dvae impute RUN --filled FILE`)"
+            f"ACC and FID {name} need features of whole futures, but these windows have missing joints; leave the "
+            "classifier out, or fill the gaps first (`dvae impute RUN --filled FILE`)"
         )
     labels = _labels(name, classifier, windows)
     classes = torch.tensor([classifier.classes.index(label) if label in classifier.classes else -1 for label in labels])
@@ -467,7 +467,7 @@ def _labels(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> 
     try:
         return windows.labels(classifier.label)
     except KeyError as error:
-        raise ValueError(f"the classifier {name} tells {classifier.label}s apart, but {error.args[0]}") from error
+        raise ValueError(f"the classifier {name} distinguishes {classifier.label}s, but {error.args[0]}") from error
 
 
 def _hash(module: nn.Module) -> str:

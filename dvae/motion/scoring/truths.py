@@ -57,7 +57,7 @@ class PseudoTruths:
     ) -> None:
         if not threshold > 0 or not minimum >= 0 or most < 1 or stride < 1:
             raise ValueError(
-                "threshold is a distance above 0, minimum a distance from 0, most and stride are numbers from 1; given "
+                "expected a threshold above 0, a minimum of at least 0, and most and stride of at least 1; got "
                 f"{threshold}, {minimum}, {most} and {stride}"
             )
         self._observed = windows.protocol.observed

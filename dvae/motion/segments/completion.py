@@ -205,14 +205,14 @@ class SegmentCompletion:
         moments = next((found[name] for name in (TIMES, FRAMES) if name in found), None)
         if unknown := found.keys() - {TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE}:
             raise ValueError(
-                f"there is nothing to be seen called {', '.join(sorted(unknown))}; what is read are {TIMES}, {FRAMES}, "
+                f"unknown observations {', '.join(sorted(unknown))}; expected some of {TIMES}, {FRAMES}, "
                 f"{SURFACES}, {POINTS}, {SPOTS} and {SHAPE}"
             )
         if moments is None or moments.dim() != 2 or not (kinds or {TIMES, FRAMES} <= found.keys()):
             given = {name: tuple(value.shape) for name, value in found.items()}
             raise ValueError(
-                f"what was seen is some of {SURFACES}, {POINTS} and {SPOTS}, at moments (B, K) that {TIMES} or "
-                f"{FRAMES} tell; got {given}"
+                f"expected observations {SURFACES}, {POINTS} or {SPOTS}, with their moments (B, K) in {TIMES} or "
+                f"{FRAMES}; got {given}"
             )
         b, k = moments.shape
         rest: dict[str, tuple[Any, ...]] = {
@@ -232,9 +232,9 @@ class SegmentCompletion:
         frames, last = found.get(FRAMES), self.model.timed.frames - 1
         if frames is not None and ((frames < 0) | (frames > last)).any():
             low, high = frames.nan_to_num(0.0).aminmax()
-            raise ValueError(f"frames of chi are from 0 to {last}, got {low:g} to {high:g}")
+            raise ValueError(f"frames of chi must be from 0 to {last}, got {low:g} to {high:g}")
         if SHAPE in found and not found[SHAPE].isfinite().all():
-            raise ValueError(f"{SHAPE} is known of all segments, or left out and looked for; got NaN in some")
+            raise ValueError(f"{SHAPE} must be given for all segments, or left out to be estimated; got NaN in some")
         return found | ({SURFACES: found[SURFACES][..., ::THIN, :]} if SURFACES in found else {})
 
 

@@ -141,8 +141,8 @@ class SegmentData:
         kept = [clip for clip in self.motion if cycles.shortest <= (clip.frames - 1) / fps <= cycles.longest]
         if not kept:
             raise ValueError(
-                f"{self.path} has no clip that lasts {cycles.shortest:g} to {cycles.longest:g} s, to be a segment as "
-                "it is; cut='gait' finds the gait cycles of longer ones"
+                f"{self.path} has no clip of {cycles.shortest:g} to {cycles.longest:g} s that can be a whole "
+                "segment; cut='gait' finds the gait cycles of longer ones"
             )
         marked = [replace(clip, labels={**clip.labels, "source": clip.name}) for clip in kept]
         return fit_to_body(replace(self.motion, clips=marked), human())
@@ -182,7 +182,7 @@ class SegmentData:
             raise ValueError(
                 f"no segment or take {name!r}{nearest(name, few)} in {self.path}; the first is {next(iter(segments))}"
                 if not clips
-                else f"{name!r} is the name of several; say {' or '.join('/'.join(clip.key) for clip in clips)}"
+                else f"{name!r} is the name of several; choose {' or '.join('/'.join(clip.key) for clip in clips)}"
             )
         return Segments(replace(self.segments, clips=clips), self.timed)
 

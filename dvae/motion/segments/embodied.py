@@ -74,10 +74,12 @@ class SegmentSchema(Schema):
         references = tuple(map(_reference, timed.pop("references")))
         skeleton = Skeleton(**tuples(timed.pop("skeleton")))
         if (skeleton.names, skeleton.parents, skeleton.up) != (body.names, body.parents, "y"):
-            raise ValueError(f"timed.skeleton is not that of the body that ships, {', '.join(body.names)} with y up")
+            raise ValueError(
+                f"timed.skeleton must be the skeleton of the supplied body, {', '.join(body.names)} with y up"
+            )
         found = cls.from_data(TimedFrames(skeleton, references=references, **tuples(timed)), body)
         if config["sizes"] != found.sizes:
-            raise ValueError(f"sizes are {brief(config['sizes'])}, and such segments have {found.sizes}")
+            raise ValueError(f"sizes are {brief(config['sizes'])}, expected {found.sizes} for such segments")
         return found
 
 

@@ -103,7 +103,7 @@ class TimedFrames:
         if not np.isfinite([*self.mean, *self.deviation]).all():
             raise ValueError("mean or deviation have NaN or infinite numbers")
         if any(value <= 0 for value in self.deviation):
-            raise ValueError(f"a deviation is {min(self.deviation)}, by which nothing can be divided")
+            raise ValueError(f"deviations must be above 0, got {min(self.deviation)}")
 
     @classmethod
     def of(
@@ -273,7 +273,7 @@ class TimedFrames:
         for clip in motion:
             where = f"segment {'/'.join(clip.key)}"
             if clip.rotations is None:
-                raise ValueError(f"{where} has no turns of joints; MotionSet.with_rotations() finds them")
+                raise ValueError(f"{where} has no rotations of joints; MotionSet.with_rotations() computes them")
             if clip.frames < 2:
                 raise ValueError(f"{where} has {clip.frames} frame, expected at least 2, between which time passes")
         first = torch.from_numpy(np.stack([clip.positions[0] for clip in motion])).double()

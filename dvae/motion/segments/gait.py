@@ -180,7 +180,9 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
     found = []
     for reference in references:
         if reference.rate != cycles.rate:
-            raise ValueError(f"a reference has {reference.rate:g} frames a second, and cycles {cycles.rate:g}")
+            raise ValueError(
+                f"a reference has {reference.rate:g} frames a second, expected {cycles.rate:g} as in cycles"
+            )
         if not possible.any():
             continue  # true for most clips; skips the expensive costs
         costs = subsequence_costs(_apart(reference.hips, hips), longest)
@@ -216,9 +218,9 @@ def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[R
                 own += [(hips[first : last + 1], clip) for first, last in _between_peaks(angle, period)]
     if not all(walked):
         raise ValueError(
-            f"in no clip of {motion.name or 'this motion'} legs swing by {cycles.swing:g} rad and more, twice and "
-            f"alike (at best {max(best, 0):.2f}, expected {cycles.regular:g} of 2), {cycles.shortest:g} to "
-            f"{cycles.longest:g} s each; give references= of motion in which people walk, or lower `regular` or `swing`"
+            f"no clip of {motion.name or 'this motion'} has legs that swing by at least {cycles.swing:g} rad, twice "
+            f"and alike (at best {max(best, 0):.2f}, expected {cycles.regular:g} of 2), {cycles.shortest:g} to "
+            f"{cycles.longest:g} s each; give references= of walking people, or lower `regular` or `swing`"
         )
     left, right = (_typical(own) for own in walked)
     return (
@@ -251,7 +253,9 @@ def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], fram
 def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
     """Return a clip at another frame rate, and the number of original frames per new frame."""
     if clip.rotations is None:
-        raise ValueError(f"clip {'/'.join(clip.key)} has no turns of joints; MotionSet.with_rotations() finds them")
+        raise ValueError(
+            f"clip {'/'.join(clip.key)} has no rotations of joints; MotionSet.with_rotations() computes them"
+        )
     return (clip, 1.0) if fps == rate else (clip.resampled(fps / rate), fps / rate)
 
 
@@ -275,7 +279,7 @@ def _legs(skeleton: Skeleton) -> list[list[int]]:
             hip, below = below[0], [child for parent, child in skeleton.edges if parent == below[0]]
         if not below:
             raise ValueError(
-                f"skeleton {skeleton.name!r} has no joint below {skeleton.names[hip]}, so nobody sees legs swing"
+                f"skeleton {skeleton.name!r} has no joint below {skeleton.names[hip]}, so leg swings cannot be measured"
             )
         path = [below[0], hip]
         while (above := skeleton.parents[path[-1]]) not in (skeleton.root, -1):

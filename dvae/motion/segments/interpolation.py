@@ -190,7 +190,7 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
         raise ValueError(f"expected at least 3 segments and a label of each, got {len(means)} and {len(labels)}")
     names = list(dict.fromkeys(labels))
     if len(names) > 10 * len(MARKERS):
-        raise ValueError(f"{len(names)} labels are more than anybody tells apart; give one of few values")
+        raise ValueError(f"{len(names)} labels are too many to distinguish; give a label with few values")
     away = means - means.mean(0)
     _, spread, axes = torch.linalg.svd(away, full_matrices=False)
     places, shares = (away @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()

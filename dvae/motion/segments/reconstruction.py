@@ -192,8 +192,8 @@ def reconstruct_segments(
     """
     if not models or batch_size < 1 or bound_particles < 0:
         raise ValueError(
-            f"give at least one model, batch_size from 1 and bound_particles from 0, not {len(models)}, {batch_size} "
-            f"and {bound_particles}"
+            f"expected at least one model, batch_size from 1 and bound_particles from 0, got {len(models)}, "
+            f"{batch_size} and {bound_particles}"
         )
     seen, remembered = _Seen(segments), None if training is None else _Seen(training)
     rows: dict[str, dict[str, np.ndarray]] = {}
@@ -207,7 +207,7 @@ def reconstruct_segments(
             rows[name] = {key: torch.cat([one[key].cpu() for one in found]).double().numpy() for key in found[0]}
             if wrong := np.flatnonzero(~np.isfinite(rows[name][ERROR])).tolist():
                 where = "/".join(held.motion.clips[wrong[0]].key)
-                raise FloatingPointError(f"what {name} makes of segment {where} is not finite")
+                raise FloatingPointError(f"the output of {name} for segment {where} is not finite")
 
         for name, model in models.items():
             held = seen.by(model.timed)

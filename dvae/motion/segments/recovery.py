@@ -212,7 +212,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     with archive(path) as members:
         if unknown := [name for name in members if name not in known]:
             meant = nearest(unknown[0], known)
-            raise NpyError(f"{unknown[0]!r} is nothing that is seen{meant}; expected some of {', '.join(known)}")
+            raise NpyError(f"{unknown[0]!r} is not an observation{meant}; expected some of {', '.join(known)}")
         if (size := sum(member.size for member in members.values())) > LARGEST:
             raise NpyError(
                 f"it unpacks to {size:,} bytes, at most {LARGEST:,} are read; give fewer moments or segments"
@@ -231,13 +231,13 @@ def _check_numbers(name: str, value: Tensor) -> None:
     far = float(value.abs().nan_to_num(0.0, torch.inf).max())
     if name in (SURFACES, POINTS, SPOTS) and far > FARTHEST:
         raise ValueError(
-            f"{name} has a coordinate of {far:g}; expected metres, from where the root is in the segment's first frame"
+            f"{name} has a coordinate of {far:g}; expected metres, relative to the root in the segment's first frame"
         )
     if name == TIMES and (far > LATEST or (value < 0).any()):
         low, high = value.nan_to_num(0.0).aminmax()
         raise ValueError(f"times go from {low:g} to {high:g}; expected seconds from the first frame of the segment")
     if name == SHAPE and far > FARTHEST:
-        raise ValueError(f"{name} has {far:g}; expected parameters of shape, which are about as wide as N(0, 1)")
+        raise ValueError(f"{name} has {far:g}; expected parameters of shape, which vary about as N(0, 1)")
 
 
 def _check_something(seen: Mapping[str, Any]) -> None:
@@ -248,7 +248,7 @@ def _check_something(seen: Mapping[str, Any]) -> None:
     if not (known := some.any(-1)).all():
         row = int(known.logical_not().nonzero()[0])
         raise ValueError(
-            f"nothing was seen of segment {row} of {len(known)}, the first being 0: all is NaN; leave it out"
+            f"segment {row} of {len(known)}, counted from 0, has no observations: all is NaN; leave it out"
         )
 
 

@@ -135,7 +135,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             return found
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         pass
-    raise ValueError(f"{path} does not hold the pitches of chorales; delete it, and it is made anew")
+    raise ValueError(f"{path} does not contain the pitches of chorales; delete it, and it is built again")
 
 
 def _settings() -> dict[str, np.ndarray]:

@@ -111,7 +111,7 @@ def resynthesised(estimate: np.ndarray, samples: np.ndarray) -> np.ndarray:
     """
     observed = spectrum(samples)
     if estimate.shape != observed.shape:
-        raise ValueError(f"the power has shape {estimate.shape}, and the spectrum of the signal {observed.shape}")
+        raise ValueError(f"the power has shape {estimate.shape}, but the spectrum of the signal {observed.shape}")
     return sound(np.sqrt(estimate) * np.exp(1j * np.angle(observed)), len(samples))
 
 

@@ -118,5 +118,5 @@ def test_programs_that_cannot_be_searched_say_why():
     for program, message in ((known, "has no latents"), (two_heaped, "not log-concave")):
         with pytest.raises(ValueError, match=message):
             dvae.posterior(program, batch, descent=QUICK)
-    with pytest.raises(ValueError, match="at least so many candidates"):
+    with pytest.raises(ValueError, match="at least as many candidates"):
         dvae.Descent(starts=5, candidates=4)

@@ -190,7 +190,7 @@ def test_a_stage_keeps_what_it_freezes_also_across_a_resume(tmp_path):
     assert same(*(load_file(tmp_path / name / "last.safetensors") for name in ("whole", "parts")))
     with pytest.raises(ValueError, match="starts with"):
         run(stages=[Stage(2, frozen=("decoder.",))])
-    with pytest.raises(ValueError, match="parameter frozen"):
+    with pytest.raises(ValueError, match="parameter is frozen"):
         run(stages=[Stage(2, frozen=("generator", "encoder"))])
 
 

@@ -208,7 +208,7 @@ def test_a_task_that_does_not_go_through_the_shared_parameters_is_refused():
     ("change", "message"),
     [
         ({"weight/huge": 1.0}, "objective"),
-        ({"first/large": math.nan}, "objective writes"),
+        ({"first/large": math.nan}, "objective's format"),
         ({"weight/small": 3.0}, "positive numbers"),
     ],
 )

@@ -51,7 +51,7 @@ class TestMotionInfilling(FactorizationContract):
     def build(self, size):
         return small().build({"x": size})
 
-    @pytest.mark.skip(reason="the network makes sequences of one length, and none is padded")
+    @pytest.mark.skip(reason="the network outputs sequences of one length, and none is padded")
     def test_padding_changes_nothing(self):
         pass
 

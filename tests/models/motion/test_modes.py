@@ -214,7 +214,7 @@ def test_a_config_that_is_none_of_a_cvae_is_refused(windows, cvae_run, tmp_path,
 def test_weights_that_are_not_those_of_the_config_are_refused(windows, cvae_run, tmp_path):
     run = Path(shutil.copytree(cvae_run, tmp_path / "cvae"))
     config = json.loads((run / "config.json").read_text())
-    for width, message in ((9, "holds the weights of another model"), (16384, "asks for a model that is larger than")):
+    for width, message in ((9, "holds the weights of another model"), (16384, "describes a model that is larger than")):
         (run / "config.json").write_text(json.dumps({**config, "method": {**config["method"], "width": width}}))
         with pytest.raises(CheckpointError, match=message):
             started(windows, run)

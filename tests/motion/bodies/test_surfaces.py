@@ -31,7 +31,7 @@ def test_bodies_stand_apart_upright_and_face_the_viewer(up):
     assert not any(text.get_parse_math() for text in ax.texts)
     with pytest.raises(ValueError, match="4 names for 5 bodies"):
         surfaces(PERSON.faces, people, names=list("abcd"))
-    with pytest.raises(ValueError, match="a face has corner"):
+    with pytest.raises(ValueError, match="a face refers to vertex"):
         surfaces(PERSON.faces, people[:, :9])
 
 

@@ -108,7 +108,7 @@ def test_gaps_stay_where_motion_is_resampled_or_divided():
 
 
 def test_turns_of_joints_need_whole_bodies(tmp_path):
-    needs = "lacks joints, without which their turns are not known"
+    needs = "has missing joints, so its rotations are not known"
     turned = replace(motion.PROTOCOLS["simulated"], representation="6d")
     for call in (GAPS.with_rotations, lambda: motion.windows(GAPS, turned, "train")):
         with pytest.raises(ValueError, match=needs):
@@ -118,10 +118,12 @@ def test_turns_of_joints_need_whole_bodies(tmp_path):
         dvae.method("mix-and-match").build(quaternions.windows("train"))
     found = replace(PEOPLE.with_rotations(), missing=True)
     batch = motion.windows(found, turned, "test").all()
-    with pytest.raises(ValueError, match="leaves the turns of others open"):
+    with pytest.raises(ValueError, match="leaves the rotations of others undetermined"):
         motion.windows(found, turned, "test").schema.view(batch | {"mask": {"x": batch["mask"]}})
     for format in ("bvh", "amass"):
-        with pytest.raises(ValueError, match=f"lacks joints, and {format} has no gaps; fill them first.*or write npz"):
+        with pytest.raises(
+            ValueError, match=f"has missing joints, but {format} has no gaps; fill them first.*or write npz"
+        ):
             motion.write_motion(tmp_path / "folder", GAPS, format)
 
 
@@ -186,7 +188,7 @@ def test_listed_windows_have_something_before_and_after_the_present():
     windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
     assert {start for _, _, start in windows.keys} == {5, 10, 15}  # 15 frames from 5 on end at 19
     assert len(windows.all()["x"]) == len(windows.keys) == len(windows)
-    with pytest.raises(ValueError, match="no window that has the root beside another joint"):
+    with pytest.raises(ValueError, match="no window with the root and another joint"):
         motion.windows(without(PEOPLE, Pelvis=slice(None)), motion.PROTOCOLS["simulated"], "train")
 
 
@@ -296,10 +298,14 @@ def test_statistics_are_of_what_was_observed():
 
 def test_what_needs_whole_bodies_says_what_to_do():
     windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
-    with pytest.raises(ValueError, match=r"features of whole futures, but these windows lack joints.*dvae impute"):
+    with pytest.raises(
+        ValueError, match=r"features of whole futures, but these windows have missing joints.*dvae impute"
+    ):
         motion.scores(windows, classifiers={"content": None})
     told = motion.windows(GAPS, motion.PROTOCOLS["simulated-trajectories"], "test").given(["LWrist"])
-    with pytest.raises(ValueError, match=r"exchanged whole, but these windows may lack joints.*dvae impute"):
+    with pytest.raises(
+        ValueError, match=r"only whole poses can be exchanged, but these windows may have missing joints.*dvae impute"
+    ):
         motion.ExchangedWindows(told)
     data, method = small("trajevae")
     pose = GAPS.clips[0].positions[np.isnan(GAPS.clips[0].positions).any((1, 2))][0]

@@ -129,7 +129,7 @@ class TestMotionSet:
         here, there = people((9,)), people((9,), "test", 1)
         both = MotionSet([*here, *there], WALKER)
         np.testing.assert_array_equal(both["test", "clip_0"].positions, there[0].positions.astype(np.float32))
-        with pytest.raises(ValueError, match="train/clip_0 is there twice"):
+        with pytest.raises(ValueError, match="train/clip_0 occurs twice"):
             MotionSet([*here, *here], WALKER)
         with pytest.raises(KeyError, match="keys are"):
             both["clip_0"]
@@ -187,7 +187,7 @@ class TestArchive:
     @pytest.mark.parametrize(
         ("content", "message"),
         [
-            (pickle.dumps([1, 2]), "no dictionary of dictionaries"),
+            (pickle.dumps([1, 2]), "not a dictionary of dictionaries"),
             (pickle.dumps({"train": {}}), "no clips"),
             (pickle.dumps({"a": 1})[:-3], "damaged pickle"),
             (b"\x80\x04\x8e" + (2**60).to_bytes(8, "little"), "damaged pickle"),
@@ -394,10 +394,10 @@ class TestWindows:
         others = replace(TINY, train=("S1",), test=("S2",))
         for protocol, split, length, message in (
             (TINY, "train", 99, r"no window of 99 frames: \d clips, the longest of 30 frames"),
-            (PROTOCOLS["h36m"], "train", None, "counts frames at 50 a second, 'people' has 30"),
+            (PROTOCOLS["h36m"], "train", None, "needs 50 frames per second, but 'people' has 30"),
             (TINY, "tests", None, r"did you mean 'test'\?\): expected train, validation, test"),
             ("h36", "train", None, r"unknown protocol 'h36' \(did you mean 'h36m'"),
-            (others, "train", None, "wants split S1 for training and S2 for test; 'people' has train, test"),
+            (others, "train", None, "needs split S1 for training and S2 for test; 'people' has train, test"),
         ):
             with pytest.raises(ValueError, match=message):
                 windows(motion(), protocol, split, length)

@@ -90,7 +90,7 @@ def test_what_does_not_fit_is_refused(bodies):
         animate(WALKER, observed, np.where(samples > 0.5, np.nan, samples))
     with pytest.raises(ValueError, match="2 names for 3 samples"):
         animate(WALKER, *bodies, names=["a", "b"])
-    with pytest.raises(ValueError, match=r"fixed names joints \[-1, 17\]; they go from 0 to 16"):
+    with pytest.raises(ValueError, match=r"fixed has joints \[-1, 17\]; expected indices from 0 to 16"):
         animate(WALKER, *bodies, fixed=[17, 3, -1])
 
 

@@ -81,8 +81,8 @@ def test_a_bone_turns_about_its_own_axes_and_carries_what_hangs_from_it(tmp_path
     ("file", "old", "new", "message"),
     [
         ("asf", ":bonedata", ":nothing", "no :bonedata"),
-        ("asf", "root thigh", "head thigh", "'thigh' hangs from 'head'"),
-        ("asf", "length 4", "length four", "length of thigh: 'four' is no number"),
+        ("asf", "root thigh", "head thigh", "the parent of 'thigh' is 'head'"),
+        ("asf", "length 4", "length four", "length of thigh: 'four' is not a number"),
         ("asf", "direction 0 -1 0", "direction 0 -1", "direction of thigh has 2 numbers"),
         ("asf", "direction 0 -1 0\n", "", "line 15 ends a bone without"),
         ("asf", "dof rx", "dof rx tx", "expected rx, ry or rz"),
@@ -113,5 +113,5 @@ def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):
 @pytest.mark.parametrize("text", ["", "0 " * 117, "0 " * 233 + "nan"])
 def test_what_are_no_exponential_maps_is_refused(text, tmp_path):
     (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(ValueError, match=r"no rows of 117|no number"):
+    with pytest.raises(ValueError, match=r"expected rows of 117|not a number"):
         read_expmap(tmp_path / "a.txt")

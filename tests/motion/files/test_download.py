@@ -52,16 +52,16 @@ def test_files_come_once_and_are_where_they_were_at_the_address(url, tmp_path, c
 
 def test_a_file_that_is_another_is_not_kept(url, tmp_path):
     (tmp_path / "there" / "02" / "02_01.amc").write_bytes(b"something else")
-    with pytest.raises(ValueError, match=r"02_01\.amc: it is not the file that is known"):
+    with pytest.raises(ValueError, match=r"02_01\.amc: the file differs from the known one"):
         download.get("cmu", tmp_path / "here", url)
     assert not (tmp_path / "here" / "02" / "02_01.amc").exists()
 
 
 def test_what_is_not_there_is_said_with_its_address(url, tmp_path):
     (tmp_path / "there" / "02" / "02_01.amc").unlink()
-    with pytest.raises(OSError, match=r"02_01\.amc cannot be had"):
+    with pytest.raises(OSError, match=r"02_01\.amc cannot be downloaded"):
         download.get("cmu", tmp_path / "here", url)
-    with pytest.raises(OSError, match=r"127\.0\.0\.1:1/02/02\.asf cannot be had"):
+    with pytest.raises(OSError, match=r"127\.0\.0\.1:1/02/02\.asf cannot be downloaded"):
         download.get("cmu", tmp_path / "nothing")
     with pytest.raises(ValueError, match="no collection 'cm'; known: cmu"):
         download.get("cm", tmp_path)

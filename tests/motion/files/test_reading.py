@@ -179,7 +179,7 @@ def test_a_unit_that_no_person_has_is_asked_for_and_one_that_differs_in_a_folder
     scaled(bvh / "train" / "person_0001.bvh", 1 / 2.54)
     with pytest.raises(ValueError, match=r"in centimetres, .*person_0001.* in inches|in inches, .* in centimetres"):
         read_motion(bvh)
-    with pytest.raises(ValueError, match=r"person_0001\.bvh: its body is 0\.\d+ times that of"):
+    with pytest.raises(ValueError, match=r"person_0001\.bvh: its body is 0\.\d+ times as large as in"):
         read_motion(bvh, metres=0.01)
     scaled(bvh / "train" / "person_0000.bvh", 7)
     with pytest.raises(ValueError, match=r"0\.bvh: the body is about .* tall .* give the metres"):
@@ -310,7 +310,7 @@ def test_recordings_that_nobody_divided_are(people):
 
     assert [clip.key for clip in both.divided(0.5, 30)] == [("train", "a-b-x"), ("test", "c-x")]  # too short for parts
     assert [clip.split for clip in alone.divided(0.5, 30)] == ["train"]
-    with pytest.raises(ValueError, match="the part for test is 1"):
+    with pytest.raises(ValueError, match="the share for test is 1"):
         alone.divided(1)
 
 

@@ -35,7 +35,7 @@ def recordings(three, tmp_path_factory):
 
 def test_formats_and_names_fit_each_other_or_are_refused(three, tmp_path):
     for path, format, message in (
-        ("a.bvh", None, "holds one clip a file, and there are 3"),
+        ("a.bvh", None, "stores one clip per file, but there are 3"),
         ("a", None, "which format.*--format"),
         ("a.csv", "bvh", "which format"),
         ("a", "npz", "end its name in .npz"),
@@ -161,7 +161,7 @@ def test_archives_of_clips_are_joined(three, tmp_path, capsys):
     write_motion(tmp_path / "a.bvh", replace(three, clips=[three.clips[0]]))
     for other, message in (
         (tmp_path / "a.bvh", "is an archive of clips and"),  # which was left out without a word
-        (paths[0], "is there twice"),
+        (paths[0], "have the clip name"),
         (folder / "z.npz", "z is up, and y in"),
     ):
         save(folder / "z.npz", MotionSet([three.clips[0]], replace(WALKER, up="z")))

@@ -220,5 +220,5 @@ class TestLimits:
             estimate_angle_limits(pose(WALKER), WALKER, quantile=0.5)
         with pytest.raises(ValueError, match="at least one"):
             estimate_angle_limits(torch.zeros(0, 48), WALKER)
-        with pytest.raises(ValueError, match="above the upper ones, or no numbers: b"):
+        with pytest.raises(ValueError, match="exceed upper ones, or are not numbers: b"):
             AngleLimits(("a", "b"), torch.tensor([0.0, 1.0]), torch.tensor([0.0, torch.nan]))

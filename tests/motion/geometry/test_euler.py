@@ -135,19 +135,22 @@ def test_positions_are_scored_by_the_turns_that_they_show_on_both_sides(people, 
 
 def test_what_it_refuses(people, windows):
     for options, message in (
-        ({"times": (80, 1000)}, "nearest to 1000 ms: windows of simulated go on for 12 frames at 30 a second, 400 ms"),
+        ({"times": (80, 1000)}, "nearest to 1000 ms: windows of simulated have 12 frames at 30 a second, 400 ms"),
         ({"times": ()}, "nearest to no time"),
-        ({"counts": (0, 5)}, "at least one future"),
-        ({"models": {"near": Shifts(windows, 0.1)}}, "a model of positions makes no turns; score it with inverse=True"),
+        ({"counts": (0, 5)}, "at least one, got"),
+        (
+            {"models": {"near": Shifts(windows, 0.1)}},
+            "a model of positions predicts no rotations; score it with inverse=True",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             euler_errors(**{"models": {}, "windows": windows, "times": TIMES, "progress": False, **options})
     plain = motion.windows(people, replace(PROTOCOL, representation="positions"), "test")
-    with pytest.raises(ValueError, match="of positions, which do not tell all turns"):
+    with pytest.raises(ValueError, match="have positions, which do not determine all rotations"):
         Angles(plain, TIMES)
     bare = motion.simulate(clips=6, frames=40, test=0.4)
-    with pytest.raises(ValueError, match=r"no rest pose, .* MotionSet.with_rotations\(\) finds both"):
+    with pytest.raises(ValueError, match=r"no rest pose, .* MotionSet.with_rotations\(\) computes both"):
         Angles(motion.windows(bare, replace(PROTOCOL, representation="positions"), "test"), TIMES, inverse=True)
     lacking = motion.windows(motion.occlude(bare, 0.2, 5.0), replace(PROTOCOL, representation="positions"), "test")
-    with pytest.raises(ValueError, match="a joint that is missing leaves the turns of others open"):
+    with pytest.raises(ValueError, match="a missing joint leaves the rotations of others undetermined"):
         Angles(lacking, TIMES, inverse=True)

@@ -166,7 +166,7 @@ def test_bounds_of_turns_do_not_compare_with_those_of_positions(people_of_two_si
     turns, positions = windows(people_of_two_sizes, representation="6d"), windows(people_of_two_sizes)
     models = {"turns": small(turns), "positions": small(positions)}
     with pytest.raises(
-        ValueError, match=r"those of turns, of turns of joints \(6d\) and those of positions, of the data"
+        ValueError, match=r"bounds of turns, of turns of joints \(6d\) and bounds of positions, of the data"
     ):
         dvae.compare(models, positions, particles=2, samples=0, progress=False)
     table = dvae.evaluate(models, positions, samples=2, references=False, progress=False)

@@ -115,7 +115,7 @@ def test_vectors_go_on_beyond_half_a_turn(turns):
     ("call", "message"),
     [
         (lambda: rotations.size("euler-abc"), "no form 'euler-abc'"),
-        (lambda: rotations.from_matrix(torch.eye(3), "euler-xxy"), "not every rotation"),
+        (lambda: rotations.from_matrix(torch.eye(3), "euler-xxy"), "cannot represent every rotation"),
         (lambda: rotations.to_matrix(torch.zeros(2, 5), "6d"), "6d has 6 numbers, got \\(2, 5\\)"),
         (lambda: rotations.from_matrix(torch.zeros(2, 9), "6d"), "expected matrices"),
     ],
@@ -212,7 +212,7 @@ def test_a_set_is_given_rotations_that_make_its_positions(tmp_path):
     assert Skeleton.from_json(tmp_path / "skeleton.json") == body
     for change, message in (
         (lambda turns: turns[:, :-1], r"rotations \(20, 16, 4\), expected quaternions \(20, 17, 4\)"),
-        (lambda turns: 2 * turns, "no quaternions of unit length"),
+        (lambda turns: 2 * turns, "not unit quaternions"),
     ):
         with pytest.raises(ValueError, match=message):
             MotionSet([replace(clip, rotations=change(clip.rotations))], body)

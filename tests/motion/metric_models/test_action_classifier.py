@@ -148,21 +148,21 @@ def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsy
     ("call", "message"),
     [
         (lambda: ActionClassifier(hidden=0), "hidden is 0; it must be at least 1"),
-        (lambda: ActionClassifier().build({"x": 48}), "needs to know what poses are, and was given sequences"),
+        (lambda: ActionClassifier().build({"x": 48}), "needs the description of poses, but was given sequences"),
         (
             lambda: ActionClassifier().resolve_defaults(windows("train")),
             "have nothing for the label 'content'.* are way, who",
         ),
         (
             lambda: ActionClassifier(**SMALL).resolve_defaults(windows("train", people(ways=("up", "up")))),
-            "nothing to tell apart: training clips have up for",
+            "needs two classes: training clips have up for",
         ),
         (
             lambda: ActionClassifier(**SMALL, classes=("up", "left")).train(windows("test")),
             "clip test/person_.* has 'down' for 'way', expected one of up, left",
         ),
-        (lambda: classifier().model({"x": draw(2, 10, 48)}), "the batch lacks 'c'"),
-        (lambda: classifier().features(draw(2, 9, 51)), "frames have 51 numbers; .* fitted to frames of 48"),
+        (lambda: classifier().model({"x": draw(2, 10, 48)}), "the batch has no 'c'"),
+        (lambda: classifier().features(draw(2, 9, 51)), "frames have 51 numbers, .* fitted to frames of 48"),
     ],
 )
 def test_what_it_refuses(call, message):
@@ -238,7 +238,7 @@ def test_classes_that_it_does_not_know_count_for_fid_alone_and_the_record_says_s
         (lambda: windows("test", protocol=replace(SHORT, predicted=5)), "fitted to 6 predicted frames at .* have 5 at"),
         (
             lambda: windows("test", motion.simulate(clips=9, frames=40, test=0.4)),
-            "tells ways apart, but no label 'way'",
+            "distinguishes ways, but no label 'way'",
         ),
         (lambda: windows("test", people(3), replace(SHORT, test_stride=99)), "these are 1 windows of 1 clips"),
     ],

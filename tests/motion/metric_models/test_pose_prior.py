@@ -122,7 +122,7 @@ def test_a_fitted_prior_is_read_back_and_goes_on(run, people, tmp_path, capsys):
         (lambda: PosePrior(layers=0), "layers is 0; it must be at least 1"),
         (lambda: PosePrior(noise=-0.1), "noise is -0.1; it must be at least 0 and below 1"),
         (lambda: PosePrior(turned=True, heading=True), "heading fixes the direction that turned would draw"),
-        (lambda: PosePrior().build({"x": 48}), "needs to know what poses are, and was given sequences"),
+        (lambda: PosePrior().build({"x": 48}), "needs the description of poses, but was given sequences"),
     ],
 )
 def test_what_it_refuses(run, message):

@@ -111,7 +111,7 @@ def test_who_faces_where_and_where_the_pelvis_is_tell_nobody_apart(people):
         torch.testing.assert_close(metric_model.logits(other.flatten(-2)), metric_model.logits(x))
     assert metric_model.logits(x).std() > 0
     assert (fixed.logits(turned.flatten(-2)) != fixed.logits(x)).all()
-    with pytest.raises(ValueError, match="frames have 5 numbers; those of the skeleton 'walker' have 51, or 48"):
+    with pytest.raises(ValueError, match="frames have 5 numbers; expected 51 for the skeleton 'walker', or 48"):
         metric_model.logits(x[..., :5])
 
 
@@ -136,7 +136,7 @@ def test_what_it_refuses(people):
     lacking = motion.windows(motion.occlude(motion.simulate(8, 40, test=0.5), 0.2, 5.0), SHORT, "test")
     for options, message in (
         ({"people": {**people, "test": other}}, "training and test windows differ in skeleton or frames"),
-        ({"people": {**people, "test": lacking}}, "these lack joints; fill the gaps first"),
+        ({"people": {**people, "test": lacking}}, "these have missing joints; fill the gaps"),
         ({"seeds": ()}, "at least one example and one seed"),
         ({"models": {"zero velocity": noise}, "references": True}, "must not have the name of a reference row: zero"),
     ):
@@ -145,7 +145,7 @@ def test_what_it_refuses(people):
     with pytest.raises(FloatingPointError, match="the forecast of broken is not finite"):
         judged({"broken": lambda x, horizon: noise(x, horizon) / 0}, people)
     with pytest.raises(
-        ValueError, match="a metric model of quality needs to know what poses are, and was given sequences"
+        ValueError, match="a metric model of quality needs the description of poses, but was given sequences"
     ):
         RealOrGenerated().build({"x": 48})
 

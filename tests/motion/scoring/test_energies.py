@@ -110,7 +110,7 @@ class TestEveryEnergy:
         with pytest.raises(ValueError, match="with no size 0"):
             energy(normal(0, B, T, D), **SEQUENCES)
         if energy not in [ENERGIES[name] for name in OF_SAMPLES]:
-            with pytest.raises(ValueError, match="beside samples"):
+            with pytest.raises(ValueError, match="for samples of shape"):
                 energy(normal(S, B + 1, T, D), **SEQUENCES)
 
     @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ class TestEveryEnergy:
             ),
             (
                 lambda x: joint_angles(x[..., :42], LIMITS, HUMANEVA),
-                "limits of the angles Spine2Hip, .* expected those of skeleton 'humaneva'",
+                "limits of the angles Spine2Hip, .* expected the angles of skeleton 'humaneva'",
             ),
         ],
     )

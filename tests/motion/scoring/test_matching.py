@@ -69,7 +69,7 @@ def test_ends_that_files_do_not_name_are_what_bones_lead_to():
 
 def test_what_is_not_found_is_listed_and_can_be_told():
     names = ["Paw" if name == "LWrist" else name for name in WALKER.names]
-    with pytest.raises(ValueError, match=r"no joint is LWrist of skeleton 'walker'; there are .*Paw"):
+    with pytest.raises(ValueError, match=r"no joint matches LWrist of skeleton 'walker'; there are .*Paw"):
         match(names, WALKER)
     assert match(names, WALKER, {"Paw": "LWrist"}) == list(range(17))
     for told, message in (({"Pfote": "LWrist"}, "no joint 'Pfote'"), ({"Paw": "Wrist"}, "has no joint 'Wrist'")):
@@ -84,9 +84,9 @@ def test_kept_joints_hang_from_the_nearest_kept_ancestor():
     assert (renamed.names, renamed.parents) == (("hips", "top"), (-1, 0))
     assert Kept.of(WALKER.names, WALKER.parents, [3, 0]).names == ("RFoot", "Pelvis")
     for wrong, message in (
-        (["LFoot", "RFoot"], "these hang from LFoot, RFoot"),
+        (["LFoot", "RFoot"], "their roots are LFoot, RFoot"),
         (["Leg"], "no joint 'Leg'"),
-        ([0, 0], "is none of 17, or there twice"),
+        ([0, 0], "is not one of 17, or occurs twice"),
     ):
         with pytest.raises(ValueError, match=message):
             Kept.of(WALKER.names, WALKER.parents, wrong)

@@ -130,7 +130,7 @@ def test_limbs_without_length_make_no_nan(people):
 
 
 def test_what_has_no_future_or_heading_is_refused(people, windows, truths):
-    for options, message in (({"threshold": 0}, "distance above 0"), ({"most": 0}, "numbers from 1")):
+    for options, message in (({"threshold": 0}, "threshold above 0"), ({"most": 0}, "stride of at least 1")):
         with pytest.raises(ValueError, match=message):
             PseudoTruths(windows, **options)
     with pytest.raises(ValueError, match="no future"):

@@ -240,7 +240,7 @@ def test_recovered_segments_are_compared_with_the_truth_and_become_motion(model)
         assert abs(clip.positions[:shorter] - theirs.positions[:shorter]).max() < 0.02
     for table in found.table().renderables:
         assert [str(cell) for cell in table.columns[0].cells] == ["a/first", "b/second"]
-    with pytest.raises(ValueError, match="nothing was seen of segment 1 of 2"):
+    with pytest.raises(ValueError, match="segment 1 of 2, counted from 0, has no observations"):
         recover(model, {**seen, "markers": seen["markers"] * torch.tensor([1.0, torch.nan])[:, None, None, None]}, keys)
 
 
@@ -249,12 +249,12 @@ def test_what_cannot_have_been_seen_is_refused(model):
     seen = simulate_observations(model, x, shape, "markers", frames=[0, 50])
     program = SegmentCompletion(model)
     for wrong, message in (
-        ({**seen, "marker": seen["markers"]}, "nothing to be seen called marker"),
-        ({"frames": seen["frames"]}, "some of surfaces, points and markers"),
-        ({"markers": seen["markers"]}, "at moments"),
+        ({**seen, "marker": seen["markers"]}, "unknown observations marker"),
+        ({"frames": seen["frames"]}, "expected observations surfaces, points or markers"),
+        ({"markers": seen["markers"]}, "with their moments"),
         ({**seen, "markers": seen["markers"][:, :, :5]}, r"markers has shape \(2, 2, 5, 3\), expected \(2, 2, 16, 3\)"),
         ({**seen, "frames": seen["frames"] + 60}, "from 0 to 99, got 60 to 110"),
-        ({**seen, SHAPE: shape * torch.nan}, "beta is known of all segments"),
+        ({**seen, SHAPE: shape * torch.nan}, "beta must be given for all segments"),
     ):
         with pytest.raises(ValueError, match=message):
             program.read(wrong)

@@ -59,7 +59,9 @@ def test_who_stands_or_marches_on_one_leg_walks_no_cycle():
     assert not find_cycles(replace(walk(), rotations=lame), SKELETON, references, Cycles())
     with pytest.raises(ValueError, match=r"people has no gait cycle of 0.3 to 3 s whose hips are within 0.25 rad"):
         gait_cycles(of(still), references)
-    with pytest.raises(ValueError, match=r"in no clip of people legs swing by 0.2 rad and more, twice .* references="):
+    with pytest.raises(
+        ValueError, match=r"no clip of people has legs that swing by at least 0.2 rad, twice .* references="
+    ):
         reference_cycles(of(still))
 
 
@@ -116,12 +118,15 @@ def test_what_cannot_be_cut_is_refused():
         (lambda: find_cycles(clip, replace(SKELETON, left=()), references, Cycles()), "has no left and right joints"),
         (
             lambda: find_cycles(clip, armless, references, Cycles()),
-            "has no joint below LHip, so nobody sees legs swing",
+            "has no joint below LHip, so leg swings cannot be measured",
         ),
-        (lambda: gait_cycles(bare, references), r"clip train/walk has no turns of joints; MotionSet.with_rotations"),
+        (
+            lambda: gait_cycles(bare, references),
+            r"clip train/walk has no rotations of joints; MotionSet.with_rotations",
+        ),
         (
             lambda: gait_cycles(people, references, Cycles(rate=25.0)),
-            "a reference has 30 frames a second, and cycles 25",
+            "a reference has 30 frames a second, expected 25",
         ),
         (lambda: Cycles(shortest=2.0, longest=1.0), "expected the shorter first"),
     ):

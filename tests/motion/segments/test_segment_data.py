@@ -82,7 +82,7 @@ def test_clips_are_segments_as_they_are_where_they_last_as_long_as_one():
     data = SegmentData("simulated", replace(PEOPLE, clips=clips), "clips")
     assert [clip.frames for clip in data.segments] == [clip.frames for clip in clips if clip.frames > 9]
     assert data.fingerprint != replace(data, cut="gait").fingerprint
-    with pytest.raises(ValueError, match=r"no clip that lasts 0\.3 to 3 s.*cut='gait' finds the gait cycles"):
+    with pytest.raises(ValueError, match=r"no clip of 0\.3 to 3 s.*cut='gait' finds the gait cycles"):
         assert SegmentData("simulated", replace(PEOPLE, clips=clips[:1]), "clips").segments
 
 
@@ -98,8 +98,8 @@ def test_takes_that_nobody_divided_are_whole_in_a_split(count, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda config: config["sizes"].update(turns=10**6), "sizes are .*, and such segments have"),
-        (lambda config: config["timed"]["skeleton"].update(up="z"), "is not that of the body that ships"),
+        (lambda config: config["sizes"].update(turns=10**6), "sizes are .*, expected .* for such segments"),
+        (lambda config: config["timed"]["skeleton"].update(up="z"), "must be the skeleton of the supplied body"),
         (lambda config: config["timed"].update(frames=10**9), "frames is 1000000000; it must be"),
         (lambda config: config["timed"]["references"][0].update(hips=[[1, 0, 0, 0]]), "hips of a reference are"),
     ],

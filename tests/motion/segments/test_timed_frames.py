@@ -102,7 +102,7 @@ def test_what_is_no_segment_is_refused(people):
     stranger = replace(people, skeleton=replace(skeleton, names=tuple(map(str, range(17)))))
     lost = torch.zeros(1, 100, 76).index_put((torch.tensor(0),) * 3, torch.tensor(torch.nan))
     for call, message in (
-        (lambda: view.to(bare), r"train/person_0000 has no turns of joints; MotionSet.with_rotations"),
+        (lambda: view.to(bare), r"train/person_0000 has no rotations of joints; MotionSet.with_rotations"),
         (lambda: view.to(replace(people, clips=[people.clips[0].between(4, 5)])), "has 1 frame, expected at least 2"),
         (lambda: view.to(stranger), "alike brings two sources onto one tree"),
         (lambda: view.back({"x": torch.zeros(1, 99, 76)}), r"expected \(..., 100, 76\)"),
@@ -139,5 +139,5 @@ def test_bones_that_leave_one_joint_and_bend_get_joints_of_their_own(people):
     views = [TimedFrames.of(each) for each in (bent, straight)]
     off = [largest(each, view.back(view.to(each))) for each, view in zip((bent, straight), views, strict=True)]
     assert off[1] < 2e-3 < 0.02 < off[0]
-    with pytest.raises(ValueError, match="has rotations; joints are added where turns are still to be found"):
+    with pytest.raises(ValueError, match="has rotations; joints can only be added to complete poses"):
         people.loosened()
