@@ -108,7 +108,7 @@ def show(
         OUT.print(found.table())
         OUT.print(found.verdict)
     else:
-        why = "all latents are summed out" if summed else "nothing is latent"
+        why = "all latents are summed out" if summed else "the model has no latents"
         OUT.print(f"{why}: there is no guide, and the bound is the log evidence")
     if method is not None:
         OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)

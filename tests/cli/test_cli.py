@@ -64,7 +64,7 @@ def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
     assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
     assert "exact: the guide reads everything" in shown(*EQUATIONS)
     assert "q(z_t | z_{t-1}, x_{>=t})" in shown(*EQUATIONS[:2])
-    assert "has no latents" in shown("--generative", "p(x_t | x_{<t})", "--inference", "")
+    assert "the model has no latents" in shown("--generative", "p(x_t | x_{<t})", "--inference", "")
 
 
 @pytest.mark.parametrize(
@@ -268,7 +268,7 @@ def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
     assert "no joint 'RPaw'" in failure(capsys, "evaluate", str(tracker), "--joints", "RPaw", *out)
     error = failure(capsys, "evaluate", str(fitted), "--joints", "RFoot", *out, code=2)
     assert "are for methods that take trajectories" in error
-    assert "are given no joints" in failure(capsys, "evaluate", str(tracker), "--exchange", ".01", *out)
+    assert "1 observed frames and no given joints" in failure(capsys, "evaluate", str(tracker), "--exchange", ".01", *out)
     assert main(["evaluate", str(tracker), "--joints", "RFoot", "--samples", "2", "--exchange", "2"]) == 0
     assert dvae.Evaluation.load(tracker / "evaluation-RFoot-exchanged-2.json").data["exchanged"]["threshold"] == 2
 

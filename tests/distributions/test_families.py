@@ -180,7 +180,7 @@ def test_a_product_is_its_parts():
     assert whole.support.check(value).all()
     assert not whole.support.check(value - 100)[..., 1:3].any()
     twice = distributions.Product((((0, 1), distributions.Normal()), ((1,), distributions.Normal())))
-    with pytest.raises(ValueError, match="coordinates"):
+    with pytest.raises(ValueError, match="each coordinate 0 to 3 of x exactly once"):
         twice.build(Shape(4, 5, name="x"))
     with pytest.raises(ValueError, match="density"):
         distributions.Product((((0, 1), distributions.Delta()),)).build(Shape(2, 2, name="x"))

@@ -52,8 +52,8 @@ def told(read, path):
 BROKEN = {
     "no object": ([1, 2], "expected JSON with joint_names and parents"),
     "nothing": (None, "expected JSON with joint_names and parents"),
-    "no names": ({"parents": [-1]}, "lacks joint_names"),
-    "no parents": ({"joint_names": ["a"]}, "lacks parents, found joint_names"),
+    "no names": ({"parents": [-1]}, "joint_names is missing"),
+    "no parents": ({"joint_names": ["a"]}, "parents is missing, found joint_names"),
     "names as text": ({"joint_names": "abcd"}, "names is 'abcd', expected a list of text"),
     "names as an object": ({"joint_names": {"a": 1}}, "expected a list of text"),
     "names as numbers": ({"joint_names": [1, 2, 3, 4]}, "names has 1 at place 0, expected text"),

@@ -50,8 +50,8 @@ class ExchangedWindows:
         if not windows.given_joints or windows.protocol.observed != 1:
             raise ValueError(
                 "poses are exchanged among windows with one observed pose and the same given joints, as in "
-                f"windows.given(['LWrist']); these have {windows.protocol.observed} observed frames, and given are "
-                f"{', '.join(windows.given_joints or ()) or 'no joints'}"
+                f"windows.given(['LWrist']); these have {windows.protocol.observed} observed frames and "
+                f"{', '.join(windows.given_joints or ()) or 'no'} given joints"
             )
         if windows.missing:
             raise ValueError(
