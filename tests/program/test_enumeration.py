@@ -145,7 +145,7 @@ def test_the_oracle_counts_all_courses():
     torch.testing.assert_close(oracle.evidence(x), sum(pair.log_joint(x, {}).values()), rtol=0, atol=1e-10)
     torch.testing.assert_close(oracle.bound(x), oracle.evidence(x))
     mask = torch.rand_like(x) < 0.6
-    with pytest.raises(ValueError, match="state sequences in .* steps, but at most"):
+    with pytest.raises(ValueError, match="cannot be summed out"):
         oracle.evidence({"x": x, "mask": mask})
     hidden = dvae.linear_gaussian_surrogate(*HMM, {"k": Discrete(3), "x": 1}, 3)
     for each, batch in ((pair, {"x": x}), (hidden, {"x": x, "mask": mask})):
@@ -168,7 +168,7 @@ def test_the_oracle_counts_all_courses():
     wild = dvae.linear_gaussian_surrogate("p(k_t | x_{t-1}) p(x_t | k_t)", "", {"k": Discrete(2), "x": 1}, 3)
     with pytest.raises(ValueError, match="oracle needs"):
         dvae.Oracle(wild, 3)
-    with pytest.raises(ValueError, match="courses"):
+    with pytest.raises(ValueError, match="state sequences"):
         build(HMM, {"k": 2}).sums.state_sequences(40)
 
 
