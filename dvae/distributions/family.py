@@ -348,9 +348,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
         to = _transform(constraint)
         forms[key] = tuple(to.inverse_shape(torch.Size(size))), to, size
     if not forms:
-        raise ValueError(
-            f"no parameter of {name} is left to be read or learned; it has {', '.join(constraints)}"
-        )
+        raise ValueError(f"no parameter of {name} is left to be read or learned; it has {', '.join(constraints)}")
     return forms
 
 

@@ -168,7 +168,7 @@ def test_the_oracle_counts_all_courses():
     wild = dvae.linear_gaussian_surrogate("p(k_t | x_{t-1}) p(x_t | k_t)", "", {"k": Discrete(2), "x": 1}, 3)
     with pytest.raises(ValueError, match="oracle needs"):
         dvae.Oracle(wild, 3)
-    with pytest.raises(ValueError, match="courses"):
+    with pytest.raises(ValueError, match="state sequences"):
         build(HMM, {"k": 2}).sums.state_sequences(40)
 
 
