@@ -120,7 +120,7 @@ __all__ = [
     "views",
 ]
 
-_PLACES = {
+_MODULES = {
     name: module
     for module, names in {
         "data": "views",
@@ -163,7 +163,7 @@ _PLACES = {
 
 
 if not TYPE_CHECKING:  # type checkers read the imports above
-    __getattr__ = importing(__name__, _PLACES)
+    __getattr__ = importing(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:

@@ -11,18 +11,18 @@ from torch import Tensor
 
 @lru_cache(maxsize=4096)
 @torch.inference_mode(False)  # a constant first requested in inference mode must still work under autograd
-def _made(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _cached_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor(values, dtype=dtype, device=device)
 
 
 def constant(values: Any, like: Tensor) -> Tensor:
     """Return numbers, or nested tuples of them, with the dtype and device of `like`. Do not modify the tensor."""
-    return _made(values, like.dtype, like.device)
+    return _cached_tensor(values, like.dtype, like.device)
 
 
 def indices(values: Any, like: Tensor) -> Tensor:
     """Return indices along an axis, for `index_select`, on the device of `like`."""
-    return _made(tuple(values), torch.long, like.device)
+    return _cached_tensor(tuple(values), torch.long, like.device)
 
 
 @lru_cache(maxsize=32)  # small, because the mask of a long series is large

@@ -46,7 +46,7 @@ def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bo
     """
     path = Path(path)
     if not links and path.is_symlink():
-        raise FileRefused(f"{path} is a link, which could lead to any file; put the file itself in its place")
+        raise FileRefused(f"{path} is a link, which could lead to any file; replace it by the file itself")
     try:
         number = os.open(path, flags | (_PLAIN & ~getattr(os, "O_NOFOLLOW", 0) if links else _PLAIN), 0o666)
     except OSError as error:
@@ -70,12 +70,14 @@ def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise FileRefused(f"{path} has {size} bytes, and can rightly have {most} at most")
-        parts, left = [], most + 1
-        while left and (part := file.read(min(left, 1 << 24))):  # the file may have grown or shrunk since fstat
+        parts, remaining = [], most + 1
+        while remaining and (
+            part := file.read(min(remaining, 1 << 24))
+        ):  # the file may have grown or shrunk since fstat
             parts.append(part)
-            left -= len(part)
-    if not left:
-        raise FileRefused(f"{path} grows while it is read, beyond {most} bytes")
+            remaining -= len(part)
+    if not remaining:
+        raise FileRefused(f"{path} grew beyond {most} bytes while it was read")
     return b"".join(parts)
 
 
@@ -98,9 +100,9 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
 
 def write_all(file: BinaryIO, content: bytes) -> None:
     """Write all content to an unbuffered file, which may accept it in several parts."""
-    left = memoryview(content)
-    while left:
-        left = left[file.write(left) :]
+    remaining = memoryview(content)
+    while remaining:
+        remaining = remaining[file.write(remaining) :]
 
 
 @contextmanager
@@ -131,14 +133,14 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 @contextmanager
 def create_folder(folder: Path) -> Iterator[None]:
     """Create a folder and its parents; if the block fails, remove the created folders that are empty."""
-    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
         yield
     except BaseException:
-        for each in missing:
+        for path in missing:
             with suppress(OSError):
-                each.rmdir()
+                path.rmdir()
         raise
 
 
@@ -151,7 +153,7 @@ def remove_leftovers(folder: Path) -> None:
     """Remove temporary files and folders that killed processes of this machine left in a folder."""
     with suppress(OSError):
         for path in [Path(entry) for entry in os.scandir(folder) if entry.name.startswith(".")]:
-            if (found := _TEMPORARY.fullmatch(path.name)) and not _is_running(int(found[1])):
+            if (match := _TEMPORARY.fullmatch(path.name)) and not _is_running(int(match[1])):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
                 else:

@@ -22,13 +22,13 @@ def importing(package: str, places: Mapping[str, str] | None = None) -> Callable
     def find(name: str) -> Any:
         with no_fork:
             if places and name in places:
-                found = getattr(import_module(f"{package}.{places[name]}"), name)
+                value = getattr(import_module(f"{package}.{places[name]}"), name)
             elif name.startswith("_") or find_spec(f"{package}.{name}") is None:
                 raise AttributeError(f"module {package!r} has no attribute {name!r}")
             else:
-                found = import_module(f"{package}.{name}")
-        setattr(sys.modules[package], name, found)
-        return found
+                value = import_module(f"{package}.{name}")
+        setattr(sys.modules[package], name, value)
+        return value
 
     return find
 

@@ -21,7 +21,7 @@ SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
 """The table that Pyro appends to an error raised inside a program."""
 
 
-class _Alone(ContextDecorator):
+class _ProgramLock(ContextDecorator):
     """A reentrant lock, usable as a context manager or a decorator."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class _Alone(ContextDecorator):
         if error is not None and error.args and isinstance(error.args[0], str):
             error.args = (SHAPES.sub("", error.args[0]), *error.args[1:])
 
-    def _leave_to_the_parent(self) -> None:
+    def _reset_in_child(self) -> None:
         """Replace a lock held by a thread of the parent process, which does not exist in a forked child."""
         if self._lock.acquire(blocking=False):
             self._lock.release()
@@ -46,7 +46,7 @@ class _Alone(ContextDecorator):
         _PYRO_STACK.clear()
 
 
-serialized = _Alone()
+serialized = _ProgramLock()
 
 
 @contextmanager
@@ -69,4 +69,4 @@ no_fork = threading.RLock()
 """A lock held during imports: a child forked during an import would wait forever for the lock of the module."""
 if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(before=no_fork.acquire, after_in_parent=no_fork.release, after_in_child=no_fork.release)
-    os.register_at_fork(after_in_child=serialized._leave_to_the_parent)
+    os.register_at_fork(after_in_child=serialized._reset_in_child)

@@ -100,46 +100,54 @@ def require(hint: Any, **values: Any) -> None:
 def problem(name: str, value: Any, hint: Any) -> Exception | None:
     """Return the error for a value that does not match its type, or None if it does."""
     origin, arguments = get_origin(hint), get_args(hint)
-    given = f"{name} is {reprlib.repr(value)}"
+    message = f"{name} is {reprlib.repr(value)}"
     if origin is Annotated:
         ranges = [each for each in arguments[1:] if isinstance(each, Range)]
-        found = problem(name, value, arguments[0])
-        if found is None and ranges and value not in ranges[0]:
-            found = ValueError(f"{given}; it must be {ranges[0]}")
-        return found
+        error = problem(name, value, arguments[0])
+        if error is None and ranges and value not in ranges[0]:
+            error = ValueError(f"{message}; it must be {ranges[0]}")
+        return error
     if origin in (Union, UnionType):
         problems = [problem(name, value, each) for each in arguments]
-        own = [each for each, hint in zip(problems, arguments, strict=True) if hint is not NoneType]
-        return None if None in problems else next((each for each in own if isinstance(each, ValueError)), own[0])
+        errors = [each for each, hint in zip(problems, arguments, strict=True) if hint is not NoneType]
+        return None if None in problems else next((each for each in errors if isinstance(each, ValueError)), errors[0])
     if origin is Literal:
         if any(type(value) is type(each) and value == each for each in arguments):
             return None
-        meant = nearest(value, filter(lambda each: isinstance(each, str), arguments)) if isinstance(value, str) else ""
-        return ValueError(f"unknown {name} {reprlib.repr(value)}{meant}; known: {', '.join(map(str, arguments))}")
+        suggestion = (
+            nearest(value, filter(lambda each: isinstance(each, str), arguments)) if isinstance(value, str) else ""
+        )
+        return ValueError(f"unknown {name} {reprlib.repr(value)}{suggestion}; known: {', '.join(map(str, arguments))}")
     if origin is tuple:
         return _problem_of_entries(name, value, arguments)
     if hint is int:
         if not isinstance(value, Integral) or isinstance(value, bool):
-            return TypeError(f"{given}; it must be a whole number")
+            return TypeError(f"{message}; it must be a whole number")
         return (
-            None if -(2**63) <= int(value) < 2**63 else ValueError(f"{given}; it must be at least -2^63 and below 2^63")
+            None
+            if -(2**63) <= int(value) < 2**63
+            else ValueError(f"{message}; it must be at least -2^63 and below 2^63")
         )
     if hint is float:
         if not isinstance(value, Real):
-            return TypeError(f"{given}; it must be a number")
-        whole = isinstance(value, Integral) and abs(int(value)) > sys.float_info.max
-        return ValueError(f"{given}; it must be a number that a float holds") if whole or value != value else None
+            return TypeError(f"{message}; it must be a number")
+        too_large = isinstance(value, Integral) and abs(int(value)) > sys.float_info.max
+        return (
+            ValueError(f"{message}; it must be a finite number in the range of a float")
+            if too_large or value != value
+            else None
+        )
     kind = origin or hint
     if getattr(kind, "_is_protocol", False):  # not checked: unrelated objects may match its structure
         return None
     if isinstance(kind, type) and kind is not Any and not isinstance(value, kind):
-        return TypeError(f"{given}; it must be {'true or false' if kind is bool else 'of type ' + kind.__name__}")
+        return TypeError(f"{message}; it must be {'true or false' if kind is bool else 'of type ' + kind.__name__}")
     if isinstance(value, str | Mapping) and len(value) > LONGEST:
-        return ValueError(f"{given}, with {len(value)} characters or entries; it must have {LONGEST} at most")
+        return ValueError(f"{message}, with {len(value)} characters or entries; it must have {LONGEST} at most")
     if isinstance(value, Mapping) and len(arguments) == 2:
         parts = [(f"{name}'s key", key, arguments[0]) for key in value]
         parts += [(f"{name}[{key!r}]", item, arguments[1]) for key, item in value.items()]
-        return next((found for part in parts if (found := problem(*part)) is not None), None)
+        return next((error for part in parts if (error := problem(*part)) is not None), None)
     return None
 
 
@@ -174,8 +182,10 @@ def kind_of(value: Any) -> str:
 
 def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Exception | None:
     if not isinstance(value, tuple | list):
-        one = hints[1:] == (Ellipsis,) and problem(name, value, hints[0]) is None
-        return TypeError(f"{name} is {reprlib.repr(value)}; it must be a tuple{f', such as {(value,)}' if one else ''}")
+        is_entry = hints[1:] == (Ellipsis,) and problem(name, value, hints[0]) is None
+        return TypeError(
+            f"{name} is {reprlib.repr(value)}; it must be a tuple{f', such as {(value,)}' if is_entry else ''}"
+        )
     if hints[1:] == (Ellipsis,):
         longest = LONGEST if hints[0] is str else DEEPEST
         if len(value) > longest:
@@ -183,8 +193,8 @@ def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Except
         hints = hints[:1] * len(value)
     if len(value) != len(hints):
         return ValueError(f"{name} is {reprlib.repr(value)}; it must have {len(hints)} entries")
-    problems = (problem(f"{name}[{place}]", *each) for place, each in enumerate(zip(value, hints, strict=True)))
-    return next((found for found in problems if found is not None), None)
+    problems = (problem(f"{name}[{index}]", *entry) for index, entry in enumerate(zip(value, hints, strict=True)))
+    return next((error for error in problems if error is not None), None)
 
 
 @cache

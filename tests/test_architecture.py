@@ -201,7 +201,7 @@ def test_what_is_shown_is_found_where_it_is_imported_from():
     imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level]
     places = {alias.name: node.module for node in imported for alias in node.names}
     del places["importing"]
-    assert places == {name: dvae._PLACES.get(name) for name in dvae.__all__}
+    assert places == {name: dvae._MODULES.get(name) for name in dvae.__all__}
     assert set(dvae.__all__) <= set(dir(dvae))
 
 

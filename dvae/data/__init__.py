@@ -20,7 +20,7 @@ __all__ = [
     "time_since_previous",
 ]
 
-_PLACES = dict.fromkeys(__all__, "sequences") | {"Batch": "batch", "Schema": "schema", "SchemaError": "schema"}
+_MODULES = dict.fromkeys(__all__, "sequences") | {"Batch": "batch", "Schema": "schema", "SchemaError": "schema"}
 
 if not TYPE_CHECKING:
-    __getattr__ = importing(__name__, _PLACES)
+    __getattr__ = importing(__name__, _MODULES)

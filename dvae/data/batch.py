@@ -25,7 +25,7 @@ class Batch(dict[str, Any]):
 
     reserved: ClassVar[tuple[str, ...]] = ("lengths", "mask", "group", "log_det", "view_inputs")
     reader: Any = None
-    """Mark of the model that has read the batch and need not read it again; None after an entry was set."""
+    """Identifier of the model that has read the batch and need not read it again; None after an entry was set."""
 
     @property
     def lengths(self) -> Any:
@@ -50,8 +50,8 @@ class Batch(dict[str, Any]):
     @property
     def view_inputs(self) -> Mapping[str, Any]:
         """Additional inputs of some views, by name; models do not read them."""
-        found: Mapping[str, Any] = self.get("view_inputs", {})
-        return found
+        inputs: Mapping[str, Any] = self.get("view_inputs", {})
+        return inputs
 
     @property
     def partial(self) -> bool:
@@ -84,22 +84,22 @@ class Batch(dict[str, Any]):
 
     def rows(self, which: Any) -> Batch:
         """Return some of the sequences, by a slice or an index."""
-        found = self.map(lambda value: value[which])
-        found.reader = self.reader
-        return found
+        selected = self.map(lambda value: value[which])
+        selected.reader = self.reader
+        return selected
 
     def past(self, observed: int) -> Batch:
-        """Return the batch as forecasts see it: all context, and the first frames of x, its mask and `view_inputs`."""
-        known = Batch({name: self[name] for name in (WHOLE, "mask", "view_inputs") if name in self})
-        return self | known.map(lambda value: value[:, :observed])
+        """Return the input of a forecast: all context, and the first frames of x, its mask and `view_inputs`."""
+        observable = Batch({name: self[name] for name in (WHOLE, "mask", "view_inputs") if name in self})
+        return self | observable.map(lambda value: value[:, :observed])
 
     def leaves(self) -> dict[str, Any]:
         """Return all tensors by path, such as "mask/x"."""
-        found: dict[str, Any] = {}
+        tensors: dict[str, Any] = {}
         for name, value in self.items():
             inner = Batch(value).leaves() if isinstance(value, Mapping) else None
-            found |= {name: value} if inner is None else {f"{name}/{key}": each for key, each in inner.items()}
-        return found
+            tensors |= {name: value} if inner is None else {f"{name}/{key}": each for key, each in inner.items()}
+        return tensors
 
     def __setitem__(self, name: str, value: Any) -> None:
         self.reader = None

@@ -1,7 +1,7 @@
 """Long arrays, in memory or mapped from disk, processed in blocks and cut into windows on demand.
 
 Functions read a mapped array (`dvae.data.npy`) block by block or window by window, and memory does not grow with its
-length. Arrays in memory are treated alike, and no unused part is copied.
+length. Arrays in memory are processed in the same way, and no unused part is copied.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ def blocks(values: np.ndarray | Tensor) -> Iterator[Any]:
 
 def row_blocks(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     """Yield blocks of the rows of several arrays (N, C) in order; short arrays share a block."""
-    held, size = list[np.ndarray](), 0
+    parts, size = list[np.ndarray](), 0
     for block in chain.from_iterable(map(blocks, arrays)):
-        held.append(block)
+        parts.append(block)
         size += block.size
         if size >= NUMBERS:
-            yield np.concatenate(held)
-            held, size = [], 0
-    if held:
-        yield np.concatenate(held)
+            yield np.concatenate(parts)
+            parts, size = [], 0
+    if parts:
+        yield np.concatenate(parts)
 
 
 def cut_windows(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
@@ -56,11 +56,11 @@ def cut_windows(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, len
     """
     steps = [lengths] * len(which) if isinstance(lengths, int) else lengths.tolist()
     dtype = np.result_type(np.float32, *{values.dtype for values in arrays})
-    found = np.empty((len(which), max(steps, default=0), *arrays[0].shape[1:]), dtype)
-    for window, place, start, length in zip(found, which.tolist(), starts.tolist(), steps, strict=True):
-        window[:length] = arrays[place][start : start + length]
+    windows = np.empty((len(which), max(steps, default=0), *arrays[0].shape[1:]), dtype)
+    for window, index, start, length in zip(windows, which.tolist(), starts.tolist(), steps, strict=True):
+        window[:length] = arrays[index][start : start + length]
         window[length:] = window[length - 1]
-    return torch.from_numpy(found)
+    return torch.from_numpy(windows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,34 +86,34 @@ class ColumnSummary:
         Raises:
             ValueError: without any part.
         """
-        found: ColumnSummary | None = None
+        total: ColumnSummary | None = None
         for part in parts:
             values = part.detach().double().cpu().numpy() if isinstance(part, Tensor) else part
-            own = cls.of_block(np.array(values, np.float64))
-            found = own if found is None else found.joined(own)
-        if found is None:
+            summary = cls.of_block(np.array(values, np.float64))
+            total = summary if total is None else total.joined(summary)
+        if total is None:
             raise ValueError("expected at least one value to summarise, got none")
-        return found
+        return total
 
     @classmethod
     def of_block(cls, values: np.ndarray) -> ColumnSummary:
         """Summarise rows (n, C) in double precision; the array is overwritten."""
-        there = ~np.isnan(values)
-        count = there.sum(0)
-        known: Any = True if there.all() else there
-        ends = values.min(0, initial=np.inf, where=known), values.max(0, initial=-np.inf, where=known)
-        mean = values.sum(0, where=known) / count.clip(1)
+        present = ~np.isnan(values)
+        count = present.sum(0)
+        where: Any = True if present.all() else present
+        ends = values.min(0, initial=np.inf, where=where), values.max(0, initial=-np.inf, where=where)
+        mean = values.sum(0, where=where) / count.clip(1)
         values -= mean
-        values[~there] = 0
+        values[~present] = 0
         return cls(count, mean, np.einsum("nc,nc->c", values, values) / count.clip(1), *ends)
 
     def joined(self, other: ColumnSummary) -> ColumnSummary:
         """Combine two summaries (Chan, Golub and LeVeque 1983, "Algorithms for computing the sample variance")."""
         count = self.count + other.count
-        share, apart = other.count / count.clip(1), other.mean - self.mean
-        variance = (1 - share) * self.variance + share * other.variance + share * (1 - share) * apart**2
+        share, difference = other.count / count.clip(1), other.mean - self.mean
+        variance = (1 - share) * self.variance + share * other.variance + share * (1 - share) * difference**2
         ends = np.minimum(self.least, other.least), np.maximum(self.largest, other.largest)
-        return ColumnSummary(count, self.mean + share * apart, variance, *ends)
+        return ColumnSummary(count, self.mean + share * difference, variance, *ends)
 
 
 class Digest(Protocol):
@@ -131,8 +131,8 @@ def hash_values(digest: Digest, values: np.ndarray, dtype: str | np.dtype) -> No
 
 def hash_list(digest: Digest, items: Iterable[Any]) -> None:
     """Add the `repr` of a list of items to a hash; the items need not fit in memory at once."""
-    said, before = map(repr, items), b"["
-    while some := list(islice(said, 4096)):
-        digest.update(before + ", ".join(some).encode())
-        before = b", "
-    digest.update(b"]" if before == b", " else b"[]")
+    texts, separator = map(repr, items), b"["
+    while chunk := list(islice(texts, 4096)):
+        digest.update(separator + ", ".join(chunk).encode())
+        separator = b", "
+    digest.update(b"]" if separator == b", " else b"[]")

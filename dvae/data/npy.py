@@ -40,20 +40,20 @@ def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any
         read: function that returns the next n bytes of the file, or the remaining ones.
 
     Raises:
-        Refused: if this is not an npy file, or its header is not one that NumPy writes for a plain array.
+        NpyError: if this is not an npy file, or its header differs from those that NumPy writes for plain arrays.
     """
     magic = read(8)
     if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\x00", b"\x02\x00"):
         raise NpyError(f"not an npy file of version 1 or 2 (it begins with {magic!r}); write it with numpy")
     size = int.from_bytes(read(2 if magic[6] == 1 else 4), "little")
     text = read(size).decode("latin1") if size <= LONGEST else ""
-    found = HEADER.fullmatch(text)
-    if not found or None in found.groups():
+    match = HEADER.fullmatch(text)
+    if not match or None in match.groups():
         raise NpyError(f"damaged, or not a plain array: the header of its npy file is {text[:100]!r}")
-    lengths = [length.strip().removesuffix("L") for length in found["shape"].split(",") if length.strip()]
+    lengths = [length.strip().removesuffix("L") for length in match["shape"].split(",") if length.strip()]
     if not all(re.fullmatch(r"\d{1,18}", length) for length in lengths):
-        raise NpyError(f"damaged: its shape is ({found['shape'][:100]})")
-    return dtype_of(found["descr"]), tuple(map(int, lengths)), "F" if found["order"] == "True" else "C"
+        raise NpyError(f"damaged: its shape is ({match['shape'][:100]})")
+    return dtype_of(match["descr"]), tuple(map(int, lengths)), "F" if match["order"] == "True" else "C"
 
 
 def dtype_of(code: str) -> np.dtype:
@@ -69,9 +69,9 @@ def dtype_of(code: str) -> np.dtype:
 
 def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = "declares") -> None:
     """Check that the shape matches the number of bytes; also refuse an empty array with very large dimensions."""
-    needed, places = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
-    if len(shape) > 32 or needed != size or places > max(size, NOTHING):
-        short = f", needs {needed:,}; it was cut short, copy or write it again" if needed > size else ""
+    n_bytes, padded = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
+    if len(shape) > 32 or n_bytes != size or padded > max(size, NOTHING):
+        short = f", needs {n_bytes:,}; it was cut short, copy or write it again" if n_bytes > size else ""
         raise NpyError(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes{short}")
 
 
@@ -111,9 +111,9 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
                     "is in Fortran order, which stores the numbers of a frame far apart; write it with "
                     "numpy.ascontiguousarray"
                 )
-            found = np.memmap(file, dtype, "r", file.tell(), shape)
-            found.filename = os.path.abspath(path)  # for joblib, whose processes map it too
-            return found.view(np.ndarray)
+            array = np.memmap(file, dtype, "r", file.tell(), shape)
+            array.filename = os.path.abspath(path)  # for joblib, whose processes map it too
+            return array.view(np.ndarray)
     except NpyError as error:
         raise ValueError(f"{os.fspath(path)} {error}") from error
     except OSError as error:

@@ -115,14 +115,14 @@ class Schema:
             sizes = {name: value.shape[-1] for name, value in batch.items() if name != "mask" and np.ndim(value) > 1}
             observed = data.observed if isinstance(data, ArrayWindows) else None
             data = Schema(sizes, None if "lengths" in batch else batch["x"].shape[1], observed)
-        found = Schema(dict(data)) if isinstance(data, Mapping) else getattr(data, "schema", data)
-        if not isinstance(found, cls):
-            known = found.kind if isinstance(found, Schema) else type(data).__name__
-            need = f"{who} needs the description of {cls.kind}, but was given {known}"
-            if isinstance(found, Schema) and type(found) is not Schema:
+        schema = Schema(dict(data)) if isinstance(data, Mapping) else getattr(data, "schema", data)
+        if not isinstance(schema, cls):
+            kind = schema.kind if isinstance(schema, Schema) else type(data).__name__
+            need = f"{who} needs the description of {cls.kind}, but was given {kind}"
+            if isinstance(schema, Schema) and type(schema) is not Schema:
                 raise SchemaError(f"{need}, which has none; take a method for any sequences, such as srnn")
             raise SchemaError(f"{need}; give the training windows, or their schema")
-        return found
+        return schema
 
     def config(self) -> dict[str, Any]:
         """Return the schema as JSON types, for `from_config` of its class."""

@@ -108,15 +108,15 @@ def axis_names(said: Mapping[str, Any]) -> tuple[str, str]:
 
 def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:
     """Return the unit of every named column of x; empty if the windows have no column names."""
-    found: Mapping[str, str] = windows.description.get("columns", {})
-    return found
+    columns: Mapping[str, str] = windows.description.get("columns", {})
+    return columns
 
 
 def scales_of(windows: HeldOutWindows) -> Sequence[float]:
-    """Return scales that make columns comparable: those of the windows if units differ, otherwise none."""
+    """Return the scales of the windows, which make columns comparable, if units differ; otherwise none."""
     units = [*columns_of(windows).values()]
-    mixed = len(units) > 1 and (len({*units}) > 1 or "" in units)
-    return windows.description.get("scales", ()) if mixed else ()
+    differ = len(units) > 1 and (len({*units}) > 1 or "" in units)
+    return windows.description.get("scales", ()) if differ else ()
 
 
 @dataclass(frozen=True)
@@ -172,8 +172,8 @@ class Sequences:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return `batch_size` different sequences in random order, or all if there are fewer."""
-        chosen = torch.randperm(len(self), generator=generator)[:batch_size]
-        return self.batch.rows(chosen)
+        rows = torch.randperm(len(self), generator=generator)[:batch_size]
+        return self.batch.rows(rows)
 
     def batches(self, batch_size: int) -> Iterator[Batch]:
         """Yield all sequences in order, `batch_size` at a time."""
@@ -185,8 +185,8 @@ class Sequences:
 class RandomMasking:
     """A source that hides further entries of x at random, anew in each batch.
 
-    The bound remains valid for the visible entries. The guide thereby learns from incomplete sequences if training
-    sequences have few missing values or none.
+    The bound remains valid for the visible entries. The guide thus learns to read incomplete sequences even if training
+    sequences have few or no missing values.
 
     Args:
         source: source of the batches.
@@ -201,25 +201,25 @@ class RandomMasking:
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return a batch of the source, with a mask."""
         batch = Batch(self.source.sample(batch_size, generator))
-        x, seen, kept = batch["x"], batch.mask(), (1 - self.share) ** 0.5
+        x, observed, keep = batch["x"], batch.mask(), (1 - self.share) ** 0.5
         steps, entries = (
-            torch.rand(*x.shape[:2], count, generator=generator) < kept for count in (1, max(self.together) + 1)
+            torch.rand(*x.shape[:2], count, generator=generator) < keep for count in (1, max(self.together) + 1)
         )
-        left = (steps & entries)[..., list(self.together)].to(x.device)
-        left = left if seen is None else seen & left
-        return batch | {"mask": {**batch["mask"], "x": left} if isinstance(batch.get("mask"), Mapping) else left}
+        visible = (steps & entries)[..., list(self.together)].to(x.device)
+        visible = visible if observed is None else observed & visible
+        return batch | {"mask": {**batch["mask"], "x": visible} if isinstance(batch.get("mask"), Mapping) else visible}
 
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the source, if it has one."""
-        found: str = self.source.fingerprint
-        return found
+        fingerprint: str = self.source.fingerprint
+        return fingerprint
 
 
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
     """Return means over some dimensions, without NaN."""
-    found: Tensor = values.mean(dims)
-    return values.nanmean(dims) if found.isnan().any() else found
+    means: Tensor = values.mean(dims)
+    return values.nanmean(dims) if means.isnan().any() else means
 
 
 def interpolate_missing(x: Tensor, mask: Tensor | None) -> Tensor:
@@ -234,7 +234,7 @@ def interpolate_missing(x: Tensor, mask: Tensor | None) -> Tensor:
 
     Example:
         >>> x = torch.tensor([[0.0, 9.0, 9.0, 3.0, 9.0]]).mT
-        >>> bridged(x, x < 9).flatten().tolist()
+        >>> interpolate_missing(x, x < 9).flatten().tolist()
         [0.0, 1.0, 2.0, 3.0, 3.0]
     """
     if mask is None:
@@ -244,7 +244,7 @@ def interpolate_missing(x: Tensor, mask: Tensor | None) -> Tensor:
     before = torch.where(mask, step, -1).cummax(-2).values
     after = torch.where(mask, step, length).flip(-2).cummin(-2).values.flip(-2)
     first, last = torch.where(before < 0, after, before), torch.where(after == length, before, after)
-    start, end = (x.gather(-2, place.clamp(0, length - 1)) for place in (first, last))
+    start, end = (x.gather(-2, index.clamp(0, length - 1)) for index in (first, last))
     line = start + (end - start) * ((step - first) / (last - first).clamp(min=1)).to(x)
     return torch.where(mask, x, torch.where(mask.any(-2, keepdim=True), line, 0.0))
 
@@ -263,7 +263,7 @@ def time_since_previous(times: Tensor | np.ndarray, lengths: Tensor | None = Non
         ValueError: if times are not finite or not increasing.
 
     Example:
-        >>> gaps(torch.tensor([[3.0, 4.0, 6.5, 0.0]]), torch.tensor([3])).flatten().tolist()
+        >>> time_since_previous(torch.tensor([[3.0, 4.0, 6.5, 0.0]]), torch.tensor([3])).flatten().tolist()
         [0.0, 1.0, 2.5, 0.0]
     """
     times = torch.as_tensor(times)
@@ -297,7 +297,7 @@ def time_since_observed(mask: Tensor, gaps: Tensor | None = None) -> Tensor:
 
     Example:
         >>> mask = torch.tensor([[[True], [False], [False], [True], [True]]])
-        >>> since_observed(mask).flatten().tolist()
+        >>> time_since_observed(mask).flatten().tolist()
         [0.0, 1.0, 2.0, 3.0, 1.0]
     """
     steps = torch.ones_like(mask[..., :1], dtype=torch.get_default_dtype()) if gaps is None else gaps
@@ -355,15 +355,15 @@ def sequences(data: Any) -> Sequences:
         data: x as a tensor or array (N, T, D), which may be mapped, a batch, or `Listed` data.
 
     Raises:
-        TypeError, ValueError: if it is none of these.
+        TypeError, ValueError: if the data are none of these.
     """
     refuse_table(data)
     if isinstance(data, Sequences):
         return data
     if isinstance(data, Mapping):
         x, mask = unmasked(data.get("x"))
-        own = Batch(data) if mask is None or "mask" in data else Batch(data) | {"x": x, "mask": mask}
-        return Sequences(own.map(tensor_of))
+        batch = Batch(data) if mask is None or "mask" in data else Batch(data) | {"x": x, "mask": mask}
+        return Sequences(batch.map(tensor_of))
     if isinstance(data, Tensor | np.ndarray):
         check_real(data, "x")
         x, mask = unmasked(data)
@@ -382,13 +382,13 @@ def sequences(data: Any) -> Sequences:
 
 
 def as_source(data: Any) -> Source:
-    """Return training data that draw batches: unchanged if they do, else as `sequences`."""
+    """Return training data unchanged if they draw batches, otherwise as `Sequences`."""
     refuse_table(data)
     return data if isinstance(data, Source) else sequences(data)
 
 
 def as_batches(data: Any) -> Batched:
-    """Return validation data that can be iterated: unchanged if they can, else as `sequences`."""
+    """Return validation data unchanged if they can be iterated, otherwise as `Sequences`."""
     data = take_split(data, "validation")
     return data if isinstance(data, Batched) else sequences(data)
 
@@ -490,8 +490,8 @@ class ArrayWindows:
             raise ValueError(f"windows must be (N, T, D), but x has shape {tuple(self.x.shape)}")
         if self.observed >= self.x.shape[1]:
             raise ValueError(
-                f"observed is {self.observed} of {self.x.shape[1]} steps of x, and no step is left to predict; give "
-                "fewer"
+                f"observed is {self.observed}, but x has {self.x.shape[1]} steps; give fewer observed steps, so that "
+                "at least one is left to predict"
             )
         if self.mask is not None and self.mask.shape != self.x.shape:
             raise ValueError(
@@ -518,8 +518,8 @@ class ArrayWindows:
     @property
     def description(self) -> dict[str, Any]:
         """Columns and season, if they were given."""
-        said = {"columns": None if self.columns is None else dict(self.columns), "season": self.season}
-        return {name: value for name, value in said.items() if value is not None}
+        description = {"columns": None if self.columns is None else dict(self.columns), "season": self.season}
+        return {name: value for name, value in description.items() if value is not None}
 
     @property
     def fingerprint(self) -> str:

@@ -8,10 +8,9 @@ stays in float64, its values are read in float64, and only the difference become
 
 Units are different from views of the data (`dvae.data.views`). Latents and context also have units, and outputs keep
 the original unit. A distribution is transformed to the data's unit where it is built
-(`ConditionalDistribution.rescale`, the push-forward), so given scales and all densities are in this unit. Positive data
-that span orders of magnitude are read
-as logarithms: of the raw powers of a spectrum, a network sees only the peaks. They are still produced as a multiple of
-their mean.
+(`ConditionalDistribution.rescale`, the push-forward), so given scales and all densities are in this unit. Networks read
+positive data that span orders of magnitude as logarithms, since the peaks of a raw power spectrum would hide everything
+else. They still produce such data as a multiple of their mean.
 """
 
 from __future__ import annotations
@@ -38,23 +37,23 @@ TOO_SMALL = f"models compute in float32, which needs at least {SMALLEST:g}; mult
 
 
 LEVELS = "subtract from each sequence its own mean, or fit in float64"
-"""Advice for sequences at levels so far apart that float32 resolves no variation around one mean."""
+"""Advice for sequences whose levels differ too much for float32 to resolve their variation around one mean."""
 
 
-def is_imprecise(known: ColumnSummary, center: Any) -> np.ndarray:
+def is_imprecise(summary: ColumnSummary, center: Any) -> np.ndarray:
     """Return whether columns vary, but by less than float32 resolves at their distance from a center."""
-    spread = np.sqrt(known.variance)
-    return (spread > ROUNDING * abs(known.mean)) & (spread < RESOLVED * abs(known.mean - center))  # type: ignore[no-any-return]
+    spread = np.sqrt(summary.variance)
+    return (spread > ROUNDING * abs(summary.mean)) & (spread < RESOLVED * abs(summary.mean - center))  # type: ignore[no-any-return]
 
 
 def imprecise_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
     """Return `is_imprecise` (N, D) for the coordinates of each sequence (N, T, D), read in blocks."""
-    found = []
+    masks = []
     for block in blocks(values):
         count, _, size = block.shape
         columns = block.swapaxes(0, 1).reshape(-1, count * size)
-        found.append(is_imprecise(ColumnSummary.of([columns]), np.tile(center, count)).reshape(count, size))
-    return np.concatenate(found)
+        masks.append(is_imprecise(ColumnSummary.of([columns]), np.tile(center, count)).reshape(count, size))
+    return np.concatenate(masks)
 
 
 def exceeds_float32(dtype: torch.dtype | np.dtype) -> bool:
@@ -104,11 +103,11 @@ class Units(nn.Module):
     def __init__(self, size: int, coordinates: Sequence[Coordinate] = (), exact: bool = False):
         super().__init__()
         self.exact = exact
-        given = torch.tensor(coordinates, dtype=torch.float64).reshape(-1, len(Coordinate._fields))
-        found = dict(zip(Coordinate._fields, given.T, strict=True)) if coordinates else {}
-        for name, value in (found or {"mean": torch.zeros(size), "scale": torch.ones(())}).items():
-            kept = exact and name in EXACT and value.dtype is torch.float64
-            self.register_buffer(name, value if kept else value.to(torch.get_default_dtype()))
+        values = torch.tensor(coordinates, dtype=torch.float64).reshape(-1, len(Coordinate._fields))
+        buffers = dict(zip(Coordinate._fields, values.T, strict=True)) if coordinates else {}
+        for name, value in (buffers or {"mean": torch.zeros(size), "scale": torch.ones(())}).items():
+            is_wide = exact and name in EXACT and value.dtype is torch.float64
+            self.register_buffer(name, value if is_wide else value.to(torch.get_default_dtype()))
         self.logarithms = any(each.floor for each in coordinates)
 
     @torch.no_grad()
@@ -123,26 +122,27 @@ class Units(nn.Module):
         if self.scale.dim():
             raise ValueError("these coordinates have given units, which cannot be fitted; remove the call of fit")
         size, variance = len(self.mean), 0.0
-        if alike := values.shape[-1] == size:
-            known = ColumnSummary.of(block.reshape(-1, size) for block in blocks(values))
-            variance = float((known.variance * known.count / (known.count - 1).clip(1)).mean())
+        if same_size := values.shape[-1] == size:
+            summary = ColumnSummary.of(block.reshape(-1, size) for block in blocks(values))
+            variance = float((summary.variance * summary.count / (summary.count - 1).clip(1)).mean())
         if not variance > 0:
             raise ValueError(
                 f"units need values (..., {size}) that vary, got {tuple(values.shape)}"
-                f"{' without variance' if alike else ''}"
+                f"{' without variance' if same_size else ''}"
             )
         if (scale := math.sqrt(variance)) < SMALLEST:
             raise ValueError(f"the standard deviation of these values is {scale:g}; {TOO_SMALL}")
-        mean = torch.from_numpy(known.mean).to(self.mean.device)
+        mean = torch.from_numpy(summary.mean).to(self.mean.device)
         self.mean = mean if self.exact and exceeds_float32(values.dtype) else mean.to(self.scale.dtype)
         self.scale.fill_(scale)
         if values.ndim == 3 and exceeds_float32(values.dtype) and self.scale.dtype is torch.float32:
-            lost = imprecise_sequences(values, known.mean)
-            if lost.any():
+            imprecise = imprecise_sequences(values, summary.mean)
+            if imprecise.any():
+                rows, coordinate = imprecise.any(1), imprecise.any(0).argmax()
                 warnings.warn(
-                    f"in {lost.any(1).sum()} of {len(lost)} sequences, such as {lost.any(1).argmax()}, coordinate "
-                    f"{lost.any(0).argmax()} varies by less than float32 resolves at its distance from the mean of "
-                    f"all sequences, {known.mean[lost.any(0).argmax()]:.9g}; {LEVELS}",
+                    f"in {rows.sum()} of {len(rows)} sequences, such as {rows.argmax()}, coordinate {coordinate} "
+                    "varies by less than float32 resolves at its distance from the mean of all sequences, "
+                    f"{summary.mean[coordinate]:.9g}; {LEVELS}",
                     stacklevel=3,  # the decorator `no_grad` adds a frame
                 )
 
@@ -154,22 +154,22 @@ class Units(nn.Module):
     @override
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Keep float64 if the model changes its precision."""
-        kept = {n: v for n, v in self.named_buffers() if self.exact and n in EXACT and v.dtype is torch.float64}
+        wide = {n: v for n, v in self.named_buffers() if self.exact and n in EXACT and v.dtype is torch.float64}
         super()._apply(fn, recurse)
-        for name, value in kept.items():
+        for name, value in wide.items():
             setattr(self, name, value.to(getattr(self, name).device))
         return self
 
     @override
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
-        """Use float64 exactly where the state does."""
+        """Use float64 for the buffers that are float64 in the state."""
         for name in self._buffers.keys() & {*EXACT} if self.exact else ():
-            kept = prefix + name in state_dict and state_dict[prefix + name].dtype is torch.float64
-            setattr(self, name, getattr(self, name).to(torch.float64 if kept else self.scale.dtype))
+            is_wide = prefix + name in state_dict and state_dict[prefix + name].dtype is torch.float64
+            setattr(self, name, getattr(self, name).to(torch.float64 if is_wide else self.scale.dtype))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def relative(self, values: Tensor) -> Tensor:
-        """Return values (..., D), minus the mean if they are in float64, since float32 resolves the rest."""
+        """Return values (..., D), minus the mean if they are in float64; float32 resolves the difference."""
         return (values - self.mean).to(self.scale.dtype) if self.wide else values
 
     def absolute(self, values: Tensor) -> Tensor:
@@ -186,6 +186,6 @@ class Units(nn.Module):
         plain: Tensor = (values - self.mean).to(self.scale.dtype) / self.scale
         if not self.logarithms:
             return plain
-        read = self.floor > 0
-        logarithms = values.clamp(min=torch.where(read, self.floor, 1.0)).log()  # finite in unused entries
-        return torch.where(read, (logarithms.to(self.level.dtype) - self.level) / self.spread, plain)
+        use_log = self.floor > 0
+        logarithms = values.clamp(min=torch.where(use_log, self.floor, 1.0)).log()  # finite in unused entries
+        return torch.where(use_log, (logarithms.to(self.level.dtype) - self.level) / self.spread, plain)

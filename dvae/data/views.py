@@ -2,11 +2,11 @@
 
 A model has one view. `DynamicalVAE.read` applies it to a batch, and `DynamicalVAE.to_data_space` applies its inverse to
 the model's data. In between, all values are in the representation of the model. Views for one kind of data are in the
-package of these data.
+package for these data.
 
 Densities and bounds refer to the data as given: for a view that changes volume, the log-determinant is added to the log
-density of the representation. All views here keep volume. A view that is no bijection either raises in `log_det`, and
-the model has no density, or sets `View.measured`: densities then refer to the representation.
+density of the representation. All views here keep volume. A view that is not a bijection has two options. It raises an
+error in `log_det`, and the model has no density. Or it sets `View.measured`, and densities refer to the representation.
 
 >>> view = dvae.data.views.Parts({"legs": [0, 2], "arms": [1]})
 >>> batch = dvae.data.Batch(x=torch.tensor([[[1.0, 2.0, 3.0]]]))
@@ -45,13 +45,13 @@ class View:
     past: int = 0
     """Number of first frames of x that become context."""
     measured: str = ""
-    """Quantity of densities, if it is not the data as given; bounds of different quantities do not compare."""
+    """Quantity that densities refer to, if it is not the data as given; bounds of different quantities differ."""
 
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         """Check that a model is compatible with this view.
 
         Raises:
-            ValueError: if it is not, with the reason.
+            ValueError: if the model is incompatible; the message states the reason.
         """
 
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
@@ -67,7 +67,7 @@ class View:
         return data
 
     def inverse(self, seen: Batch) -> Batch:
-        """Return the data of a representation: values (..., B, T, D), and additions of the view (B, ...)."""
+        """Return the data from their representation: values (..., B, T, D), and additions of the view (B, ...)."""
         return seen
 
     def log_det(self, data: Batch) -> Tensor:
@@ -77,8 +77,8 @@ class View:
         not count. Any other view that changes volume requires complete data.
         """
         some = next(iter(data.values()))
-        found: Tensor = some.new_zeros(len(some))
-        return found
+        zeros: Tensor = some.new_zeros(len(some))
+        return zeros
 
     @property
     def keeps_volume(self) -> bool:
@@ -139,9 +139,9 @@ class Views(View):
         self.history = next((view.history for view in views if view.history), None)
         self.past = sum(view.past for view in views)
         self.measured = ", ".join(view.measured for view in views if view.measured)
-        pasts = [place for place, view in enumerate(views) if isinstance(view, Past)]
+        pasts = [index for index, view in enumerate(views) if isinstance(view, Past)]
         if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
-            raise ValueError(f"{self} changes the volume of frames without a score; let Past be the first")
+            raise ValueError(f"{self} changes the volume of frames that are not scored; make Past the first view")
 
     def __repr__(self) -> str:
         return f"Views({', '.join(map(repr, self.views))})"
@@ -174,12 +174,12 @@ class Views(View):
 
     @override
     def counted(self, data: Batch) -> Tensor:
-        found = []
+        terms = []
         for view in self.views:
-            found += [] if view.keeps_volume else [view.counted(data)]
+            terms += [] if view.keeps_volume else [view.counted(data)]
             data = Batch(view(data))
-        whole = any(each.dim() == 1 for each in found)
-        return torch.stack([Batch(log_det=each).volume if whole else each for each in found]).sum(0)
+        by_sequence = any(each.dim() == 1 for each in terms)
+        return torch.stack([Batch(log_det=each).volume if by_sequence else each for each in terms]).sum(0)
 
 
 @dataclass(frozen=True)
@@ -200,38 +200,38 @@ class Parts(View):
 
     @override
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
-        places = sorted(place for part in self.parts.values() for place in part)
-        if places != list(range(len(places))):
-            raise ValueError(f"the parts must contain each coordinate 0, 1, ... of x exactly once; got {places}")
+        coordinates = sorted(coordinate for part in self.parts.values() for coordinate in part)
+        if coordinates != list(range(len(coordinates))):
+            raise ValueError(f"the parts must contain each coordinate 0, 1, ... of x exactly once; got {coordinates}")
         for name, part in self.parts.items():
             if len(part) != sizes[name]:
                 raise ValueError(f"the part {name} has {len(part)} coordinates, but its size is {sizes[name]}")
         if WHOLE in sizes:
-            raise ValueError(f"with parts, {WHOLE!r} is the name of the whole; no variable can have it")
+            raise ValueError(f"with parts, {WHOLE!r} names the whole array; rename the variable {WHOLE!r}")
 
     @override
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         if WHOLE not in data:
             return data
-        seen, masks = Batch(data), data.masks()
-        whole, mask = seen.pop(WHOLE), masks.pop(WHOLE, None)
+        result, masks = Batch(data), data.masks()
+        x, mask = result.pop(WHOLE), masks.pop(WHOLE, None)
         size = sum(map(len, self.parts.values()))
-        if whole.dim() < 2 or whole.shape[-1] != size:
-            raise ValueError(f"{WHOLE} has shape {tuple(whole.shape)}, expected (B, T, {size})")
+        if x.dim() < 2 or x.shape[-1] != size:
+            raise ValueError(f"{WHOLE} has shape {tuple(x.shape)}, expected (B, T, {size})")
         for name, part in self.parts.items():
-            own = indices(part, whole)
-            seen.setdefault(name, whole.index_select(-1, own))
+            columns = indices(part, x)
+            result.setdefault(name, x.index_select(-1, columns))
             if mask is not None:
-                masks[name] = mask.index_select(-1, own)
-        return seen | {"mask": masks} if mask is not None else seen
+                masks[name] = mask.index_select(-1, columns)
+        return result | {"mask": masks} if mask is not None else result
 
     @override
     def inverse(self, seen: Batch) -> Batch:
         if not self.parts.keys() <= seen.keys():
             return seen
-        order = [place for part in self.parts.values() for place in part]
-        whole = torch.cat([seen[name] for name in self.parts], dim=-1)
-        return seen | {WHOLE: whole.index_select(-1, indices(map(order.index, range(len(order))), whole))}
+        order = [coordinate for part in self.parts.values() for coordinate in part]
+        x = torch.cat([seen[name] for name in self.parts], dim=-1)
+        return seen | {WHOLE: x.index_select(-1, indices(map(order.index, range(len(order))), x))}
 
 
 @dataclass(frozen=True)
@@ -254,10 +254,10 @@ class History(View):
         if name not in context:
             raise ValueError(f"the history is {name!r}, but the context is {', '.join(context) or 'none'}")
         for factor in generative.factors:
-            read = factor.parent(name)
-            if read is not None and (read.relation is None or read.relation.intervals is not None):
+            parent = factor.parent(name)
+            if parent is not None and (parent.relation is None or parent.relation.intervals is not None):
                 raise ValueError(
-                    f"{factor} reads {read}, but {name} is the data, and a forecast has only their past; "
+                    f"{factor} reads {parent}, but {name} is the data, and a forecast has only their past; "
                     f"give {name} a custom mask that hides the frames to predict, such as "
                     f'{name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
                 )
@@ -267,8 +267,8 @@ class History(View):
         if self.of not in data or self.history in data or view_inputs is not None:
             return data
         masks = data.masks()
-        seen = data | {self.history: data[self.of]}
-        return seen | {"mask": {**masks, self.history: masks[self.of]}} if self.of in masks else seen
+        result = data | {self.history: data[self.of]}
+        return result | {"mask": {**masks, self.history: masks[self.of]}} if self.of in masks else result
 
 
 @dataclass(frozen=True)
@@ -303,23 +303,23 @@ class Past(View):
             return data
         if data.lengths is not None:
             raise ValueError("a view with `Past` requires windows of one length; remove 'lengths' from the batch")
-        whole, masks, now = data[WHOLE], data.masks(), self.frames
-        if whole.shape[1] < now:
-            raise ValueError(f"this model continues from {now} frames, but was given {whole.shape[1]}")
+        x, masks, frames = data[WHOLE], data.masks(), self.frames
+        if x.shape[1] < frames:
+            raise ValueError(f"this model continues from {frames} frames, but was given {x.shape[1]}")
         for name in self.also:
-            if name in data and data[name].shape[1] != whole.shape[1] > now:
+            if name in data and data[name].shape[1] != x.shape[1] > frames:
                 raise ValueError(
-                    f"x {tuple(whole.shape)} has {self.name} as its first frames, so {name} must cover the "
-                    f"whole window, (B, {now} + T, D); got {tuple(data[name].shape)}"
+                    f"x {tuple(x.shape)} has {self.name} as its first frames, so {name} must cover the "
+                    f"whole window, (B, {frames} + T, D); got {tuple(data[name].shape)}"
                 )
-        later = {name: data[name][:, now:] for name in (WHOLE, *self.also) if name in data}
-        seen = data | {**later, self.name: whole[:, :now].flatten(1)}
+        later = {name: data[name][:, frames:] for name in (WHOLE, *self.also) if name in data}
+        result = data | {**later, self.name: x[:, :frames].flatten(1)}
         if WHOLE in masks:
-            seen["mask"] = {**masks, WHOLE: masks[WHOLE][:, now:], self.name: masks[WHOLE][:, :now].flatten(1)}
-        if whole.shape[1] == now:
-            del seen[WHOLE]
-            seen.get("mask", {}).pop(WHOLE, None)
-        return seen
+            result["mask"] = {**masks, WHOLE: masks[WHOLE][:, frames:], self.name: masks[WHOLE][:, :frames].flatten(1)}
+        if x.shape[1] == frames:
+            del result[WHOLE]
+            result.get("mask", {}).pop(WHOLE, None)
+        return result
 
     @override
     def inverse(self, seen: Batch) -> Batch:

@@ -170,7 +170,7 @@ def is_real(support: Any) -> bool:
     while hasattr(support, "base_constraint"):
         support = support.base_constraint
     parts = getattr(support, "parts", ())  # only a ProductSupport has parts
-    return all(is_real(own) for _, own in parts) if parts else support is constraints.real
+    return all(is_real(part) for _, part in parts) if parts else support is constraints.real
 
 
 class DistributionSpec(Protocol):

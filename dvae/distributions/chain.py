@@ -86,8 +86,8 @@ class GaussianChain(torch.autograd.Function):
             return base.new_empty(steps, batch, width)
 
         # z = (loc + s e) + softplus(raw) e: the minimum scale s is added with the bias, outside the loop
-        least = min_scale * noise
-        offset = torch.cat([least, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
+        min_noise = min_scale * noise
+        offset = torch.cat([min_noise, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
         values, out = empty(size), empty(2 * size)
         # softplus of both halves in one call, since on a slice it is not vectorised and takes three times as long
         soft, zero = torch.empty_like(out), out.new_zeros(())
@@ -169,7 +169,7 @@ class GaussianChain(torch.autograd.Function):
         ctx.save_for_backward(
             noise, values, out, recurrent, first, inputs, activated, cells, squashed, *tensors, *features, *hidden
         )
-        return values, out[..., :size] - least, scales, states
+        return values, out[..., :size] - min_noise, scales, states
 
     @staticmethod
     @once_differentiable
@@ -228,7 +228,7 @@ class GaussianChain(torch.autograd.Function):
             to_gates = torch.empty_like(activated)
             three = to_gates[..., : 3 * width].unflatten(-1, (3, width)).unbind(0)
             fourth, all_gates = to_gates[..., 3 * width :].unbind(0), to_gates.unbind(0)
-            own = to_states.unbind(0)
+            state_gradients = to_states.unbind(0)
             into_cell = torch.zeros_like(cells[0])
             into_state = torch.zeros_like(cells[0])
         carried = twice[-1]
@@ -237,7 +237,7 @@ class GaussianChain(torch.autograd.Function):
             for matrix, slope, target in back:
                 gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
             if inputs is not None:
-                to_state = torch.add(own[t], into_state).addmm_(gradient, first)
+                to_state = torch.add(state_gradients[t], into_state).addmm_(gradient, first)
                 into_cell = torch.addcmul(into_cell, to_state, cell_by_state[t])
                 torch.mul(by_cell[t], into_cell.unsqueeze(1), out=three[t])
                 torch.mul(by_output[t], to_state, out=fourth[t])

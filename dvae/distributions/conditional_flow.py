@@ -102,7 +102,7 @@ class ConditionalFlowModule(ConditionalDistribution):
         if len(values) < 2:
             raise ValueError(f"a flow needs at least two values to start from, got {len(values)}")
         loc, scale, features = parameters
-        self.flow.start_at((values - loc) / scale, _read(features))
+        self.flow.start_at((values - loc) / scale, _optional_features(features))
 
 
 class ConditionedBijection:
@@ -116,7 +116,7 @@ class ConditionedBijection:
             )
         self.loc, self.scale, features = (each.to(dtype) for each in parameters)
         with torch.autocast(self.loc.device.type, enabled=False):
-            self.move = flow(_read(features))
+            self.move = flow(_optional_features(features))
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Map values (..., D) to noise (..., D) and the log-determinant (...)."""
@@ -130,6 +130,6 @@ class ConditionedBijection:
             return torch.addcmul(self.loc, self.scale, self.move.inv(z.to(self.loc.dtype)))
 
 
-def _read(features: Tensor) -> Tensor | None:
+def _optional_features(features: Tensor) -> Tensor | None:
     """Return the features as zuko expects them: None for zero features."""
     return features if features.shape[-1] else None

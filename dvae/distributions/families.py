@@ -146,8 +146,8 @@ class FixedNormalModule(Gaussian):
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         """Convert the parameters; a scale that is not learned already has the unit of the variable."""
-        loc, own = super().rescale(parameters, mean, scale)
-        return loc, own if self.learned else parameters[1]
+        loc, rescaled = super().rescale(parameters, mean, scale)
+        return loc, rescaled if self.learned else parameters[1]
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:

@@ -126,8 +126,8 @@ class VonMises(dist.VonMises):  # type: ignore[misc]
 
     @override
     def log_prob(self, value: Tensor) -> Tensor:
-        concentration, apart = self.concentration.double(), value.double() - self.loc.double()
-        kernel = -2 * concentration * (apart / 2).sin().square()  # cos - 1 without cancellation
+        concentration, difference = self.concentration.double(), value.double() - self.loc.double()
+        kernel = -2 * concentration * (difference / 2).sin().square()  # cos - 1 without cancellation
         return (kernel - (2 * math.pi * torch.special.i0e(concentration)).log()).to(value.dtype)
 
     @override
@@ -193,11 +193,11 @@ class Family:
         """
         if not isinstance(self.distribution, str):
             return self.distribution
-        found = vars(dist).get(self.distribution)
-        if isinstance(found, type) and issubclass(found, Distribution):
-            return found
-        known = [name for name, value in vars(dist).items() if isinstance(value, type)]
-        raise ValueError(f"Pyro has no distribution {self.distribution!r}{nearest(self.distribution, known)}")
+        kind = vars(dist).get(self.distribution)
+        if isinstance(kind, type) and issubclass(kind, Distribution):
+            return kind
+        names = [name for name, value in vars(dist).items() if isinstance(value, type)]
+        raise ValueError(f"Pyro has no distribution {self.distribution!r}{nearest(self.distribution, names)}")
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
@@ -222,8 +222,8 @@ class FamilyModule(ConditionalDistribution):
         if self.residual and "loc" not in self.forms:
             raise ValueError(f"{self.kind.__name__} has no location, so a previous value cannot be added")
         widths = {name: math.prod(free) for name, (free, _, _) in self.forms.items()}
-        read = [name for name in widths if name not in spec.learned]
-        self.read = sorted(read, key=lambda name: name != "loc")  # `projection` expects the location first
+        names = [name for name in widths if name not in spec.learned]
+        self.read = sorted(names, key=lambda name: name != "loc")  # `projection` expects the location first
         self.widths = [widths[name] for name in self.read]
         self.learned = nn.ParameterDict({name: torch.zeros(widths[name]) for name in spec.learned})
         self.out: Any = nn.Identity()
@@ -236,12 +236,13 @@ class FamilyModule(ConditionalDistribution):
             )
         with torch.no_grad():
             probe = torch.ones(1, shape.features), torch.zeros(1, shape.size) if self.residual else None
-            with _refusing(spec, AttributeError, TypeError):
-                made = self.distribution(self(*probe))
-                self.centre = _centre(made)
-        support = getattr(made, "support", None)
-        self.event_dim, self.discrete = len(made.event_shape), support is not None and support.is_discrete
-        self.reparameterised = made.has_rsample and not self.discrete  # torch.bernoulli has a gradient that is zero
+            with _explain_errors(spec, AttributeError, TypeError):
+                probe_distribution = self.distribution(self(*probe))
+                self.centre = _centre(probe_distribution)
+        support = getattr(probe_distribution, "support", None)
+        self.event_dim, self.discrete = len(probe_distribution.event_shape), support is not None and support.is_discrete
+        # torch.bernoulli has a gradient that is zero
+        self.reparameterised = probe_distribution.has_rsample and not self.discrete
         self.support = support if support is not None and _is_fixed(support) else None
 
     @property
@@ -254,37 +255,39 @@ class FamilyModule(ConditionalDistribution):
         raw: dict[str, Tensor] = {name: p.expand(*features.shape[:-1], -1) for name, p in self.learned.items()}
         if self.out is not None:
             raw |= dict(zip(self.read, self.out(features).split(self.widths, -1), strict=True))
-        found = []
+        parameters = []
         for name, (free, to, shape) in self.forms.items():
             value = to(raw[name].unflatten(-1, free)).flatten(-len(shape)) if shape else to(raw[name])  # (..., P)
             value = value + self.floors.get(name, 0)
-            found.append(self.add_residual(value, previous) if name == "loc" else value)
-        return tuple(found)
+            parameters.append(self.add_residual(value, previous) if name == "loc" else value)
+        return tuple(parameters)
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         if not parameters or parameters[0].dtype is torch.float64 or self.kind.__name__ in PLAIN:
             return self._bounded(parameters)
-        return DoublePrecision(self._made(parameters), lambda: self._bounded(tuple(p.double() for p in parameters)))
+        return DoublePrecision(
+            self._unbounded(parameters), lambda: self._bounded(tuple(p.double() for p in parameters))
+        )
 
     def _bounded(self, parameters: Parameters) -> TorchDistribution:
-        made = self._made(parameters)
-        return BoundedDistribution(made) if constraints.is_dependent(self.kind.support) else made
+        distribution = self._unbounded(parameters)
+        return BoundedDistribution(distribution) if constraints.is_dependent(self.kind.support) else distribution
 
-    def _made(self, parameters: Parameters) -> TorchDistribution:
+    def _unbounded(self, parameters: Parameters) -> TorchDistribution:
         shaped = {
             name: value.unflatten(-1, shape) if len(shape) > 1 else value if shape else value[..., 0]
             for (name, (_, _, shape)), value in zip(self.forms.items(), parameters, strict=True)
         }
-        given = self.given
+        fixed = self.given
         if parameters:  # cached tensors, because torch would copy numbers to the device at every call
-            numbers = {name: value for name, value in given.items() if isinstance(value, float)}
-            given = given | {name: constant(value, parameters[0]) for name, value in numbers.items()}
-        made = self.kind(**shaped, **given)
+            numbers = {name: value for name, value in fixed.items() if isinstance(value, float)}
+            fixed = fixed | {name: constant(value, parameters[0]) for name, value in numbers.items()}
+        distribution = self.kind(**shaped, **fixed)
         for kind, support in OPEN.items():
-            if isinstance(made, kind):
-                made.support = support  # type: ignore[misc]
-        return made  # type: ignore[no-any-return]
+            if isinstance(distribution, kind):
+                distribution.support = support  # type: ignore[misc]
+        return distribution  # type: ignore[no-any-return]
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:
@@ -294,8 +297,8 @@ class FamilyModule(ConditionalDistribution):
 
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        named = zip(self.forms, parameters, strict=True)
-        return tuple(self.moves[name](value, mean, scale) if name in self.moves else value for name, value in named)
+        pairs = zip(self.forms, parameters, strict=True)
+        return tuple(self.moves[name](value, mean, scale) if name in self.moves else value for name, value in pairs)
 
 
 def _is_fixed(support: Any) -> bool:
@@ -319,36 +322,38 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
     constraints = kind.arg_constraints
     if not isinstance(constraints, Mapping):
         raise ValueError(f"{name} does not declare constraints of its parameters; write a custom distribution")
-    taken = inspect.signature(kind.__init__).parameters
-    if unknown := [own for own in (*spec.given, *spec.learned, *spec.shapes) if own not in taken]:
+    parameters = inspect.signature(kind.__init__).parameters
+    if unknown := [key for key in (*spec.given, *spec.learned, *spec.shapes) if key not in parameters]:
         raise ValueError(
-            f"{name} has no parameter {unknown[0]!r}{nearest(unknown[0], taken)}; it has {', '.join(constraints)}"
+            f"{name} has no parameter {unknown[0]!r}{nearest(unknown[0], parameters)}; it has {', '.join(constraints)}"
         )
-    left = {own: constraint for own, constraint in constraints.items() if own in taken and own not in spec.given}
-    for same in ALTERNATIVES:
-        for own in [own for own in same if own in left or own in spec.given][1:]:
-            left.pop(own, None)
+    remaining = {
+        key: constraint for key, constraint in constraints.items() if key in parameters and key not in spec.given
+    }
+    for group in ALTERNATIVES:
+        for key in [key for key in group if key in remaining or key in spec.given][1:]:
+            remaining.pop(key, None)
     forms: dict[str, Form] = {}
-    for own, constraint in left.items():
-        with _refusing(spec, NotImplementedError):
-            whole = constraint.is_discrete
-        if whole:
+    for key, constraint in remaining.items():
+        with _explain_errors(spec, NotImplementedError):
+            is_integer = constraint.is_discrete
+        if is_integer:
             raise ValueError(
-                f"{own} of {name} is a whole number, which no network outputs; give it: given={{{own!r}: 10}}"
+                f"{key} of {name} is a whole number, which no network outputs; set it with given={{{key!r}: 10}}"
             )
-        if own in spec.shapes:
-            size: tuple[int, ...] = tuple(shape.size if n == -1 else n for n in spec.shapes[own])
+        if key in spec.shapes:
+            size: tuple[int, ...] = tuple(shape.size if n == -1 else n for n in spec.shapes[key])
         else:  # a univariate distribution has one parameter per coordinate
             size = (shape.size,) * (constraint.event_dim if kind.support.event_dim else 1)  # type: ignore[union-attr]
-        to = _to(constraint)
-        forms[own] = tuple(to.inverse_shape(torch.Size(size))), to, size
+        to = _transform(constraint)
+        forms[key] = tuple(to.inverse_shape(torch.Size(size))), to, size
     if not forms:
         raise ValueError(f"no parameter of {name} is left to be read or learned; it has {', '.join(constraints)}")
     return forms
 
 
 @contextmanager
-def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
+def _explain_errors(spec: Family, *errors: type[Exception]) -> Iterator[None]:
     """Convert errors of constructing a distribution into a ValueError with an explanation."""
     try:
         yield
@@ -359,7 +364,7 @@ def _refusing(spec: Family, *errors: type[Exception]) -> Iterator[None]:
         ) from error
 
 
-def _to(constraint: Any) -> Any:
+def _transform(constraint: Any) -> Any:
     try:
         return biject_to(constraint)
     except NotImplementedError:  # torch has a surjective map, but no bijection, to scale matrices
@@ -426,9 +431,9 @@ class NormalMixtureModule(ConditionalDistribution):
 
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        logits, loc, own = (value.unflatten(-1, (-1, self.components)) for value in parameters)
+        logits, loc, spread = (value.unflatten(-1, (-1, self.components)) for value in parameters)
         mean, scale = mean[:, None], scale.expand_as(mean)[:, None]
-        return logits.flatten(-2), torch.addcmul(mean, loc, scale).flatten(-2), (own * scale).flatten(-2)
+        return logits.flatten(-2), torch.addcmul(mean, loc, scale).flatten(-2), (spread * scale).flatten(-2)
 
 
 @dataclass(frozen=True)

@@ -201,8 +201,8 @@ class FlowDistribution(TorchDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Return log p (...) of values (..., D), in nats."""
         noise, log_det = self.flow.to_noise(value)
-        found = log_det - noise.square().sum(-1) / 2 - self.event_shape[0] / 2 * math.log(2 * math.pi)
-        return found.expand(torch.broadcast_shapes(found.shape, self.batch_shape))
+        density = log_det - noise.square().sum(-1) / 2 - self.event_shape[0] / 2 * math.log(2 * math.pi)
+        return density.expand(torch.broadcast_shapes(density.shape, self.batch_shape))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> FlowDistribution:
         """Return the distribution with another batch shape."""

@@ -95,9 +95,9 @@ class LinearGaussianChain:
     def _backward(self) -> tuple[Tensor, Moments]:
         """Gain, and moments at z_{t+1} = 0, of z_t given z_{t+1} and the weights up to t, in reverse order of t."""
         gain = self._gain
-        rest = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain @ self.transition
+        remainder = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain @ self.transition
         # Joseph's form is a sum of squares, so rounding cannot make it negative, unlike the difference
-        spread = rest @ self.filtered.covariance[:-1] @ rest.mT + gain @ self.noise @ gain.mT
+        spread = remainder @ self.filtered.covariance[:-1] @ remainder.mT + gain @ self.noise @ gain.mT
         mean = self.filtered.mean[:-1] - _times(gain, self.predicted.mean[1:])
         return gain.flip(0), Moments(mean.flip(0), symmetric(spread).flip(0))
 
@@ -125,9 +125,9 @@ class LinearGaussianChain:
 def update(mean: Tensor, covariance: Tensor, information: Tensor, potential: Tensor) -> Moments:
     """Return the moments of N(mean, covariance) times exp(g' z - z' G z / 2); shapes (..., N) and (..., N, N)."""
     identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
-    moved = _column(covariance, potential - _times(information, mean))
+    shift = _column(covariance, potential - _times(information, mean))
     # more exact than updated covariance times difference if the difference is large
-    right = torch.cat([covariance, moved], dim=-1)
+    right = torch.cat([covariance, shift], dim=-1)
     solved = torch.linalg.solve_ex(identity + covariance @ information, right)[0]
     return Moments(mean + solved[..., -1], symmetric(solved[..., :-1]))
 
@@ -150,12 +150,12 @@ class Predict(torch.autograd.Function):
         covariances, shrink, carry = riccati(transition, noise, information[:-1], covariance)
         covariances = symmetric(covariances)
         filtered = shrink @ covariances[:-1]
-        gathered = (transition @ _column(filtered, potential[:-1])).add_(offset[..., None])
+        offsets = (transition @ _column(filtered, potential[:-1])).add_(offset[..., None])
         recursion = Recursion(carry)
-        means = recursion.states(gathered, mean[..., None])[..., 0]
-        after = update(means[:-1], covariances[:-1], information[:-1], potential[:-1]).mean
-        wrong = _times(transition, after) + offset - means[1:]
-        means = means + recursion.states(wrong[..., None], torch.zeros_like(mean)[..., None])[..., 0]
+        means = recursion.states(offsets, mean[..., None])[..., 0]
+        updated = update(means[:-1], covariances[:-1], information[:-1], potential[:-1]).mean
+        errors = _times(transition, updated) + offset - means[1:]
+        means = means + recursion.states(errors[..., None], torch.zeros_like(mean)[..., None])[..., 0]
         ctx.save_for_backward(transition, information, potential, means, filtered, shrink, carry)
         return means, covariances
 
@@ -170,18 +170,18 @@ class Predict(torch.autograd.Function):
         back = backward(carry)
         total = back.states(*from_last(to_mean[..., None])).flip(0)
         later = total[1:]
-        missed = potential[:-1, ..., None] - information[:-1] @ means[:-1, ..., None]
+        residual = potential[:-1, ..., None] - information[:-1] @ means[:-1, ..., None]
         totals = to_covariance.clone()
-        totals[:-1] += (carry.mT @ later) @ (shrink.mT @ missed).mT
+        totals[:-1] += (carry.mT @ later) @ (shrink.mT @ residual).mT
         totals = back.covariances(*from_last(symmetric(totals))).flip(0)
         laters = totals[1:]
         to_filtered = transition.mT @ later  # gradient of the filtered mean
-        moved = filtered @ to_filtered
-        spread = transition.mT @ laters @ transition + to_filtered @ missed.mT
-        filtered_mean = means[:-1, ..., None] + filtered @ missed
+        to_shift = filtered @ to_filtered
+        spread = transition.mT @ laters @ transition + to_filtered @ residual.mT
+        filtered_mean = means[:-1, ..., None] + filtered @ residual
         to_information, to_potential = torch.zeros_like(information), torch.zeros_like(potential)
-        to_potential[:-1] = moved[..., 0]
-        to_information[:-1] = -(filtered @ spread @ filtered) - moved @ means[:-1, ..., None].mT
+        to_potential[:-1] = to_shift[..., 0]
+        to_information[:-1] = -(filtered @ spread @ filtered) - to_shift @ means[:-1, ..., None].mT
         to_transition = later @ filtered_mean.mT + 2 * (laters @ (transition @ filtered))
         return (
             to_transition,

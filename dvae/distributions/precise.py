@@ -1,10 +1,9 @@
 """Distributions whose values or densities need more precision than the float32 of the networks.
 
 `OffsetDistribution` subtracts the mean in float64, because float32 cannot represent the noise in 1e9 + N(0, 1).
-`DoublePrecision`
-evaluates a density in float64 if its terms cancel: a Poisson log density at mean 1e7 is a difference of terms near 1e8.
-`BoundedDistribution` sets the density to 0 outside the support, such as below the scale of a Pareto, where torch
-extrapolates.
+`DoublePrecision` evaluates a density in float64 if its terms cancel: a Poisson log density at mean 1e7 is a difference
+of terms near 1e8. `BoundedDistribution` sets the density to 0 outside the support, such as below the scale of a Pareto,
+where torch extrapolates.
 """
 
 from __future__ import annotations

@@ -43,11 +43,11 @@ class Product:
         Raises:
             ValueError: a coordinate is in no part, or in more than one; a part has no density.
         """
-        given = sorted(place for places, _ in self.parts for place in places)
-        if given != list(range(shape.size)):
+        coordinates = sorted(place for places, _ in self.parts for place in places)
+        if coordinates != list(range(shape.size)):
             raise ValueError(
                 f"the parts of a Product must contain each coordinate 0 to {shape.size - 1} of {shape.name} exactly "
-                f"once; got {given}"
+                f"once; got {coordinates}"
             )
         return ProductModule(self, shape)
 
@@ -59,20 +59,21 @@ class ProductModule(ConditionalDistribution):
 
     def __init__(self, spec: Product, shape: Shape):
         parts = [
-            distribution.build(Shape(len(places), shape.features, *_rest(shape))) for places, distribution in spec.parts
+            distribution.build(Shape(len(places), shape.features, *_shape_options(shape)))
+            for places, distribution in spec.parts
         ]
         super().__init__(max(part.residual for part in parts))
         self.parts = nn.ModuleList(parts)
         self.places = [list(places) for places, _ in spec.parts]
-        for place, part in enumerate(parts):
+        for index, part in enumerate(parts):
             if part.deterministic:
                 raise ValueError(
-                    f"the part {self.places[place]} of {shape.name} has no density; a Product needs all densities"
+                    f"the part {self.places[index]} of {shape.name} has no density; a Product needs all densities"
                 )
         self.register_buffer("order", _order(self.places), persistent=False)
         self.location_scale = any(part.location_scale for part in parts)
-        own = {place: bool(parts[n].centred) for n, places in enumerate(self.places) for place in places}
-        self.centred = any(own.values()) and tuple(own[place] for place in range(shape.size))
+        centred = {index: bool(parts[n].centred) for n, places in enumerate(self.places) for index in places}
+        self.centred = any(centred.values()) and tuple(centred[index] for index in range(shape.size))
         with torch.no_grad():
             probe, before = torch.ones(1, shape.features), torch.zeros(1, shape.size)
             self.counts = [len(self._part(n, probe, before, None)) for n in range(len(parts))]
@@ -94,18 +95,20 @@ class ProductModule(ConditionalDistribution):
 
     @override
     def interior_point(self, size: int) -> Tensor | None:
-        found = [part.interior_point(len(places)) for part, places in zip(self.parts, self.places, strict=True)]  # type: ignore[operator]
-        if all(each is None for each in found):
+        points = [part.interior_point(len(places)) for part, places in zip(self.parts, self.places, strict=True)]  # type: ignore[operator]
+        if all(each is None for each in points):
             return None
         sizes = map(len, self.places)
-        return self._whole([torch.zeros(n) if own is None else own for own, n in zip(found, sizes, strict=True)])
+        return self._concatenate(
+            [torch.zeros(n) if point is None else point for point, n in zip(points, sizes, strict=True)]
+        )
 
     def _part(self, n: int, features: Tensor, previous: Tensor | None, t: int | None) -> Parameters:
         distribution: Any = self.parts[n]
-        own = None
+        part_previous = None
         if distribution.residual and previous is not None:
-            own = previous.index_select(-1, indices(self.places[n], previous))
-        return distribution(features, own, t)  # type: ignore[no-any-return]
+            part_previous = previous.index_select(-1, indices(self.places[n], previous))
+        return distribution(features, part_previous, t)  # type: ignore[no-any-return]
 
     @override
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
@@ -119,30 +122,32 @@ class ProductModule(ConditionalDistribution):
             start += count
         return list(zip(self.parts, self.places, split, strict=True))
 
-    def _whole(self, parts: list[Tensor]) -> Tensor:
+    def _concatenate(self, parts: list[Tensor]) -> Tensor:
         return torch.cat(parts, -1)[..., self.order]
 
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         return ProductDistribution(
-            [(places, distribution.distribution(own)) for distribution, places, own in self.each(parameters)]
+            [(places, distribution.distribution(values)) for distribution, places, values in self.each(parameters)]
         )
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:
-        return self._whole([distribution.mean(own) for distribution, _, own in self.each(parameters)])
+        return self._concatenate([distribution.mean(values) for distribution, _, values in self.each(parameters)])
 
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        scale, found = scale.expand_as(mean), ()
-        for distribution, places, own in self.each(parameters):
-            found += distribution.rescale(own, mean[places], scale[places]) if distribution.location_scale else own
-        return found
+        scale, rescaled = scale.expand_as(mean), ()
+        for distribution, places, values in self.each(parameters):
+            rescaled += (
+                distribution.rescale(values, mean[places], scale[places]) if distribution.location_scale else values
+            )
+        return rescaled
 
     @override
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        return self._whole(
-            [distribution.draw(own, noise[..., places]) for distribution, places, own in self.each(parameters)]
+        return self._concatenate(
+            [distribution.draw(values, noise[..., places]) for distribution, places, values in self.each(parameters)]
         )
 
 
@@ -151,7 +156,7 @@ def _order(parts: Iterable[Sequence[int]]) -> Tensor:
     return torch.tensor(list(chain.from_iterable(parts))).argsort()
 
 
-def _rest(shape: Shape) -> tuple[Any, ...]:
+def _shape_options(shape: Shape) -> tuple[Any, ...]:
     return shape.local, shape.name, shape.data, shape.guide
 
 
@@ -172,34 +177,36 @@ class ProductDistribution(TorchDistribution):
         self.has_rsample = all(distribution.has_rsample for _, distribution in parts)
         super().__init__(torch.Size([*batch, len(self.order)]), torch.Size(), validate_args=False)
 
-    def _whole(self, parts: list[Tensor]) -> Tensor:
+    def _concatenate(self, parts: list[Tensor]) -> Tensor:
         return torch.cat(parts, -1).index_select(-1, indices(self.order, parts[0]))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return (..., D), with the density of an event at its first coordinate and 0 at its others."""
-        found = []
+        densities = []
         for places, distribution in self.parts:
-            own = distribution.log_prob(value.index_select(-1, indices(places, value)))
-            found.append(functional.pad(own[..., None], (0, len(places) - 1)) if distribution.event_shape else own)
-        return self._whole(found)
+            density = distribution.log_prob(value.index_select(-1, indices(places, value)))
+            densities.append(
+                functional.pad(density[..., None], (0, len(places) - 1)) if distribution.event_shape else density
+            )
+        return self._concatenate(densities)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Return a reparameterised draw (..., D)."""
-        return self._whole([distribution.rsample(torch.Size(sample_shape)) for _, distribution in self.parts])
+        return self._concatenate([distribution.rsample(torch.Size(sample_shape)) for _, distribution in self.parts])
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         """Return a draw (..., D)."""
-        return self._whole([distribution.sample(torch.Size(sample_shape)) for _, distribution in self.parts])
+        return self._concatenate([distribution.sample(torch.Size(sample_shape)) for _, distribution in self.parts])
 
     @property
     def mean(self) -> Tensor:
         """Means (..., D) of the parts."""
-        return self._whole([distribution.mean for _, distribution in self.parts])
+        return self._concatenate([distribution.mean for _, distribution in self.parts])
 
     @property
     def variance(self) -> Tensor:
         """Variances (..., D) of the parts."""
-        return self._whole([distribution.variance for _, distribution in self.parts])
+        return self._concatenate([distribution.variance for _, distribution in self.parts])
 
     @property
     def support(self) -> constraints.Constraint:  # type: ignore[override]
@@ -212,14 +219,14 @@ class ProductSupport(constraints.Constraint):
 
     def __init__(self, parts: Sequence[tuple[list[int], Any]]):
         self.parts = parts
-        self.is_discrete = any(own.is_discrete for _, own in parts)
+        self.is_discrete = any(support.is_discrete for _, support in parts)
         self.event_dim = 0
 
     def check(self, value: Tensor) -> Tensor:
         """Return whether each coordinate satisfies its constraint."""
-        found = []
-        for places, own in self.parts:
-            right = own.check(value.index_select(-1, indices(places, value)))
-            found.append(right[..., None].expand(*right.shape, len(places)) if own.event_dim else right)
+        checks = []
+        for places, support in self.parts:
+            valid = support.check(value.index_select(-1, indices(places, value)))
+            checks.append(valid[..., None].expand(*valid.shape, len(places)) if support.event_dim else valid)
         order = _order(places for places, _ in self.parts).tolist()
-        return torch.cat(found, -1).index_select(-1, indices(order, value))
+        return torch.cat(checks, -1).index_select(-1, indices(order, value))

@@ -45,7 +45,7 @@ class Recursion:
     @cached_property
     def _blocks(self) -> tuple[Recursion, Tensor, Recursion]:
         """The recursion within all blocks at once, the products within blocks, and the recursion between blocks."""
-        matrix = _apart(self.matrix)
+        matrix = _to_blocks(self.matrix)
         passed = products(matrix)
         return Recursion(matrix), passed, Recursion(_last(passed, self.matrix))
 
@@ -53,47 +53,47 @@ class Recursion:
         """Return all x (T + 1, B, N, M) for c (T, B, N, M) and x_1 (B, N, M)."""
         if use_blocks(self.matrix):
             within, passed, between = self._blocks
-            own = within.states(offset := _apart(offset), torch.zeros_like(offset[0]))[1:]
-            starts = between.states(_last(own, self.matrix), start)[:-1].flatten(0, 1)
-            return torch.cat([start[None], _joined(own + passed @ starts, self.matrix)])
-        found, steps = _room(start, len(offset))
+            from_zero = within.states(offset := _to_blocks(offset), torch.zeros_like(offset[0]))[1:]
+            starts = between.states(_last(from_zero, self.matrix), start)[:-1].flatten(0, 1)
+            return torch.cat([start[None], _from_blocks(from_zero + passed @ starts, self.matrix)])
+        states, steps = _allocate(start, len(offset))
         for f, c, last, new in zip(self.matrix.unbind(0), offset.unbind(0), steps, steps[1:], strict=False):
             torch.baddbmm(c, f, last, out=new)
-        return found
+        return states
 
     def covariances(self, offset: Tensor, start: Tensor) -> Tensor:
         """Return all X (T + 1, B, N, N) for C (T, B, N, N) and X_1 (B, N, N)."""
         if use_blocks(self.matrix):
             within, passed, between = self._blocks
-            own = within.covariances(offset := _apart(offset), torch.zeros_like(offset[0]))[1:]
-            starts = between.covariances(_last(own, self.matrix), start)[:-1].flatten(0, 1)
-            return torch.cat([start[None], _joined(own + passed @ starts @ passed.mT, self.matrix)])
-        found, steps = _room(start, len(offset))
-        right = torch.empty_like(found[0])
+            from_zero = within.covariances(offset := _to_blocks(offset), torch.zeros_like(offset[0]))[1:]
+            starts = between.covariances(_last(from_zero, self.matrix), start)[:-1].flatten(0, 1)
+            return torch.cat([start[None], _from_blocks(from_zero + passed @ starts @ passed.mT, self.matrix)])
+        covariances, steps = _allocate(start, len(offset))
+        right = torch.empty_like(covariances[0])
         for f, c, last, new in zip(self.matrix.unbind(0), offset.unbind(0), steps, steps[1:], strict=False):
             torch.bmm(last, f.mT, out=right)
             torch.baddbmm(c, f, right, out=new)
-        return found
+        return covariances
 
 
 def riccati(transition: Tensor, noise: Tensor, information: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return all P (T + 1, B, N, N), W and F (T, B, N, N) for A, Q and G (T, B, N, N) and P_1 (B, N, N)."""
     if use_blocks(transition):
-        a, q, g = (_apart(values) for values in (transition, noise, information))
-        own, shrink, carry = riccati(a, q, g, torch.zeros_like(a[0]))
-        passed, told = products(carry), g @ shrink
-        told[1:] = passed[:-1].mT @ told[1:] @ passed[:-1]
-        whole = (passed, symmetric(own), symmetric(told.sum(0, keepdim=True)))
-        d, c, j = (_last(values, transition) for values in whole)
+        a, q, g = (_to_blocks(values) for values in (transition, noise, information))
+        from_zero, shrink, carry = riccati(a, q, g, torch.zeros_like(a[0]))
+        passed, gained = products(carry), g @ shrink
+        gained[1:] = passed[:-1].mT @ gained[1:] @ passed[:-1]
+        elements = (passed, symmetric(from_zero), symmetric(gained.sum(0, keepdim=True)))
+        d, c, j = (_last(values, transition) for values in elements)
         starts = symmetric(riccati(d, c, j, start)[0][:-1])
-        found, shrink, carry = riccati(a, q, g, starts.flatten(0, 1))
-        found, shrink, carry = (_joined(values, transition) for values in (found[1:], shrink, carry))
-        return torch.cat([start[None], found]), shrink, carry
-    found, steps = _room(start, len(transition))
+        covariances, shrink, carry = riccati(a, q, g, starts.flatten(0, 1))
+        covariances, shrink, carry = (_from_blocks(values, transition) for values in (covariances[1:], shrink, carry))
+        return torch.cat([start[None], covariances]), shrink, carry
+    covariances, steps = _allocate(start, len(transition))
     identity = torch.eye(start.shape[-1], dtype=start.dtype, device=start.device).expand_as(start)
-    shrink = torch.empty_like(found[1:]).mT  # W; transposed, since the inverse is computed by columns
-    carry = torch.empty_like(found[1:])  # F
-    inside, right = (torch.empty_like(found[0]) for _ in range(2))
+    shrink = torch.empty_like(covariances[1:]).mT  # W; transposed, since the inverse is computed by columns
+    carry = torch.empty_like(covariances[1:])  # F
+    inside, right = (torch.empty_like(covariances[0]) for _ in range(2))
     info = torch.empty(len(start), dtype=torch.int32, device=start.device)
     sequences = (values.unbind(0) for values in (transition, noise, information, shrink, carry))
     for a, q, g, w, f, last, new in zip(*sequences, steps, steps[1:], strict=False):
@@ -102,15 +102,15 @@ def riccati(transition: Tensor, noise: Tensor, information: Tensor, start: Tenso
         torch.bmm(a, w, out=f)
         torch.bmm(last, a.mT, out=right)
         torch.baddbmm(q, f, right, out=new)
-    return found, shrink, carry
+    return covariances, shrink, carry
 
 
 def products(matrix: Tensor) -> Tensor:
     """Return D_t = F_t ... F_1 for all t, from F (T, B, N, N)."""
-    found, steps = _room(matrix[0], len(matrix) - 1)
+    results, steps = _allocate(matrix[0], len(matrix) - 1)
     for f, last, new in zip(matrix.unbind(0)[1:], steps, steps[1:], strict=False):
         torch.bmm(f, last, out=new)
-    return found
+    return results
 
 
 def symmetric(matrix: Tensor) -> Tensor:
@@ -118,21 +118,21 @@ def symmetric(matrix: Tensor) -> Tensor:
     return 0.5 * (matrix + matrix.mT)
 
 
-def _room(start: Tensor, steps: int) -> tuple[Tensor, tuple[Tensor, ...]]:
+def _allocate(start: Tensor, steps: int) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Allocate memory for `steps` steps after the first, as a whole and by step; other layouts slow products down."""
-    found = start.new_empty(steps + 1, *start.shape)
-    found[0] = start
-    return found, found.unbind(0)
+    memory = start.new_empty(steps + 1, *start.shape)
+    memory[0] = start
+    return memory, memory.unbind(0)
 
 
-def _apart(values: Tensor) -> Tensor:
+def _to_blocks(values: Tensor) -> Tensor:
     """Rearrange (T, B, ...) to the steps of all blocks, (BLOCK, blocks * B, ...); zeros pad the last block."""
     values = torch.cat([values, values.new_zeros(-len(values) % BLOCK, *values.shape[1:])])
     return values.unflatten(0, (-1, BLOCK)).transpose(0, 1).flatten(1, 2).contiguous()
 
 
-def _joined(values: Tensor, like: Tensor) -> Tensor:
-    """Invert `_apart`, with the numbers of steps and sequences of `like`."""
+def _from_blocks(values: Tensor, like: Tensor) -> Tensor:
+    """Invert `_to_blocks`, with the numbers of steps and sequences of `like`."""
     return values.unflatten(1, (-1, like.shape[1])).transpose(0, 1).flatten(0, 1)[: len(like)]
 
 
@@ -147,17 +147,17 @@ class States(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, offset: Tensor, start: Tensor) -> Tensor:
         """Run the recursion."""
-        found = Recursion(matrix).states(offset[..., None], start[..., None])[..., 0]
-        ctx.save_for_backward(matrix, found)
-        return found
+        states = Recursion(matrix).states(offset[..., None], start[..., None])[..., 0]
+        ctx.save_for_backward(matrix, states)
+        return states
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Run the adjoint recursion, backward in time."""
-        matrix, found = ctx.saved_tensors
+        matrix, states = ctx.saved_tensors
         total = backward(matrix).states(*from_last(gradient[..., None])).flip(0)
-        return total[1:] @ found[:-1, ..., None].mT, total[1:, ..., 0], total[0, ..., 0]
+        return total[1:] @ states[:-1, ..., None].mT, total[1:, ..., 0], total[0, ..., 0]
 
 
 class Covariances(torch.autograd.Function):
@@ -166,17 +166,17 @@ class Covariances(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, offset: Tensor, start: Tensor) -> Tensor:
         """Run the recursion."""
-        found = symmetric(Recursion(matrix).covariances(offset, start))
-        ctx.save_for_backward(matrix, found)
-        return found
+        covariances = symmetric(Recursion(matrix).covariances(offset, start))
+        ctx.save_for_backward(matrix, covariances)
+        return covariances
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Run the adjoint recursion, backward in time."""
-        matrix, found = ctx.saved_tensors
+        matrix, covariances = ctx.saved_tensors
         total = symmetric(backward(matrix).covariances(*from_last(symmetric(gradient))).flip(0))
-        return 2 * total[1:] @ matrix @ found[:-1], total[1:], total[0]
+        return 2 * total[1:] @ matrix @ covariances[:-1], total[1:], total[0]
 
 
 def backward(matrix: Tensor) -> Recursion:

@@ -48,10 +48,10 @@ class Subset:
             size: L, number of indices.
             curriculum: progress of the curriculum, from 0 to 1.
         """
-        chosen = self.chosen(size)
-        most = round(chosen * (size - chosen) / size)
+        n_chosen = self.chosen(size)
+        most = round(n_chosen * (size - n_chosen) / size)
         swapped = int(curriculum * most)
-        return SubsetDistribution(size, chosen, None if curriculum >= 1 else swapped)
+        return SubsetDistribution(size, n_chosen, None if curriculum >= 1 else swapped)
 
 
 class SubsetDistribution(TorchDistribution):
@@ -83,22 +83,22 @@ class SubsetDistribution(TorchDistribution):
     def sample(self, sample_shape: Any = ()) -> Tensor:
         shape = torch.Size(sample_shape)
         if self.swapped is None:
-            return _some(shape, self.size, self.chosen)
-        first = 1 - _some(shape, self.chosen, self.swapped)
-        return torch.cat([first, _some(shape, self.size - self.chosen, self.swapped)], -1)
+            return _random_subset(shape, self.size, self.chosen)
+        first = 1 - _random_subset(shape, self.chosen, self.swapped)
+        return torch.cat([first, _random_subset(shape, self.size - self.chosen, self.swapped)], -1)
 
     @override
     def log_prob(self, value: Tensor) -> Tensor:
-        right = ((value == 0) | (value == 1)).all(-1) & (value.sum(-1) == self.chosen)
+        valid = ((value == 0) | (value == 1)).all(-1) & (value.sum(-1) == self.chosen)
         if self.swapped is not None:
-            right &= value[..., self.chosen :].sum(-1) == self.swapped
-        return torch.where(right, -self._log_number, -torch.inf).to(value.dtype)
+            valid &= value[..., self.chosen :].sum(-1) == self.swapped
+        return torch.where(valid, -self._log_number, -torch.inf).to(value.dtype)
 
 
-def _some(shape: torch.Size, size: int, count: int) -> Tensor:
+def _random_subset(shape: torch.Size, size: int, count: int) -> Tensor:
     """Return (*shape, size) with ones at `count` random places."""
-    places = torch.rand(*shape, size).argsort(-1)[..., :count]
-    return torch.zeros(*shape, size).scatter(-1, places, 1.0)
+    positions = torch.rand(*shape, size).argsort(-1)[..., :count]
+    return torch.zeros(*shape, size).scatter(-1, positions, 1.0)
 
 
 def _log_choose(size: int, count: int) -> float:

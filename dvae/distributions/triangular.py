@@ -23,10 +23,10 @@ class Triangular:
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
-        needed = shape.size + shape.size**2
-        if shape.features != needed:
+        n_features = shape.size + shape.size**2
+        if shape.features != n_features:
             raise ValueError(
-                f"a Triangular distribution takes {needed} features, but the network gives {shape.features}"
+                f"a Triangular distribution takes {n_features} features, but the network gives {shape.features}"
             )
         return TriangularModule(shape.size)
 

@@ -39,9 +39,9 @@ def draw_dag(
     """
     import matplotlib.pyplot as plt
 
-    place = _layout(dag)
+    positions = _layout(dag)
     if ax is None:
-        right, down = max(x for x, _ in place.values()), -min(y for _, y in place.values())
+        right, down = max(x for x, _ in positions.values()), -min(y for _, y in positions.values())
         _, ax = plt.subplots(figsize=(0.85 * right + 1.2, 0.85 * down + 1.4), layout="constrained")
 
     def symbol(name: str, t: int | None) -> str:
@@ -49,13 +49,13 @@ def draw_dag(
         return f"${word}_{{{t}}}$" if t else f"${word}$"
 
     patches = {
-        node: _circled(ax, xy, symbol(*node), dag.nodes[node].get("kind", "latent")) for node, xy in place.items()
+        node: _draw_node(ax, xy, symbol(*node), dag.nodes[node].get("kind", "latent")) for node, xy in positions.items()
     }
     dotted = set(redundant)
     edges = [(edge, REDUNDANT if edge in dotted else EDGE) for edge in dag.edges]
     for (source, target), style in edges + [(edge, MISSING) for edge in missing]:
-        _edge(ax, (source, target), place, patches, style)
-    return _finished(ax)
+        _draw_edge(ax, (source, target), positions, patches, style)
+    return _hide_axes(ax)
 
 
 def draw_slice(
@@ -75,9 +75,10 @@ def draw_slice(
         top: KL gap of the widest edge; at least the highest of `costs`.
         unsure: edges to draw in a lighter colour.
     """
-    place = _slice_layout(graph)
+    positions = _slice_layout(graph)
     patches = {
-        node: _circled(ax, xy, graph.nodes[node]["label"], graph.nodes[node]["kind"]) for node, xy in place.items()
+        node: _draw_node(ax, xy, graph.nodes[node]["label"], graph.nodes[node]["kind"])
+        for node, xy in positions.items()
     }
     top = max([top, *costs.values()])
     for edge in graph.edges:
@@ -86,17 +87,17 @@ def draw_slice(
         if cost is not None:
             thick = {"linewidth": 0.9 + 5 * cost / top, "mutation_scale": 9 + 8 * cost / top} if cost > 0 else {}
             style = REDUNDANT if cost <= LEAST * top else {**style, **thick}
-        bend = _edge(ax, edge, place, patches, style)
+        bend = _draw_edge(ax, edge, positions, patches, style)
         if cost is not None:
-            (x, y), (to_x, to_y) = (place[node] for node in edge)
+            (x, y), (to_x, to_y) = (positions[node] for node in edge)
             middle = (x + to_x + bend * (to_y - y)) / 2, (y + to_y - bend * (to_x - x)) / 2
             box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-            how: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "bbox": box, "zorder": 5}
-            ax.text(middle[0], middle[1], f"{round(cost, 3) + 0.0:.3f}", **how)
-    return _finished(ax)
+            text_style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "bbox": box, "zorder": 5}
+            ax.text(middle[0], middle[1], f"{round(cost, 3) + 0.0:.3f}", **text_style)
+    return _hide_axes(ax)
 
 
-def _circled(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch:
+def _draw_node(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch:
     """Draw a node with its label."""
     from matplotlib.patches import Circle, Rectangle
 
@@ -107,21 +108,23 @@ def _circled(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch
     return ax.add_patch(shape)
 
 
-def _edge(
-    ax: Axes, edge: tuple[Any, Any], place: Mapping[Any, Any], patches: Mapping[Any, Patch], style: dict[str, Any]
+def _draw_edge(
+    ax: Axes, edge: tuple[Any, Any], positions: Mapping[Any, Any], patches: Mapping[Any, Patch], style: dict[str, Any]
 ) -> float:
     """Draw an edge between two nodes and return its curvature."""
     from matplotlib.patches import FancyArrowPatch
 
     source, target = edge
-    bend = _bend(source, target, place)
+    bend = _bend(source, target, positions)
     ends: dict[str, Any] = {"patchA": patches[source], "patchB": patches[target]}
     curve = f"arc3,rad={bend}"
-    ax.add_patch(FancyArrowPatch(place[source], place[target], connectionstyle=curve, **ends, **{**ARROW, **style}))
+    ax.add_patch(
+        FancyArrowPatch(positions[source], positions[target], connectionstyle=curve, **ends, **{**ARROW, **style})
+    )
     return bend
 
 
-def _finished(ax: Axes) -> Axes:
+def _hide_axes(ax: Axes) -> Axes:
     ax.set_aspect("equal")
     ax.autoscale_view()
     ax.margins(0.05)
@@ -135,38 +138,38 @@ def _layout(dag: nx.DiGraph) -> dict[Node, tuple[float, float]]:
     static = [node for node in dag if node[1] is None]
     last = {name for name, t in dag if dag.nodes[name, t].get("kind") == "data"}
     names = sorted(dict.fromkeys(name for name, t in dag if t is not None), key=lambda name: name in last)
-    place = {}
+    positions = {}
     for i, node in enumerate(static):
-        place[node] = (1.7 * (T + 1) * (i + 1) / (len(static) + 1), 0.0)
+        positions[node] = (1.7 * (T + 1) * (i + 1) / (len(static) + 1), 0.0)
     for row, name in enumerate(names, start=bool(static)):
         for t in range(1, T + 1):
-            place[name, t] = (1.7 * t + 0.3 * (row % 3 - 1), -1.6 * row)
-    return place
+            positions[name, t] = (1.7 * t + 0.3 * (row % 3 - 1), -1.6 * row)
+    return positions
 
 
 def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
     """Place static nodes on top, then one row per local variable, data last; past and future at the sides."""
     local = {name: graph.nodes[name, sub]["kind"] == "data" for name, sub in graph if sub is not None}
     rows = {name: row for row, name in enumerate(sorted(local, key=local.__getitem__), start=1)}
-    place: dict[Any, tuple[float, float]] = {}
-    beside: dict[Any, int] = {}
+    positions: dict[Any, tuple[float, float]] = {}
+    counts: dict[Any, int] = {}
     static = [node for node in graph if node[1] is None]
     for i, node in enumerate(static):
-        place[node] = (1.9 * (i - (len(static) - 1) / 2) + 0.6, 0.0)
+        positions[node] = (1.9 * (i - (len(static) - 1) / 2) + 0.6, 0.0)
     for node in graph:
-        if node not in place:
+        if node not in positions:
             side = graph.nodes[node]["side"]
-            out = beside[node[0], side] = beside.get((node[0], side), 0) + 1
-            place[node] = (2.2 * side * out + 0.3 * (rows[node[0]] % 3 - 1), -1.8 * rows[node[0]])
-    return place
+            distance = counts[node[0], side] = counts.get((node[0], side), 0) + 1
+            positions[node] = (2.2 * side * distance + 0.3 * (rows[node[0]] % 3 - 1), -1.8 * rows[node[0]])
+    return positions
 
 
-def _bend(source: Any, target: Any, place: Mapping[Any, tuple[float, float]]) -> float:
-    """Return the least curvature at which an edge avoids all other nodes; edges in outer rows bend outwards."""
-    start, end = np.array(place[source]), np.array(place[target])
-    others = np.array([xy for node, xy in place.items() if node not in (source, target)]).reshape(-1, 2)
+def _bend(source: Any, target: Any, positions: Mapping[Any, tuple[float, float]]) -> float:
+    """Return the smallest curvature that keeps an edge off all other nodes; edges in outer rows bend outwards."""
+    start, end = np.array(positions[source]), np.array(positions[target])
+    others = np.array([xy for node, xy in positions.items() if node not in (source, target)]).reshape(-1, 2)
     (dx, dy), along = end - start, np.linspace(0, 1, 60)[:, None]
-    lowest = min(y for _, y in place.values()) == start[1]
+    lowest = min(y for _, y in positions.values()) == start[1]
     outwards = (1 if lowest else -1) * np.sign(dx) if dy == 0 else 1
     least = 0.3 if dy == 0 and abs(dx) > 2 else 0.0
 

@@ -54,7 +54,7 @@ def analytic_kl(
         T = 3 + (reach**2 if hidden else reach)  # repeated sums of lags meet within the product of the lags
         T = min(T, steps or T)
     model, guide = generative.dag(T), inference.dag(T)
-    bits = {node: 1 << place for place, node in enumerate({**model.nodes, **guide.nodes})}
+    bits = {node: 1 << index for index, node in enumerate({**model.nodes, **guide.nodes})}
     reads: dict[Node, int] = {}  # sets of nodes, as the bits of an integer
     for node in nx.topological_sort(model):
         parents = model.pred[node]
@@ -101,17 +101,17 @@ class Audit(_TextTable):
         generative: the model.
         inference: the guide.
         observed: names of the observed variables.
-        missing_parents: for each latent, what the exact posterior depends on and the guide factor does not read.
-            The bound cannot be tight.
-        redundant_parents: for each latent, what the guide factor reads although the latent is independent of it
-            given the other parents. Dropping it loses nothing.
+        missing_parents: for each latent, the parents that the exact posterior depends on and the guide factor does not
+            read. Without them the bound cannot be tight.
+        redundant_parents: for each latent, parents of the guide factor of which the latent is independent given the
+            other parents. Dropping them loses nothing.
         steps: the only length T for which the audit holds if there are custom masks, which may differ between lengths;
             None if it holds for all lengths.
         summed: names of latents that are summed out.
 
     Example:
-        >>> found = dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})")
-        >>> found.exact, found.missing
+        >>> result = dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})")
+        >>> result.exact, result.missing
         (False, {'z': ('z_{t-1}',)})
     """
 
@@ -155,15 +155,15 @@ class Audit(_TextTable):
 
     @property
     def verdict(self) -> str:
-        """A sentence: whether the guide misses something, and which of its variables the model does not contain."""
-        known = {*self.generative.variables, *self.generative.context}
-        alone = [name for name in self.inference.context if name not in known]
-        said = f"; {', '.join(alone)} in the guide has no factor and is context that the data give" if alone else ""
-        where = "" if self.steps is None else f" at T = {self.steps} (masks of your own may differ at other lengths)"
+        """A sentence: whether the guide misses dependencies, and which of its variables the model does not contain."""
+        model_names = {*self.generative.variables, *self.generative.context}
+        unknown = [name for name in self.inference.context if name not in model_names]
+        note = f"; {', '.join(unknown)} in the guide has no factor and is context that the data give" if unknown else ""
+        scope = "" if self.steps is None else f" at T = {self.steps} (custom masks may differ at other lengths)"
         if self.exact:
-            return f"exact{where}: the guide reads everything the posterior depends on{said}"
-        found = "the guide misses what the posterior depends on, so the bound stays below the evidence"
-        return f"not exact{where}: {found}{said}"
+            return f"exact{scope}: the guide reads everything the posterior depends on{note}"
+        reason = "the guide misses what the posterior depends on, so the bound stays below the evidence"
+        return f"not exact{scope}: {reason}{note}"
 
     def table(self) -> Table:
         """Return a rich table with one row per guide factor."""
@@ -254,30 +254,30 @@ def audit(
     local = {name: (inference if name in inference.context else generative).local(name) for name in context}
     local |= {name: generative.local(name) for name in (*data, *latents)}
     view = Unrolled(local, width, margin)
-    model, read = generative.dag(view.length), inference.dag(view.length)
+    model_dag, guide_dag = generative.dag(view.length), inference.dag(view.length)
     given = {node for name in (*data, *context) for node in view.nodes(name)}
-    model.add_nodes_from(given)
-    read.add_nodes_from(given)
+    model_dag.add_nodes_from(given)
+    guide_dag.add_nodes_from(given)
     inner = {node for name in latents for node in view.inner(name)}
-    boundaries = MarkovBoundaries(model)
+    boundaries = MarkovBoundaries(model_dag)
     needs, uses = {}, {}
     for node in view.drawn(inference.blocks):
         if node in inner:
             needs[node] = boundaries.of(node, given)
-            uses[node] = boundaries.of(node, set(read.predecessors(node)))
+            uses[node] = boundaries.of(node, set(guide_dag.predecessors(node)))
         given.add(node)
-    lacks = {node: boundary - set(read.predecessors(node)) for node, boundary in needs.items()}
+    unread = {node: boundary - set(guide_dag.predecessors(node)) for node, boundary in needs.items()}
 
     missing: dict[str, tuple[Parent, ...]] = {}
     redundant: dict[str, tuple[Parent, ...]] = {}
     for child in latents:
         for name in local:
-            lacking = view.offsets(lacks, child, name)
+            missing_offsets = view.offsets(unread, child, name)
             # An offset that any step needs is not redundant: near the ends of a chain every offset may be unused.
-            unused = view.offsets(read.pred, child, name) & ~view.offsets(uses, child, name)
-            for found, offsets in ((missing, lacking), (redundant, unused)):
+            redundant_offsets = view.offsets(guide_dag.pred, child, name) & ~view.offsets(uses, child, name)
+            for parents, offsets in ((missing, missing_offsets), (redundant, redundant_offsets)):
                 if offsets.any():
-                    found[child] = (*found.get(child, ()), view.parent(child, name, offsets))
+                    parents[child] = (*parents.get(child, ()), view.parent(child, name, offsets))
     return Audit(generative, inference, data, missing, redundant, view.length if custom else None, summed)
 
 
@@ -313,8 +313,8 @@ class Alternatives(_TextTable):
         steps: T of the graphs whose edges were counted.
 
     Example:
-        >>> found = dvae.alternatives("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")
-        >>> len(found), found[0].text
+        >>> guides = dvae.alternatives("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")
+        >>> len(guides), guides[0].text
         (4, 'q(w | x_{1:T}) q(z_t | z_{t-1}, x_{>=t}, w)')
     """
 
@@ -387,7 +387,7 @@ def alternatives(
     generative, observed, summed = Factorization.parse(generative), tuple(observed), tuple(summed)
     if steps < 1:
         raise ValueError(f"steps must be at least 1 to count edges, got {steps}")
-    found: dict[frozenset[Factor], Derived] = {}
+    unique: dict[frozenset[Factor], Derived] = {}
     for order in orders(generative, observed, summed):
         inference = faithful_inverse(generative, observed, order, summed)
         if not inference.factors:
@@ -402,6 +402,6 @@ def alternatives(
             looped,
             tuple(name for name, exact in closed.items() if not exact),
         )
-        found.setdefault(frozenset(inference.factors), derived)
-    guides = sorted(found.values(), key=lambda each: (bool(each.looped), each.edges, len(each.sampled)))
+        unique.setdefault(frozenset(inference.factors), derived)
+    guides = sorted(unique.values(), key=lambda each: (bool(each.looped), each.edges, len(each.sampled)))
     return Alternatives(generative, tuple(guides), steps)

@@ -40,9 +40,9 @@ class MarkovBoundaries:
 
     def __init__(self, dag: nx.DiGraph):
         self.nodes: list[Node] = list(dag)
-        self.bits = {node: 1 << place for place, node in enumerate(self.nodes)}
-        self.parents = [self._joined(dag.pred[node]) for node in self.nodes]
-        self.children = [self._joined(dag.succ[node]) for node in self.nodes]
+        self.bits = {node: 1 << index for index, node in enumerate(self.nodes)}
+        self.parents = [self._to_bits(dag.pred[node]) for node in self.nodes]
+        self.children = [self._to_bits(dag.succ[node]) for node in self.nodes]
 
     def of(self, node: Node, given: AbstractSet[Node]) -> set[Node]:
         """Return the smallest part of `given` that makes `node` independent of the rest of `given`.
@@ -54,34 +54,34 @@ class MarkovBoundaries:
             node: a node that is not in `given`.
             given: nodes whose values are known.
         """
-        start, known = self.bits[node], self._joined(given)
-        kept = frontier = start | known
+        start, given_bits = self.bits[node], self._to_bits(given)
+        ancestors = frontier = start | given_bits
         while frontier:
-            above = 0
-            for place in _places(frontier):
-                above |= self.parents[place]
-            frontier = above & ~kept
-            kept |= frontier
+            parents = 0
+            for index in _bit_indices(frontier):
+                parents |= self.parents[index]
+            frontier = parents & ~ancestors
+            ancestors |= frontier
         # In the moral graph of these nodes, a child and its parents (a family) are neighbours. Given nodes block paths.
-        boundary, families, walked, frontier = 0, 0, start, start
+        boundary, families, visited, frontier = 0, 0, start, start
         while frontier:
-            reached = frontier
-            for place in _places(frontier):
-                reached |= self.children[place]
-            families |= (new := reached & kept & ~families)
-            found = new
-            for place in _places(new):
-                found |= self.parents[place]
-            boundary |= found & known
-            frontier = found & ~known & ~walked
-            walked |= frontier
-        return {self.nodes[place] for place in _places(boundary)}
+            candidates = frontier
+            for index in _bit_indices(frontier):
+                candidates |= self.children[index]
+            families |= (new := candidates & ancestors & ~families)
+            neighbours = new
+            for index in _bit_indices(new):
+                neighbours |= self.parents[index]
+            boundary |= neighbours & given_bits
+            frontier = neighbours & ~given_bits & ~visited
+            visited |= frontier
+        return {self.nodes[index] for index in _bit_indices(boundary)}
 
-    def _joined(self, nodes: Iterable[Node]) -> int:
+    def _to_bits(self, nodes: Iterable[Node]) -> int:
         return sum(self.bits[node] for node in nodes)
 
 
-def _places(bits: int) -> Iterator[int]:
+def _bit_indices(bits: int) -> Iterator[int]:
     while bits:
         lowest = bits & -bits
         yield lowest.bit_length() - 1
@@ -137,7 +137,7 @@ class Unrolled:
         relation = ALL if self.local[name] else None
         if self.in_time(child, name):
             far = self.width - 1
-            steps = [int(place) - far for place in np.flatnonzero(offsets)]
+            steps = [int(index) - far for index in np.flatnonzero(offsets)]
             relation = Relation.of((-math.inf if k == -far else k, math.inf if k == far else k) for k in steps)
         return Parent(name, self.local[name], relation)
 
@@ -179,16 +179,18 @@ def faithful_inverse(
     order = tuple(order) if order is not None else next(iter(orders(generative, data, summed)))
     if not all(isinstance(block, Block) for block in order):
         raise TypeError(f"an order must consist of blocks, as in dvae.factorization.inversion.orders, got {order!r}")
-    if mixed := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
-        raise ValueError(f"{describe_order(mixed)} mixes static and local latents; give static ones a separate block")
+    if mixed_blocks := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
+        raise ValueError(
+            f"{describe_order(mixed_blocks)} mixes static and local latents; give static ones a separate block"
+        )
     if sorted(name for block in order for name in block.names) != sorted(latents):
         raise ValueError(
             f"the order '{describe_order(order)}' must contain the latents {', '.join(latents)}, each once"
         )
     relations = [p.relation for f in generative.factors for p in f.parents if p.relation is not None]
-    if own := [relation for relation in relations if relation.intervals is None]:
+    if custom := [relation for relation in relations if relation.intervals is None]:
         raise ValueError(
-            f"{own[0]} is a custom mask, known at one length at a time, but a derived guide is for every length; "
+            f"{custom[0]} is a custom mask, known at a single length, but a derived guide is for every length; "
             "write the guide, and check it at your length with audit(..., steps=T)"
         )
     reach = sum({relation.lag for relation in relations}) * max(1, len(latents))
@@ -204,7 +206,7 @@ def faithful_inverse(
         given.add(node)
 
     def factor(child: str) -> Factor:
-        found = []
+        parents = []
         for name in sorted(names, key=lambda name: not view.local[name]):  # static parents last, as in papers
             offsets = view.offsets(needs, child, name)
             if view.in_time(child, name):  # a dependency this far away repeats periodically
@@ -212,11 +214,11 @@ def faithful_inverse(
                 for side in (-1, 1):
                     if (beyond := far[side * far > 2 * reach]).size:
                         start = side * int(abs(beyond).min())
-                        places = range(start, side * view.width, side)
-                        offsets[[place + view.width - 1 for place in places]] = True
+                        tail = range(start, side * view.width, side)
+                        offsets[[offset + view.width - 1 for offset in tail]] = True
             if offsets.any():
-                found.append(view.parent(child, name, offsets))
-        return Factor("q", child, view.local[child], tuple(found))
+                parents.append(view.parent(child, name, offsets))
+        return Factor("q", child, view.local[child], tuple(parents))
 
     return Factorization("q", tuple(factor(name) for block in order for name in block.names))
 
@@ -241,13 +243,13 @@ def orders(
     latents = _latents(generative, tuple(observed), tuple(summed))
     statics = tuple(Block((name,), 0) for name in latents if not generative.local(name))
     local = [name for name in latents if generative.local(name)]
-    for last in (False, True) if statics and local else (False,):
+    for statics_last in (False, True) if statics and local else (False,):
         for names in permutations(local):
-            for apart in (False, True) if len(names) > 1 else (False,):
+            for separately in (False, True) if len(names) > 1 else (False,):
                 for direction in (1, -1) if names else (1,):
-                    drawn = [(name,) for name in names] if apart else [names] if names else []
-                    locals_ = tuple(Block(each, 1 if direction > 0 else -1) for each in drawn)
-                    yield (*locals_, *statics) if last else (*statics, *locals_)
+                    groups = [(name,) for name in names] if separately else [names] if names else []
+                    locals_ = tuple(Block(group, 1 if direction > 0 else -1) for group in groups)
+                    yield (*locals_, *statics) if statics_last else (*statics, *locals_)
 
 
 def describe_order(order: Sequence[Block]) -> str:

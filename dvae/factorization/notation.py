@@ -101,17 +101,17 @@ class Factor:
 
     def edges(self, T: int) -> list[tuple[Node, Node]]:
         """Return the edges (parent, child) of the graph unrolled over T steps, as in `Factorization.dag`."""
-        found, children = [], unrolled(self.child, self.local, T)
+        edges, children = [], unrolled(self.child, self.local, T)
         for parent in self.parents:
             parents = unrolled(parent.name, parent.local, T)
-            found += [(parents[s], children[t]) for t, s in np.argwhere(self.mask(parent.name, T)).tolist()]
-        return found
+            edges += [(parents[s], children[t]) for t, s in np.argwhere(self.mask(parent.name, T)).tolist()]
+        return edges
 
     def render(self, variable: Callable[[str, str | None], str], bar: str = " | ") -> str:
         """Return the factor as text; `variable(name, subscript)` formats each variable."""
         child = variable(self.child, "t" if self.local else None)
-        given = ", ".join(variable(*piece) for parent in self.parents for piece in parent.pieces)
-        return f"{self.kind}({child}{bar + given if given else ''})"
+        conditions = ", ".join(variable(*piece) for parent in self.parents for piece in parent.pieces)
+        return f"{self.kind}({child}{bar + conditions if conditions else ''})"
 
     def __str__(self) -> str:
         return self.render(_plain)
@@ -246,9 +246,9 @@ class Factorization:
                 factors.append(factor)
                 continue
             relation = Relation.of([(0, 0)]) if factor.local else ALL
-            own = [Parent(name, True, relation) for name in local] + [Parent(name, False) for name in static]
-            known = {parent.name for parent in factor.parents}
-            factors.append(replace(factor, parents=(*factor.parents, *(p for p in own if p.name not in known))))
+            added = [Parent(name, True, relation) for name in local] + [Parent(name, False) for name in static]
+            existing = {parent.name for parent in factor.parents}
+            factors.append(replace(factor, parents=(*factor.parents, *(p for p in added if p.name not in existing))))
         return replace(self, factors=tuple(factors))
 
     def local(self, name: str) -> bool:
@@ -290,10 +290,10 @@ class Factorization:
         edge, and so is a custom mask.
         """
 
-        def sides(factor: Factor, read: Relation | None) -> Iterable[Relation | None]:
-            if read is None or read.intervals is None or not factor.local:
-                return (read,)
-            return (part for side in (PAST, NOW, FUTURE) for part in (read & side).parts)
+        def sides(factor: Factor, relation: Relation | None) -> Iterable[Relation | None]:
+            if relation is None or relation.intervals is None or not factor.local:
+                return (relation,)
+            return (part for side in (PAST, NOW, FUTURE) for part in (relation & side).parts)
 
         return tuple(
             (factor.child, replace(parent, relation=relation))
@@ -316,15 +316,15 @@ class Factorization:
         if (child, parent) not in self.edges:
             raise ValueError(f"{factor} has no edge from {parent}")
 
-        def less(read: Parent) -> Parent | None:
-            if read.relation == parent.relation or read.relation is None or parent.relation is None:
+        def subtract(other: Parent) -> Parent | None:
+            if other.relation == parent.relation or other.relation is None or parent.relation is None:
                 return None
-            rest = read.relation & ~parent.relation
-            return None if rest.intervals == () else replace(read, relation=rest)
+            remaining = other.relation & ~parent.relation
+            return None if remaining.intervals == () else replace(other, relation=remaining)
 
-        reads = (less(read) if read.name == parent.name else read for read in factor.parents)
-        fewer = replace(factor, parents=tuple(read for read in reads if read is not None))
-        return replace(self, factors=tuple(fewer if each is factor else each for each in self.factors))
+        parents = (subtract(other) if other.name == parent.name else other for other in factor.parents)
+        reduced = replace(factor, parents=tuple(other for other in parents if other is not None))
+        return replace(self, factors=tuple(reduced if each is factor else each for each in self.factors))
 
     # sampling order ----------------------------------------------------------------------------------------
 
@@ -348,24 +348,24 @@ class Factorization:
         reads = [(f, p) for f in self.factors if f.child in members for p in f.parents if p.name in members]
         if not reads:
             return Block(tuple(members), 0)
-        where: dict[tuple[str, str], frozenset[int]] = {}
+        directions: dict[tuple[str, str], frozenset[int]] = {}
         for factor, parent in reads:
             if parent.relation is None or not factor.local:
                 raise self._undrawable(factor, parent, f"{parent.name} is drawn from {factor.child}")
-            where[factor.child, parent.name] = parent.relation.directions
-        seen = frozenset().union(*where.values())
+            directions[factor.child, parent.name] = parent.relation.directions
+        used = frozenset().union(*directions.values())
         # A generative model runs forward because it must be able to forecast; only a guide may run backward.
-        direction: Literal[-1, 1] = -1 if self.kind == "q" and 1 in seen and -1 not in seen else 1
+        direction: Literal[-1, 1] = -1 if self.kind == "q" and 1 in used and -1 not in used else 1
         for factor, parent in reads:
-            if direction in where[factor.child, parent.name]:
-                why = "a generative model is drawn forward in time"
+            if direction in directions[factor.child, parent.name]:
+                reason = "a generative model is drawn forward in time"
                 if self.kind == "q":
-                    past = next(f"{f.child}_t reads {p}" for f, p in reads if -1 in where[f.child, p.name])
-                    why = f"{past}, and one loop over time cannot run both forward and backward"
-                raise self._undrawable(factor, parent, why, direction)
+                    past = next(f"{f.child}_t reads {p}" for f, p in reads if -1 in directions[f.child, p.name])
+                    reason = f"{past}, and one loop over time cannot run both forward and backward"
+                raise self._undrawable(factor, parent, reason, direction)
         now = nx.DiGraph()
         now.add_nodes_from(members)
-        now.add_edges_from((p.name, f.child) for f, p in reads if 0 in where[f.child, p.name])
+        now.add_edges_from((p.name, f.child) for f, p in reads if 0 in directions[f.child, p.name])
         try:
             names = tuple(nx.lexicographical_topological_sort(now, key=self.variables.index))
         except nx.NetworkXUnfeasible:
@@ -377,32 +377,32 @@ class Factorization:
     def _blame(self, now: nx.DiGraph) -> tuple[Factor, Parent]:
         """Choose the dependency of a cycle to report: a self-loop, else a range such as {<=t}, else the first."""
         cycle = set(next(nx.simple_cycles(now)))
-        reads = [(f, p) for f in self.factors for p in f.parents if {f.child, p.name} <= cycle]
-        reads = [(f, p) for f, p in reads if now.has_edge(p.name, f.child)]
-        return min(reads, key=lambda read: (read[0].child != read[1].name, read[1].relation == NOW))
+        edges = [(f, p) for f in self.factors for p in f.parents if {f.child, p.name} <= cycle]
+        edges = [(f, p) for f, p in edges if now.has_edge(p.name, f.child)]
+        return min(edges, key=lambda edge: (edge[0].child != edge[1].name, edge[1].relation == NOW))
 
-    def _undrawable(self, factor: Factor, parent: Parent, why: str, direction: int = 0) -> ValueError:
+    def _undrawable(self, factor: Factor, parent: Parent, reason: str, direction: int = 0) -> ValueError:
         """Return the error: factor, parent, reason, shortest cycle and, for a local parent, the likely intention."""
-        message = f"{factor} reads {parent}, but {why}"
+        message = f"{factor} reads {parent}, but {reason}"
         if cycle := self._cycle(factor.child, parent.name):
             message += f" (cycle {' -> '.join(_node(*node) for node in cycle)})"
         if parent.relation is not None and direction:
-            drawn = PAST if direction > 0 else FUTURE
-            meant = parent.relation & drawn
-            if not meant.intervals:
-                meant = Relation.of([(-direction, -direction)]) if parent.relation.pointwise else drawn
-            message += f"; did you mean {Parent(parent.name, True, meant)}?"
+            available = PAST if direction > 0 else FUTURE
+            suggestion = parent.relation & available
+            if not suggestion.intervals:
+                suggestion = Relation.of([(-direction, -direction)]) if parent.relation.pointwise else available
+            message += f"; did you mean {Parent(parent.name, True, suggestion)}?"
         return ValueError(message)
 
     def _cycle(self, child: str, parent: str) -> list[Node]:
         """Return the shortest unrolled cycle with child reading parent, preferably from step 2; [] without a cycle."""
         relations = [p.relation for f in self.factors for p in f.parents if p.relation is not None]
         dag = self.dag(max((11 if r.intervals is None else 3 + r.lag for r in relations), default=3))
-        found: list[list[Node]] = []
+        cycles: list[list[Node]] = []
         for source, target in dag.edges:
             if source[0] == parent and target[0] == child and nx.has_path(dag, target, source):
-                found.append([source, *nx.shortest_path(dag, target, source)])
-        return min(found, key=lambda path: (len(path), abs((path[0][1] or 2) - 2)), default=[])
+                cycles.append([source, *nx.shortest_path(dag, target, source)])
+        return min(cycles, key=lambda path: (len(path), abs((path[0][1] or 2) - 2)), default=[])
 
     def dag(self, T: int, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
         """Return the graph unrolled over T steps, with edges from parent to child.
@@ -453,15 +453,15 @@ class Factorization:
         return " ".join(map(str, self.factors))
 
     def _joint(self, variable: Callable[[str, str | None], str], bar: str, product: str) -> str:
-        def whole(names: Iterable[str]) -> str:
+        def sequences(names: Iterable[str]) -> str:
             return ", ".join(variable(name, "1:T" if self.local(name) else None) for name in names)
 
-        drawn = [name for block in self.blocks for name in block.names]
-        given = bar + whole(self.context) if self.context else ""
+        variables = [name for block in self.blocks for name in block.names]
+        context = bar + sequences(self.context) if self.context else ""
         static = [f.render(variable, bar) for f in self.factors if not f.local]
         local = [f.render(variable, bar) for f in self.factors if f.local]
         right = " ".join([*static, *([product] if local else []), *local])
-        return f"{self.kind}({whole(reversed(drawn))}{given}) = {right}"
+        return f"{self.kind}({sequences(reversed(variables))}{context}) = {right}"
 
     def __str__(self) -> str:
         return self._joint(_plain, " | ", "∏_t")
@@ -506,7 +506,7 @@ class _Reader:
     SUBSCRIPT = re.compile(r"\{((?:[^{}]|\{[^{}]*\})*)\}")
 
     def __init__(self, text: str, masks: Mapping[str, Relation | MaskFunction]) -> None:
-        self.text, self.at = text, 0
+        self.text, self.position = text, 0
         self.masks = {name: self.custom(name, mask) for name, mask in masks.items()}
         self.local: dict[str, bool] = {}
 
@@ -516,30 +516,30 @@ class _Reader:
             return Relation.custom(name, mask)
         return mask if mask.intervals else Relation.custom(name, mask.rows)
 
-    def fail(self, message: str, at: int | None = None) -> NoReturn:
-        at = self.at if at is None else at
-        start = self.text.rfind("\n", 0, at) + 1
+    def fail(self, message: str, position: int | None = None) -> NoReturn:
+        position = self.position if position is None else position
+        start = self.text.rfind("\n", 0, position) + 1
         line = self.text[start:].split("\n", 1)[0]
-        raise NotationError(f"{message}\n    {line}\n    {' ' * (at - start)}^")
+        raise NotationError(f"{message}\n    {line}\n    {' ' * (position - start)}^")
 
     def take(self, pattern: str | re.Pattern[str]) -> re.Match[str] | None:
         """Skip spaces, then consume and return a match of the pattern; return None if it does not match."""
-        space = self.SPACE.match(self.text, self.at)
-        self.at = space.end() if space else self.at
-        match = re.compile(pattern).match(self.text, self.at)
+        space = self.SPACE.match(self.text, self.position)
+        self.position = space.end() if space else self.position
+        match = re.compile(pattern).match(self.text, self.position)
         if match:
-            self.at = match.end()
+            self.position = match.end()
         return match
 
     def factorization(self) -> tuple[Literal["p", "q"], tuple[Factor, ...]]:
         factors: list[Factor] = []
-        while self.take(self.BETWEEN) and self.at < len(self.text):
-            start = self.at
+        while self.take(self.BETWEEN) and self.position < len(self.text):
+            start = self.position
             factor = self.factor()
             if factors and factor.kind != factors[0].kind:
-                self.fail("p and q in one factorization; write the generative model and the guide apart", start)
+                self.fail("p and q in one factorization; write the generative model and the guide separately", start)
             if any(factor.child == other.child for other in factors):
-                self.fail(f"a second factor for {factor.child}; each variable has one", start)
+                self.fail(f"a second factor for {factor.child}; write one factor for each variable", start)
             factors.append(factor)
         if not factors:
             self.fail('no factors; expected for instance "p(z_t | z_{t-1}) p(x_t | z_t)"')
@@ -550,7 +550,7 @@ class _Reader:
         if head is None:
             self.fail("expected a factor: p(...) or q(...)")
         kind: Literal["p", "q"] = "p" if head[1] == "p" else "q"
-        start = self.at
+        start = self.position
         child = self.variable()
         if child.relation not in (None, NOW):
             self.fail(f"a factor is for one step: write {kind}({child.name}_t | ...), not {child}", start)
@@ -558,17 +558,17 @@ class _Reader:
         if self.take(r"\||\\mid(?![a-z])|\\vert(?![a-z])"):
             while True:
                 self.take("")
-                start = self.at
+                start = self.position
                 parent = self.variable()
-                timed = parent.relation not in (None, ALL) and parent.relation.intervals is not None
-                if timed and not child.local:
+                is_relative = parent.relation not in (None, ALL) and parent.relation.intervals is not None
+                if is_relative and not child.local:
                     self.fail(
-                        f"{child.name} has one value per sequence and so no t that {parent} could refer to; "
+                        f"{child.name} has one value per sequence, so {parent} has no meaning; "
                         f"it can read {parent.name}_{{1:T}}",
                         start,
                     )
-                if (before := parents.get(parent.name)) and before.relation and parent.relation:
-                    parent = Parent(parent.name, True, before.relation | parent.relation)
+                if (previous := parents.get(parent.name)) and previous.relation and parent.relation:
+                    parent = Parent(parent.name, True, previous.relation | parent.relation)
                 parents[parent.name] = parent
                 if not self.take(","):
                     break
@@ -581,7 +581,7 @@ class _Reader:
         if name is None:
             self.fail("expected a variable: a name, or a name with a subscript such as z_t or z_{t-1}")
         start, word, relation = name.start(), "".join(name.groups()).replace(r"\_", "_"), None
-        if word.endswith("_") and self.text[self.at : self.at + 1] == "{":
+        if word.endswith("_") and self.text[self.position : self.position + 1] == "{":
             word, relation = word[:-1], self.relation()
         elif word.endswith("_t"):
             word, relation = word[:-2], NOW
@@ -614,7 +614,7 @@ class _Reader:
         return Parent(word, local, relation)
 
     def relation(self) -> Relation:
-        opening = self.at
+        opening = self.position
         subscript = self.take(self.SUBSCRIPT)
         if subscript is None:
             self.fail('"{" without "}"', opening)
@@ -624,8 +624,8 @@ class _Reader:
         try:
             return Relation.parse(inside)
         except ValueError as error:
-            given = f" ({', '.join(self.masks)} here)" if self.masks else ""
-            self.fail(f"{error}{given if 'unknown' in str(error) else ''}", opening)
+            hint = f" ({', '.join(self.masks)} here)" if self.masks else ""
+            self.fail(f"{error}{hint if 'unknown' in str(error) else ''}", opening)
 
 
 # -------------------------------------------------------------------------------------------- model and guide
@@ -696,8 +696,8 @@ def check_pair(
     context = tuple(name for name in everything if name not in generative.variables)
     if sizes is not None:
         if missing := [name for name in everything if name not in sizes]:
-            what = " (no factor, so read as context)" if set(missing) <= set(context) else ""
-            raise ValueError(f"sizes missing for {_names(missing)}{what}; needed are {_names(everything)}")
+            note = " (no factor, so read as context)" if set(missing) <= set(context) else ""
+            raise ValueError(f"sizes missing for {_names(missing)}{note}; needed are {_names(everything)}")
         if unknown := [name for name in sizes if name not in everything]:
             raise ValueError(f"sizes given for {_names(unknown)}; the equations have {_names(everything)}")
     return tuple(name for block in inference.blocks for name in block.names), observed, context

@@ -109,7 +109,7 @@ class Relation:
             ValueError: the relation is a custom mask, whose lag may depend on T.
         """
         if self.intervals is None:
-            raise ValueError(f"the custom mask {self} has no lag: its relation is known at a given length only")
+            raise ValueError(f"the custom mask {self} has no lag, because it may differ between lengths")
         return max((int(abs(end)) for i in self.intervals for end in i if math.isfinite(end)), default=0)
 
     @property

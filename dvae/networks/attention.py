@@ -112,10 +112,10 @@ class Layer(nn.Module):
     def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
         """Return the stream (B, T, W) after attention under an additive bias, broadcastable to (B, heads, T, S)."""
         if stream.shape[1] == 1:  # for a single query, the fused kernel takes several times as long
-            seen = self.weights(stream, keys, bias) @ values
+            attended = self.weights(stream, keys, bias) @ values
         else:
-            seen = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
-        stream = stream + self.out(seen.transpose(1, 2).flatten(2))
+            attended = functional.scaled_dot_product_attention(self.queries(stream), keys, values, attn_mask=bias)
+        stream = stream + self.out(attended.transpose(1, 2).flatten(2))
         update: Tensor = self.perceptron(stream)
         return stream + update
 
@@ -140,9 +140,9 @@ class Layer(nn.Module):
         keys, values, offset = absorbed
         query = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(0, 1)
         query, tokens = (query @ keys).transpose(0, 1)[:, None], tokens[:, None]
-        seen = functional.scaled_dot_product_attention(query, tokens, tokens, attn_mask=bias[:, None], scale=1.0)
-        seen = (seen[:, 0].transpose(0, 1) @ values).transpose(0, 1).flatten(1)
-        stream = stream + functional.linear(seen, self.out.weight, offset)
+        attended = functional.scaled_dot_product_attention(query, tokens, tokens, attn_mask=bias[:, None], scale=1.0)
+        attended = (attended[:, 0].transpose(0, 1) @ values).transpose(0, 1).flatten(1)
+        stream = stream + functional.linear(attended, self.out.weight, offset)
         update: Tensor = self.perceptron(stream)
         return stream + update
 
@@ -216,22 +216,22 @@ class AttentionNetwork(Network):
         """
         batch = next(iter(parents.values())).shape[0]
         parents = self.extractors.of(parents, lengths)
-        stream, found = self.queries(parents, batch, length), []
+        stream, weights = self.queries(parents, batch, length), []
         if self.ranged:
             tokens, bias = self.tokens(self.ranged, parents, batch, length, lengths)
             for layer in self.layers:
                 keys, values = layer.project(tokens)
-                found.append(layer.weights(stream, keys, bias))
+                weights.append(layer.weights(stream, keys, bias))
                 stream = layer(stream, keys, values, bias)
-        return found
+        return weights
 
     def queries(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
         """Return the stream (B, T, W), or (B, 1, W) for a static child."""
         stream = self.origin.expand(batch, length if self.local else 1, -1)
         if self.point is None:
             return stream
-        joined: Tensor = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
-        return stream + (joined if joined.dim() == 3 else joined[:, None])
+        query: Tensor = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
+        return stream + (query if query.dim() == 3 else query[:, None])
 
     def tokens(
         self, parents: Sequence[Input], values: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None
@@ -242,10 +242,10 @@ class AttentionNetwork(Network):
         return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), bias
 
     def kept(self, name: str, values: Tensor) -> Tensor:
-        """Return what a loop stores of a parent's values (..., D): tokens (..., W), or a shorter form if W is larger.
+        """Return the stored form of a parent's values (..., D) in a loop: tokens (..., W), or a shorter form.
 
-        The shorter form is (..., D + 2): the values, a 1 for the bias of the embedding, and an indicator of the start
-        token.
+        The shorter form is used if W is larger than D + 2. It is (..., D + 2): the values, a 1 for the bias of the
+        embedding, and an indicator of the start token.
         """
         if self.narrow:
             return torch.cat([values, constant((1.0, 0.0), values).expand(*values.shape[:-1], 2)], -1)
@@ -261,8 +261,8 @@ class AttentionNetwork(Network):
 
     def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
         """Return the bias of every step to the parents' valid steps, (B or 1, heads or 1, T or 1, T * parents)."""
-        none = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
-        bias = torch.cat([none, *(self.bias(parent, length) for parent in parents)], dim=-1)[None]
+        empty = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
+        bias = torch.cat([empty, *(self.bias(parent, length) for parent in parents)], dim=-1)[None]
         if lengths is None:
             return bias
         return bias.masked_fill(~valid_steps(lengths, length).repeat(1, len(parents))[:, None, None], -math.inf)
@@ -270,19 +270,19 @@ class AttentionNetwork(Network):
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         given = self.extractors.of(given, lengths)
-        known = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
-        queries = self.point.hoist(known, batch, length) if self.point is not None else None
+        known_points = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
+        queries = self.point.hoist(known_points, batch, length) if self.point is not None else None
         fixed = [p for p in self.ranged if p.name in given]
         live = [p for p in self.ranged if p.name not in given]
         columns, tokens, bias = self.columns(), self.origin.new_zeros(batch, 1, 1), self.origin.new_zeros(1, 1, 1)
         if self.ranged:
             first = self.start_token if columns is None else functional.pad(columns.new_ones(1), (len(columns) - 1, 0))
-            kept = [self.kept(parent.name, given[parent.name]) for parent in fixed]
-            tokens = torch.cat([first.expand(batch, 1, -1), *kept], dim=1)
+            stored = [self.kept(parent.name, given[parent.name]) for parent in fixed]
+            tokens = torch.cat([first.expand(batch, 1, -1), *stored], dim=1)
             bias = functional.pad(self.biases([*fixed, *live], length, lengths), (1, 0))
         return Attending(
             queries=queries,
-            points=[entry for i, entry in enumerate(self.points) if i not in known],
+            points=[entry for i, entry in enumerate(self.points) if i not in known_points],
             bias=bias,
             given=1 + length * len(fixed),
             batch=batch,
@@ -334,12 +334,12 @@ class SelfAttentionNetwork(Network):
         frames = [parent for parent in self.inputs if local and _closed(parent)]
         self.encoded = [p for p in frames if p.relation == frames[0].relation]
         self.statics = [parent for parent in self.inputs if parent.relation is None]
-        rest = [parent for parent in self.inputs if parent not in (*self.encoded, *self.statics)]
+        others = [parent for parent in self.inputs if parent not in (*self.encoded, *self.statics)]
         self.extractors = Extractors([*self.encoded, *self.statics], spec.extract, spec.activation)
         if not self.encoded:
             raise ValueError(
                 "SelfAttention encodes parents of a local variable that are read at {1:T}, {<=t} or {>=t}, but the "
-                f"parents are {', '.join(f'{p.name} at {p.relation.name}' for p in rest if p.relation) or 'static'}; "
+                f"parents are {', '.join(f'{p.name} at {p.relation.name}' for p in others if p.relation) or 'static'}; "
                 "use networks.Attention for this factor"
             )
         tokens = [self.extractors.seen(parent).size for parent in (*self.encoded, *self.statics)]
@@ -347,9 +347,9 @@ class SelfAttentionNetwork(Network):
         self.layers: Any = nn.ModuleList(Layer(spec) for _ in range(spec.layers))
         self.norm = nn.LayerNorm(spec.width)
         self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
-        then = replace(spec, extract={n: e for n, e in spec.extract.items() if n in [p.name for p in rest]})
+        spec_after = replace(spec, extract={n: e for n, e in spec.extract.items() if n in [p.name for p in others]})
         token = Input(ENCODED, spec.width, Relation.parse("t"))
-        self.after = AttentionNetwork(then, [token, *rest], local) if rest else None
+        self.after = AttentionNetwork(spec_after, [token, *others], local) if others else None
         self.features = spec.width if self.after is None else self.after.features
 
     @override
@@ -365,8 +365,8 @@ class SelfAttentionNetwork(Network):
         bias = self.bias(length)
         if lengths is not None:
             bias = bias.masked_fill(~valid_steps(lengths, length)[:, None, None], -math.inf)
-            own = torch.eye(length, dtype=torch.bool, device=bias.device)
-            bias = bias.masked_fill(own, 0.0)  # padding attends to itself, since a softmax over nothing is NaN
+            diagonal = torch.eye(length, dtype=torch.bool, device=bias.device)
+            bias = bias.masked_fill(diagonal, 0.0)  # padding attends to itself, since a softmax over nothing is NaN
         for layer in self.layers:
             stream = layer(stream, *layer.project(layer.norm_query(stream)), bias)
         stream = self.norm(stream)
@@ -380,8 +380,8 @@ class SelfAttentionNetwork(Network):
         steps = torch.arange(length, device=self.slopes.device, dtype=self.slopes.dtype)
         ahead = steps[None, :] - steps[:, None]
         looks_ahead = torch.arange(len(self.slopes), device=self.slopes.device)[:, None, None] % 2 == 1
-        away = ((ahead < 0) == looks_ahead) & mask.T.logical_and(mask).all()  # only if both sides are visible
-        distance = ahead.abs() * torch.where(away, 4, 1)
+        is_other_side = ((ahead < 0) == looks_ahead) & mask.T.logical_and(mask).all()  # only if both sides are visible
+        distance = ahead.abs() * torch.where(is_other_side, 4, 1)
         return (-self.slopes[:, None, None] * distance).masked_fill(~mask, -math.inf)[None]
 
     @override
@@ -411,7 +411,7 @@ def _slopes(heads: int) -> Tensor:
 
 
 def _closed(parent: Input) -> bool:
-    """Return whether two rounds of attention see the same frames as one, and each frame sees itself."""
+    """Return whether two rounds of attention read the same frames as one, and each frame reads itself."""
     if parent.relation is None or parent.relation.intervals is None or parent.relation.pointwise:
         return False
     mask = parent.relation.mask(2 * parent.relation.lag + 6)  # long enough for two rounds of attention
@@ -419,7 +419,7 @@ def _closed(parent: Input) -> bool:
 
 
 class Cache:
-    """Tokens seen so far, (B, S, C), written in place if no gradient is needed."""
+    """Tokens stored so far, (B, S, C), written in place if no gradient is needed."""
 
     def __init__(self, tokens: Tensor, room: int):
         self.tokens = tokens
@@ -433,19 +433,19 @@ class Cache:
         if self.buffer is None:
             self.tokens = torch.cat([self.tokens, torch.stack(list(tokens), 1)], 1)
             return
-        for place, token in enumerate(tokens, self.tokens.shape[1]):
-            self.buffer[:, place] = token
+        for index, token in enumerate(tokens, self.tokens.shape[1]):
+            self.buffer[:, index] = token
         self.tokens = self.buffer[:, : self.tokens.shape[1] + len(tokens)]
 
     def select(self, rows: Tensor) -> Cache:
         """Return the selected rows."""
-        chosen = copy.copy(self)
+        selected = copy.copy(self)
         if self.buffer is None:
-            chosen.tokens = self.tokens.index_select(0, rows)
+            selected.tokens = self.tokens.index_select(0, rows)
         else:
-            chosen.buffer = self.buffer.index_select(0, rows)
-            chosen.tokens = chosen.buffer[:, : self.tokens.shape[1]]
-        return chosen
+            selected.buffer = self.buffer.index_select(0, rows)
+            selected.tokens = selected.buffer[:, : self.tokens.shape[1]]
+        return selected
 
 
 @dataclass
@@ -475,19 +475,19 @@ class Attending:
 
     def select(self, rows: Tensor) -> Attending:
         """Return the selected rows."""
-        moved = {name: select(getattr(self, name), rows) for name in ("queries", "cache", "extracted", "lengths")}
+        selected = {name: select(getattr(self, name), rows) for name in ("queries", "cache", "extracted", "lengths")}
         masks, seen = self.masks.copy(), list(self.seen)
         rows = rows if self.rows is None else self.rows.index_select(0, rows)
-        return replace(self, **moved, batch=len(rows), masks=masks, seen=seen, rows=rows)
+        return replace(self, **selected, batch=len(rows), masks=masks, seen=seen, rows=rows)
 
     def fresh(self, t: int) -> list[int]:
         """Return the live tokens that step t is the first to see and mark them as cached."""
-        found = np.flatnonzero(self.masks[t]).tolist()
-        if found:
-            self.masks[:, found] = False
-            self.in_order &= found == [*range(len(self.seen), len(self.seen) + len(found))]
-            self.seen += found
-        return found
+        tokens = np.flatnonzero(self.masks[t]).tolist()
+        if tokens:
+            self.masks[:, tokens] = False
+            self.in_order &= tokens == [*range(len(self.seen), len(self.seen) + len(tokens))]
+            self.seen += tokens
+        return tokens
 
     def row(self, t: int) -> Tensor:
         """Return the bias of step t to every token in the cache, broadcastable to (B, heads, S)."""

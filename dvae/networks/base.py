@@ -107,8 +107,8 @@ class Network(nn.Module):
         """
         features = []
         for s in range(t, t + count):
-            found, state = self.step(state, s, drawn)
-            features.append(found)
+            output, state = self.step(state, s, drawn)
+            features.append(output)
         return torch.stack(features, dim=1), state
 
     def forward_last(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
@@ -200,9 +200,9 @@ class Hoisted:
 
     def select(self, rows: Tensor) -> Hoisted:
         """Return the selected rows, which are read from the same base."""
-        chosen = Hoisted(self.base, self.weights, self.known, rows)
-        chosen.steps = select(self.steps, rows)
-        return chosen
+        selected = Hoisted(self.base, self.weights, self.known, rows)
+        selected.steps = select(self.steps, rows)
+        return selected
 
     @cached_property
     def steps(self) -> Sequence[Tensor]:
@@ -252,7 +252,7 @@ class Join(nn.Module):
     def __init__(self, sizes: Sequence[int], widths: Sequence[int], activation: str, mean: bool = False):
         super().__init__()
         if mean and len(set(sizes)) > 1:
-            raise ValueError(f"parts need one size to have a mean, but have the sizes {', '.join(map(str, sizes))}")
+            raise ValueError(f"parts must have equal sizes for a mean, got {', '.join(map(str, sizes))}")
         self.sizes = tuple(sizes)
         self.mean = mean
         self.kind = activation
@@ -265,8 +265,8 @@ class Join(nn.Module):
 
     def forward(self, parts: Sequence[Tensor]) -> Tensor:
         """Return (B, T, H) for parts (B, T, D) or (B, D); return (B, H) if every part is (B, D)."""
-        joined = self._join(parts)
-        return joined if self.first is None else self.rest(self.first(joined))
+        values = self._join(parts)
+        return values if self.first is None else self.rest(self.first(values))
 
     def _join(self, parts: Sequence[Tensor]) -> Tensor:
         if len(parts) == 1:
@@ -284,8 +284,8 @@ class Join(nn.Module):
         """
         layer = self.first or through
         if layer is None:
-            none = self.like.new_empty(batch, length, 0)
-            return Hoisted(torch.cat(aligned([none, *known.values()]), dim=-1), [], known)
+            empty = self.like.new_empty(batch, length, 0)
+            return Hoisted(torch.cat(aligned([empty, *known.values()]), dim=-1), [], known)
         if self.mean:
             weights = [layer.weight / len(self.sizes)] * len(self.sizes)
         else:
@@ -301,9 +301,9 @@ class Join(nn.Module):
         """Return the features (B, H) at step t, or (B, N, H) at several, from hoisted and live parts."""
         first = hoisted.steps[t] if isinstance(t, int) else hoisted.base[:, t]
         if self.first is None:
-            seen = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=-1), strict=True))
-            coming = iter(live)
-            return self._join([seen[i] if i in seen else next(coming) for i in range(len(self.sizes))])
+            known = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=-1), strict=True))
+            remaining = iter(live)
+            return self._join([known[i] if i in known else next(remaining) for i in range(len(self.sizes))])
         for part, weight in zip(live, hoisted.weights, strict=True):
             first = torch.addmm(first, part, weight.t()) if part.dim() == 2 else first + part @ weight.t()
         features: Tensor = self.rest(first)

@@ -62,9 +62,11 @@ def _runs_lstm(precision: torch.dtype, training: bool) -> bool:
     with torch.inference_mode(False), torch.set_grad_enabled(training), torch.autocast("cpu", precision):
         entry, weight, bias = (torch.zeros(shape, requires_grad=training) for shape in ((1, 1, 1), (4, 1), (4,)))
         try:
-            found = torch.lstm(entry, (entry, entry), [weight, weight, bias, bias], True, 1, 0.0, training, False, True)
+            outputs = torch.lstm(
+                entry, (entry, entry), [weight, weight, bias, bias], True, 1, 0.0, training, False, True
+            )
             if training:
-                found[0].sum().backward()
+                outputs[0].sum().backward()
         except RuntimeError:
             return False
     return True

@@ -116,15 +116,15 @@ class CosineDecoder(CosineEncoder):
         return CosineDecoderNetwork(self, inputs, local, size)
 
 
-def _apart(network: Network, spec: Any) -> tuple[list[Input], Input]:
+def _split_inputs(network: Network, spec: Any) -> tuple[list[Input], Input]:
     """Return the parents over time and the static parent."""
     over_time = [parent for parent in network.inputs if parent.relation is not None]
     static = [parent for parent in network.inputs if parent.relation is None]
     if not network.local or not over_time or len(static) != 1:
-        given = ", ".join(f"{p.name} ({'static' if p.relation is None else 'local'})" for p in network.inputs)
+        descriptions = ", ".join(f"{p.name} ({'static' if p.relation is None else 'local'})" for p in network.inputs)
         raise ValueError(
             f"{type(spec).__name__} reads parents over time and one static parent, for a local variable; it was given "
-            f"{given or 'none'} for a {'local' if network.local else 'static'} one"
+            f"{descriptions or 'none'} for a {'local' if network.local else 'static'} one"
         )
     return over_time, static[0]
 
@@ -134,7 +134,7 @@ class CosineEncoderNetwork(FixedLengthNetwork):
 
     def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 2 * spec.width)
-        (source, *others), static = _apart(self, spec)
+        (source, *others), static = _split_inputs(self, spec)
         if others or source.relation != ALL:
             raise ValueError(f"CosineEncoder reads one parent over all time, as in y_{{1:T}}; not {self.inputs}")
         self.spec, self.names = spec, (source.name, static.name)
@@ -164,7 +164,7 @@ class CosineDecoderNetwork(FixedLengthNetwork):
 
     def __init__(self, spec: CosineDecoder, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
-        over_time, static = _apart(self, spec)
+        over_time, static = _split_inputs(self, spec)
         sizes = {parent.name: parent.size for parent in over_time}
         if spec.latent not in sizes or static.size != size:
             raise ValueError(
@@ -194,8 +194,8 @@ class CosineDecoderNetwork(FixedLengthNetwork):
         if self.spec.cosine:
             values = cosine_basis(length, components, values.dtype, values.device).T @ values
         start = memoize_valid(self.static, first, None)
-        joined = [start[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
-        hidden = self.into(torch.cat(joined, dim=-1))
+        inputs = [start[:, None].expand(-1, length, -1), values, *(parents[name] for name in self.others)]
+        hidden = self.into(torch.cat(inputs, dim=-1))
         hidden = self.transformer(
             self.dropout(hidden + positions(length, hidden.shape[-1], hidden.dtype, hidden.device))
         )
@@ -213,10 +213,10 @@ class Dropout(nn.Dropout):
     def forward(self, input: Tensor) -> Tensor:
         if not (self.training and 0 < self.p < 1 and input.device.type == "cpu"):
             return super().forward(input)
-        kept = round((1 - self.p) * 2**16)
+        threshold = round((1 - self.p) * 2**16)
         words = torch.empty(-(-input.numel() // 4), dtype=torch.int64).random_(-(2**63), None)
-        mask = words.view(torch.int16)[: input.numel()].view(input.shape) < kept - 2**15
-        return input * mask.to(input.dtype).mul_(2**16 / kept)
+        mask = words.view(torch.int16)[: input.numel()].view(input.shape) < threshold - 2**15
+        return input * mask.to(input.dtype).mul_(2**16 / threshold)
 
 
 class TransformerLayer(nn.TransformerEncoderLayer):
@@ -242,8 +242,8 @@ class TransformerLayer(nn.TransformerEncoderLayer):
             for each in functional.linear(src, attention.in_proj_weight, attention.in_proj_bias).chunk(3, dim=-1)
         )
         weights = (query @ key.mT / math.sqrt(query.shape[-1])).softmax(-1)
-        read = attention.out_proj((self.unseen(weights) @ value).transpose(1, 2).flatten(2))
-        hidden: Tensor = self.norm1(src + self.dropout1(read))
+        attended = attention.out_proj((self.unseen(weights) @ value).transpose(1, 2).flatten(2))
+        hidden: Tensor = self.norm1(src + self.dropout1(attended))
         hidden = self.norm2(hidden + self.dropout2(self.linear2(self.dropout(self.linear1(hidden).relu()))))
         return hidden
 
@@ -260,11 +260,11 @@ def _layer(size: int, out: int) -> list[nn.Module]:
 def transformer(size: int, spec: CosineEncoder) -> nn.TransformerEncoder:
     """Return a transformer encoder with normalisation after each layer and at the end."""
     layer = TransformerLayer(size, spec.heads, spec.feedforward, spec.dropout, batch_first=True)
-    made = nn.TransformerEncoder(layer, spec.layers, nn.LayerNorm(size), enable_nested_tensor=False)
-    for parameter in made.parameters():  # torch copies one layer, so all would have the same initial weights
+    encoder = nn.TransformerEncoder(layer, spec.layers, nn.LayerNorm(size), enable_nested_tensor=False)
+    for parameter in encoder.parameters():  # torch copies one layer, so all would have the same initial weights
         if parameter.dim() > 1:
             nn.init.xavier_uniform_(parameter)
-    return made
+    return encoder
 
 
 @lru_cache(maxsize=64)

@@ -60,8 +60,8 @@ class Extractors(nn.ModuleDict):
         self, kept: Mapping[str, tuple[Any, Rows]], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
     ) -> dict[str, Sequence[Tensor]]:
         """Return the draws of a loop so far with extracted features in place of values; each draw is evaluated once."""
-        found = {n: extend_features(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
-        return {**drawn, **found}
+        features = {n: extend_features(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
+        return {**drawn, **features}
 
 
 def share(name: str, *networks: Any) -> None:
@@ -69,6 +69,6 @@ def share(name: str, *networks: Any) -> None:
 
     Its output is evaluated once for all of them by `memoize`.
     """
-    held = [network.extractors for network in networks if name in network.extractors]
-    for extractors in held[1:]:
-        extractors[name] = held[0][name]
+    sharing = [network.extractors for network in networks if name in network.extractors]
+    for extractors in sharing[1:]:
+        extractors[name] = sharing[0][name]

@@ -63,28 +63,28 @@ class GraphConvNetwork(FixedLengthNetwork):
 
     def __init__(self, spec: GraphConv, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
-        own, coefficients = list(spec.nodes[spec.child]), spec.coefficients
-        self.spec, self.own, self.coordinates = spec, own, size // len(own)
-        if not local or size % len(own):
+        child_nodes, coefficients = list(spec.nodes[spec.child]), spec.coefficients
+        self.spec, self.own, self.coordinates = spec, child_nodes, size // len(child_nodes)
+        if not local or size % len(child_nodes):
             raise ValueError(
-                f"GraphConv outputs the trajectories of {len(own)} nodes with equal numbers of coordinates, for a "
-                f"local variable {spec.child}, not of size {size}"
+                f"GraphConv needs a local variable whose size is a multiple of its {len(child_nodes)} nodes, but "
+                f"{spec.child} is {'local' if local else 'static'} and has size {size}"
             )
         self.trajectories: list[tuple[str, list[int], int]] = []
         for parent in self.inputs:
             if parent.relation is None:
                 continue
-            held = list(spec.nodes.get(parent.name, ()))
-            if parent.size != self.coordinates * len(held):
+            nodes_of_parent = list(spec.nodes.get(parent.name, ()))
+            if parent.size != self.coordinates * len(nodes_of_parent):
                 raise ValueError(
-                    f"{parent.name} has size {parent.size}, but GraphConv was given its nodes {held}, of "
+                    f"{parent.name} has size {parent.size}, but GraphConv was given its nodes {nodes_of_parent}, of "
                     f"{self.coordinates} coordinates"
                 )
-            self.trajectories.append((parent.name, held, _seen(parent, spec.length)))
+            self.trajectories.append((parent.name, nodes_of_parent, _visible_steps(parent, spec.length)))
         self.trajectories.sort(key=lambda trajectory: -len(trajectory[1]))
         if not self.trajectories or sorted(self.trajectories[0][1]) != list(range(len(self.trajectories[0][1]))):
             raise ValueError(
-                "GraphConv starts from a parent that has every node, such as the history h_{1:O}; the parents are "
+                "GraphConv needs a parent that contains every node, such as the history h_{1:O}; the parents are "
                 f"{', '.join(parent.name for parent in self.inputs)}"
             )
         cosine_basis(spec.length, coefficients)  # raises an error for too many coefficients
@@ -109,34 +109,38 @@ class GraphConvNetwork(FixedLengthNetwork):
             )
         if self.training and len(parents[self.trajectories[0][0]]) == 1:
             raise ValueError(
-                "GraphConv normalises over the batch, which in training needs more than one row; take a larger batch "
-                "or more draws"
+                "GraphConv normalises over the batch, so training needs more than one row; use a larger batch or "
+                "more draws"
             )
         with torch.autocast(self.last.weight.device.type, enabled=False):  # half precision is too coarse for positions
-            known = self._coefficients(parents)
-        static = [parents[name][:, None].expand(-1, known.shape[1], -1) for name in self.statics]
-        joined = torch.cat([known, *static], dim=-1)
-        hidden = self.first(joined)
+            coefficients = self._coefficients(parents)
+        static = [parents[name][:, None].expand(-1, coefficients.shape[1], -1) for name in self.statics]
+        inputs = torch.cat([coefficients, *static], dim=-1)
+        hidden = self.first(inputs)
         for block in self.rest:
             hidden = hidden + block(hidden)
-        made: Tensor = (self.last(hidden) + joined)[..., : self.inner].index_select(1, indices(self.own, hidden))
-        made = made.unflatten(-1, (self.coordinates, -1)).flatten(1, 2).to(known.dtype)
-        with torch.autocast(made.device.type, enabled=False):
-            return (made @ self._transform(length, made)).transpose(1, 2)
+        outputs: Tensor = (self.last(hidden) + inputs)[..., : self.inner].index_select(1, indices(self.own, hidden))
+        outputs = outputs.unflatten(-1, (self.coordinates, -1)).flatten(1, 2).to(coefficients.dtype)
+        with torch.autocast(outputs.device.type, enabled=False):
+            return (outputs @ self._transform(length, outputs)).transpose(1, 2)
 
     def _coefficients(self, parents: Mapping[str, Tensor]) -> Tensor:
         """Return (B, nodes, coordinates * C): coefficients of the first coordinate, then of the second, and so on."""
-        known: Tensor | None = None
-        for name, nodes, seen in self.trajectories:
-            values, own = parents[name][:, :seen], indices(nodes, self.last.weight)
-            found = (self._transform(seen, values) @ values).transpose(1, 2)  # (B, nodes * coordinates, C)
-            found = found.unflatten(1, (-1, self.coordinates)).flatten(2)
-            known = found.index_select(1, own.argsort()) if known is None else known.index_copy(1, own, found)
-        assert known is not None
-        return known
+        total: Tensor | None = None
+        for name, nodes, n_steps in self.trajectories:
+            values, node_indices = parents[name][:, :n_steps], indices(nodes, self.last.weight)
+            coefficients = (self._transform(n_steps, values) @ values).transpose(1, 2)  # (B, nodes * coordinates, C)
+            coefficients = coefficients.unflatten(1, (-1, self.coordinates)).flatten(2)
+            total = (
+                coefficients.index_select(1, node_indices.argsort())
+                if total is None
+                else total.index_copy(1, node_indices, coefficients)
+            )
+        assert total is not None
+        return total
 
-    def _transform(self, seen: int, like: Tensor) -> Tensor:
-        return _transform(seen, self.spec.length, self.spec.coefficients, like.dtype, like.device)
+    def _transform(self, n_steps: int, like: Tensor) -> Tensor:
+        return _transform(n_steps, self.spec.length, self.spec.coefficients, like.dtype, like.device)
 
 
 class _Convolution(nn.Module):
@@ -176,11 +180,11 @@ class _Mix(Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         adjacency, nodes = ctx.saved_tensors
-        side_by_side, others = (values.transpose(0, 1).flatten(1) for values in (gradient, nodes))
-        return side_by_side @ others.T, torch.bmm(adjacency.T.expand(len(nodes), -1, -1), gradient)
+        gradients, others = (values.transpose(0, 1).flatten(1) for values in (gradient, nodes))
+        return gradients @ others.T, torch.bmm(adjacency.T.expand(len(nodes), -1, -1), gradient)
 
 
-def _seen(parent: Input, length: int) -> int:
+def _visible_steps(parent: Input, length: int) -> int:
     """Return how many first steps of a parent are read; they must be the same at every step."""
     assert parent.relation is not None
     mask = torch.as_tensor(parent.relation.mask(length))
@@ -195,8 +199,8 @@ def _seen(parent: Input, length: int) -> int:
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)  # a matrix created in inference mode could not be used under autograd
-def _transform(seen: int, length: int, coefficients: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _transform(n_steps: int, length: int, coefficients: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return (C, O), which maps O visible steps to coefficients of the sequence padded with the last visible step."""
     basis = cosine_basis(length, coefficients)
-    folded = torch.cat([basis[:, : seen - 1], basis[:, seen - 1 :].sum(1, keepdim=True)], dim=1)
+    folded = torch.cat([basis[:, : n_steps - 1], basis[:, n_steps - 1 :].sum(1, keepdim=True)], dim=1)
     return folded.to(device, dtype)

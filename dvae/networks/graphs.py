@@ -66,10 +66,10 @@ class NodeFeatures(nn.Module):
         first, *others = (layer.product() for layer in (self.first, *(layer for b in self.blocks for layer in b)))
 
         def features(frames: Tensor) -> Tensor:
-            found = torch.tanh(functional.linear(frames, *first))
+            hidden = torch.tanh(functional.linear(frames, *first))
             for inner, outer in zip(others[::2], others[1::2], strict=True):
-                found = found + torch.tanh(functional.linear(torch.tanh(functional.linear(found, *inner)), *outer))
-            return found
+                hidden = hidden + torch.tanh(functional.linear(torch.tanh(functional.linear(hidden, *inner)), *outer))
+            return hidden
 
         return features
 
@@ -142,13 +142,13 @@ class FrameGraphNetwork(Network):
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """Return (B, frames * width)."""
-        found = self.extractors.of(parents, lengths)
-        values = torch.cat([found[parent.name] for parent in self.inputs], dim=-1)
+        extracted = self.extractors.of(parents, lengths)
+        values = torch.cat([extracted[parent.name] for parent in self.inputs], dim=-1)
         last = values.new_full((len(values),), length - 1, dtype=torch.long) if lengths is None else lengths - 1
         first = torch.zeros_like(last)
         if self.training:
-            room = (last + 2 - self.frames).clamp_min(1)  # number of possible starts of the window
-            first = (torch.rand(len(values), device=values.device) * room).long()
+            n_starts = (last + 2 - self.frames).clamp_min(1)  # number of possible starts of the window
+            first = (torch.rand(len(values), device=values.device) * n_starts).long()
         window = (first[:, None] + torch.arange(self.frames, device=values.device)).minimum(last[:, None])
         features: Tensor = self.first(values.gather(1, window[..., None].expand(-1, -1, values.shape[-1])))
         for block in self.blocks:

@@ -49,14 +49,14 @@ class WithNoise:
         Raises:
             ValueError: the factor does not read the scale at t only, has no other parents, or the sizes differ.
         """
-        found = [p for p in inputs if p.name == self.scale and p.size == size and p.lags in (None, (0,))]
-        if not found or (found[0].relation is not None) != (found[0].lags == (0,)) or len(inputs) < 2:
+        scales = [p for p in inputs if p.name == self.scale and p.size == size and p.lags in (None, (0,))]
+        if not scales or (scales[0].relation is not None) != (scales[0].lags == (0,)) or len(inputs) < 2:
             raise ValueError(
                 f"WithNoise reads the scale {self.scale} of size {size} at t, such as p(x_t | z_t, {self.scale}_t), "
                 f"and other parents; the parents are {', '.join(f'{p.name} ({p.size})' for p in inputs)}"
             )
-        inner = self.network.build([p for p in inputs if p is not found[0]], local, size)
-        return WithNoiseNetwork(inner, inputs, found[0], local)
+        inner = self.network.build([p for p in inputs if p is not scales[0]], local, size)
+        return WithNoiseNetwork(inner, inputs, scales[0], local)
 
 
 class WithNoiseNetwork(Network):
@@ -68,35 +68,35 @@ class WithNoiseNetwork(Network):
         super().__init__(inputs, local, inner.features + scale.size)
         self.inner, self.name = inner, scale.name
 
-    def _of(self, given: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {name: value for name, value in given.items() if name != self.name}
+    def _without_scale(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {name: value for name, value in values.items() if name != self.name}
 
     def _scales(self, values: Tensor, length: int, lengths: Tensor | None) -> Tensor:
         """Return the scales (B, T, D) or (B, D), 1 at padding."""
         if values.dim() == 2 and self.local:
             values = values[:, None].expand(-1, length, -1)
-        there = torch.ones_like(values, dtype=torch.bool)
+        valid = torch.ones_like(values, dtype=torch.bool)
         if lengths is not None and values.dim() == 3:
-            there = valid_steps(lengths, length)[..., None].expand_as(values)
-        if (bad := there & ~(values > 0)).any():
-            place = bad.nonzero()[0].tolist()
+            valid = valid_steps(lengths, length)[..., None].expand_as(values)
+        if (bad := valid & ~(values > 0)).any():
+            index = bad.nonzero()[0].tolist()
             raise ValueError(
-                f"{self.name} is {values[tuple(place)].item():g} in sequence {place[0]}, but a scale of noise must be "
+                f"{self.name} is {values[tuple(index)].item():g} in sequence {index[0]}, but a noise scale must be "
                 "above 0"
             )
-        return torch.where(there, values, 1.0)
+        return torch.where(valid, values, 1.0)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        features = self.inner(self._of(parents), length, lengths)
+        features = self.inner(self._without_scale(parents), length, lengths)
         return torch.cat([features, self._scales(parents[self.name], length, lengths)], -1)
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         if self.name not in given:
-            raise ValueError(f"the scale {self.name} of noise is context, which a batch gives, and cannot be drawn")
+            raise ValueError(f"the noise scale {self.name} cannot be drawn; give it as context in the batch")
         scales = self._scales(given[self.name], length, lengths).unbind(1)
-        return self.inner.start(self._of(given), batch, length, lengths), scales
+        return self.inner.start(self._without_scale(given), batch, length, lengths), scales
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:

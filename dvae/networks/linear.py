@@ -93,8 +93,8 @@ class LinearNetwork(Network):
         base, live = state
         features = base[t]
         for name, (weight, mask) in live.items():
-            for s, seen in enumerate(mask[t]):
-                if seen:
+            for s, is_visible in enumerate(mask[t]):
+                if is_visible:
                     features = features + at(drawn[name], s, features, weight.shape[-1]) @ weight[t, s].t()
         return features, state
 

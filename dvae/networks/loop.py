@@ -33,11 +33,11 @@ class Rows(Sequence[Any]):
 
     def select(self, rows: Tensor) -> Rows:
         """Return the same values under one more selection of rows (N,)."""
-        chosen = Rows(self.values)
-        chosen.written = list(self.written)
-        chosen.moves = [*self.moves, rows]
-        chosen.origin = rows if self.origin is None else self.origin.index_select(0, rows)
-        return chosen
+        selected = Rows(self.values)
+        selected.written = list(self.written)
+        selected.moves = [*self.moves, rows]
+        selected.origin = rows if self.origin is None else self.origin.index_select(0, rows)
+        return selected
 
     def __getitem__(self, t: Any) -> Any:
         value, since = self.values[t], self.written[t]
@@ -95,20 +95,20 @@ def select(state: Any, rows: Tensor) -> Any:
 Computed = TypeVar("Computed")
 
 
-_ONCE: ContextVar[dict[Any, Any] | None] = ContextVar("once", default=None)
+_CACHE: ContextVar[dict[Any, Any] | None] = ContextVar("once", default=None)
 
 
 @contextmanager
 def memoizing() -> Iterator[None]:
     """Cache the results of `memoize` within the block: for one evaluation of guide and model with fixed parameters."""
-    if _ONCE.get() is not None:
+    if _CACHE.get() is not None:
         yield
         return
-    token = _ONCE.set({})
+    token = _CACHE.set({})
     try:
         yield
     finally:
-        _ONCE.reset(token)
+        _CACHE.reset(token)
 
 
 def memoize(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed]) -> Computed:
@@ -116,21 +116,21 @@ def memoize(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed
 
     Factors that share a module, such as h_t in SRNN, thus evaluate it once without a reference to each other.
     """
-    kept = _ONCE.get()
-    if kept is None:
+    cache = _CACHE.get()
+    if cache is None:
         return compute()
     key = _key(owner, inputs)
-    if key not in kept:
-        kept[key] = (inputs, compute())  # keep the inputs alive, so that their ids are not reused
-    result: Computed = kept[key][1]
+    if key not in cache:
+        cache[key] = (inputs, compute())  # keep the inputs alive, so that their ids are not reused
+    result: Computed = cache[key][1]
     return result
 
 
 def store_result(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
     """Store a result for `memoize` that was computed in another way, such as within a loop."""
-    kept = _ONCE.get()
-    if kept is not None:
-        kept[_key(owner, inputs)] = (inputs, result)
+    cache = _CACHE.get()
+    if cache is not None:
+        cache[_key(owner, inputs)] = (inputs, result)
 
 
 def _key(owner: object, inputs: Sequence[Any]) -> tuple[Any, ...]:
@@ -142,9 +142,9 @@ def shift(values: Tensor, lag: int) -> Tensor:
     if lag == 0:
         return values
     steps = values.shape[1]
-    moved = values[:, max(lag, 0) : steps + min(lag, 0)] if abs(lag) < steps else values[:, :0]
+    shifted = values[:, max(lag, 0) : steps + min(lag, 0)] if abs(lag) < steps else values[:, :0]
     gap = min(abs(lag), steps)
-    return functional.pad(moved, (0, 0, gap, 0) if lag < 0 else (0, 0, 0, gap))
+    return functional.pad(shifted, (0, 0, gap, 0) if lag < 0 else (0, 0, 0, gap))
 
 
 def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
@@ -193,10 +193,10 @@ def memoize_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> 
         first, n = memoize(repeat_batch, [values], lambda: (values, 1))
         if n > 1 and lengths is None:
             return repeat_batch(memoize_valid(module, first, None), n)
-        found: Tensor = module(values)
-        if lengths is None or found.dim() == 2:
-            return found
-        return found * valid_steps(lengths, found.shape[1])[..., None]
+        features: Tensor = module(values)
+        if lengths is None or features.dim() == 2:
+            return features
+        return features * valid_steps(lengths, features.shape[1])[..., None]
 
     return memoize(module, [values, lengths], compute)
 
@@ -216,8 +216,10 @@ def extend_features(
         module, lengths: as in `memoize_valid`.
         change: version of the module for single steps, with computations shared by all steps already done.
     """
-    there = drawn.values if isinstance(drawn, Rows) else drawn
-    fresh = [s for s, (made, value) in enumerate(zip(rows.values, there, strict=False)) if made is None is not value]
+    draws = drawn.values if isinstance(drawn, Rows) else drawn
+    fresh = [
+        s for s, (feature, value) in enumerate(zip(rows.values, draws, strict=False)) if feature is None is not value
+    ]
     values = [drawn[s] for s in fresh]
 
     def compute() -> Sequence[Tensor]:
@@ -227,8 +229,8 @@ def extend_features(
             else steps_of(memoize_valid(module, whole_of(values), None))
         )
 
-    for s, made in zip(fresh, memoize(module, [lengths, *values], compute) if fresh else [], strict=True):
-        rows[s] = made if lengths is None else made * (s < lengths)[:, None]
+    for s, feature in zip(fresh, memoize(module, [lengths, *values], compute) if fresh else [], strict=True):
+        rows[s] = feature if lengths is None else feature * (s < lengths)[:, None]
     return rows
 
 

@@ -44,8 +44,8 @@ class Residual(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         """Return (B, features) for (B, size)."""
-        made: Tensor = self.short(values) + self.long(values)
-        return made
+        features: Tensor = self.short(values) + self.long(values)
+        return features
 
 
 class CodeDecoder(nn.Module):
@@ -62,8 +62,8 @@ class CodeDecoder(nn.Module):
         """Return (B, L) for (B, L), between -1 and 1 like recurrent states."""
         norm, learning = self.norm, self.training and len(code) > 1
         mean, var = norm.running_mean, norm.running_var
-        made = functional.batch_norm(self.first(code), mean, var, norm.weight, norm.bias, learning, eps=norm.eps)
-        return torch.tanh(self.last(functional.relu(made)))
+        hidden = functional.batch_norm(self.first(code), mean, var, norm.weight, norm.bias, learning, eps=norm.eps)
+        return torch.tanh(self.last(functional.relu(hidden)))
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,9 @@ class _MixedEncoder(nn.Module):
         super().__init__()
         self.block = Residual(width, width)
 
-    def forward(self, past: Tensor, future: Tensor, chosen: Tensor | None = None) -> Tensor:
-        chosen = _told(chosen)
-        features: Tensor = self.block(chosen * past + (1 - chosen) * future)
+    def forward(self, past: Tensor, future: Tensor, indices: Tensor | None = None) -> Tensor:
+        indices = _require_indices(indices)
+        features: Tensor = self.block(indices * past + (1 - indices) * future)
         return features
 
 
@@ -125,27 +125,27 @@ class _MixedDecoder(nn.Module):
         self.block = Residual(width, count) if count else None
         self.last = CodeDecoder(width)
 
-    def forward(self, past: Tensor, z: Tensor, chosen: Tensor | None = None) -> Tensor:
-        chosen = _told(chosen)
+    def forward(self, past: Tensor, z: Tensor, indices: Tensor | None = None) -> Tensor:
+        indices = _require_indices(indices)
         if z.shape[-1] != self.latent:
             raise ValueError(f"z has {z.shape[-1]} numbers, but this code was built for {self.latent}")
-        placed = _laid_out(z, chosen < 0.5) if self.layer is None else functional.relu(self.layer(z))
-        mixed, code = chosen * past + (1 - chosen) * placed, past
+        latent_code = _scatter_in_order(z, indices < 0.5) if self.layer is None else functional.relu(self.layer(z))
+        mixture, code = indices * past + (1 - indices) * latent_code, past
         if self.block is not None:
-            code = chosen * _laid_out(self.block(mixed), chosen > 0.5) + (1 - chosen) * past
-        made: Tensor = self.last(code)
-        return made
+            code = indices * _scatter_in_order(self.block(mixture), indices > 0.5) + (1 - indices) * past
+        decoded: Tensor = self.last(code)
+        return decoded
 
 
-def _told(chosen: Tensor | None) -> Tensor:
-    if chosen is None:
-        raise ValueError("Mix-and-Match perturbs drawn indices; give them, (B, L) of ones and zeros")
-    return chosen
+def _require_indices(indices: Tensor | None) -> Tensor:
+    if indices is None:
+        raise ValueError("Mix-and-Match needs the indices to perturb; give them as (B, L) ones and zeros")
+    return indices
 
 
-def _laid_out(values: Tensor, places: Tensor) -> Tensor:
+def _scatter_in_order(values: Tensor, mask: Tensor) -> Tensor:
     """Return (B, L) with values (B, n) placed in order at the n marked positions of `places` (B, L)."""
-    order = (places.cumsum(-1) - 1).clamp(0, values.shape[-1] - 1)
+    order = (mask.cumsum(-1) - 1).clamp(0, values.shape[-1] - 1)
     return values.gather(-1, order)
 
 
@@ -164,21 +164,21 @@ class Concatenate:
 
     def encoder(self, width: int) -> nn.Module:
         """Return the module for the guide's features."""
-        return _Beside(2 * width, width)
+        return _Concatenated(2 * width, width)
 
     def decoder(self, width: int, latent: int) -> nn.Module:
         """Return the module for the initial code of the future."""
-        return _Beside(width + latent, width, CodeDecoder(width))
+        return _Concatenated(width + latent, width, CodeDecoder(width))
 
 
-class _Beside(nn.Module):
+class _Concatenated(nn.Module):
     def __init__(self, size: int, width: int, last: nn.Module | None = None) -> None:
         super().__init__()
         self.block, self.last = Residual(size, width), last or nn.Identity()
 
-    def forward(self, past: Tensor, other: Tensor, chosen: Tensor | None = None) -> Tensor:
-        made: Tensor = self.last(self.block(torch.cat([past, other], -1)))
-        return made
+    def forward(self, past: Tensor, other: Tensor, indices: Tensor | None = None) -> Tensor:
+        features: Tensor = self.last(self.block(torch.cat([past, other], -1)))
+        return features
 
 
 @dataclass(frozen=True)
@@ -194,17 +194,17 @@ class AddProjected:
 
     def decoder(self, width: int, latent: int) -> nn.Module:
         """Return the module for the initial code of the future."""
-        return _Added(width, latent)
+        return _ProjectedSum(width, latent)
 
 
-class _Added(nn.Module):
+class _ProjectedSum(nn.Module):
     def __init__(self, width: int, latent: int) -> None:
         super().__init__()
         self.layer = nn.Linear(latent, width, bias=False)
 
-    def forward(self, past: Tensor, z: Tensor, chosen: Tensor | None = None) -> Tensor:
-        made: Tensor = past + self.layer(z)
-        return made
+    def forward(self, past: Tensor, z: Tensor, indices: Tensor | None = None) -> Tensor:
+        features: Tensor = past + self.layer(z)
+        return features
 
 
 class Noise(Protocol):

@@ -128,12 +128,14 @@ class Memory(nn.Module):
         first = self.embed[0] if self.embed is not None else self.layers[0]
         weight, bias = (first.weight, first.bias) if self.embed is not None else (first.weight_ih_l0, first.bias_ih_l0)
         columns = weight.split([parent.size for parent, _ in self.entries], dim=1)
-        known = [i for i, (parent, _) in enumerate(self.entries) if parent.name in given]
-        live = [i for i in range(len(self.entries)) if i not in known]
+        known_entries = [i for i, (parent, _) in enumerate(self.entries) if parent.name in given]
+        live = [i for i in range(len(self.entries)) if i not in known_entries]
         base = bias.expand(batch, 1, -1)
-        if known:
-            values = torch.cat([shift(given[self.entries[i][0].name], self.entries[i][1]) for i in known], dim=-1)
-            base = functional.linear(values, torch.cat([columns[i] for i in known], dim=1), bias)
+        if known_entries:
+            values = torch.cat(
+                [shift(given[self.entries[i][0].name], self.entries[i][1]) for i in known_entries], dim=-1
+            )
+            base = functional.linear(values, torch.cat([columns[i] for i in known_entries], dim=1), bias)
         zero = weight.new_zeros(batch, self.layers[0].hidden_size)
         return MemoryState(
             base=base,
@@ -204,9 +206,9 @@ class MemoryState:
 
     def select(self, rows: Tensor) -> MemoryState:
         """Return the selected rows; the base is unchanged."""
-        chosen = MemoryState(self.base, self.live, select(self.lengths, rows), select(self.hidden, rows))
-        chosen.steps = select(self.steps, rows)
-        return chosen
+        selected = MemoryState(self.base, self.live, select(self.lengths, rows), select(self.hidden, rows))
+        selected.steps = select(self.steps, rows)
+        return selected
 
 
 def gru_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[Tensor, Tensor]:
@@ -260,9 +262,7 @@ class RecurrentNetwork(Network):
         if spec.stack and (
             not past or {parent for parent, _ in past} != {parent for parent, _ in future} or spec.separate
         ):
-            raise ValueError(
-                "Recurrent(stack=True) is for factors that read over time at {1:T} only, with one state for all"
-            )
+            raise ValueError("Recurrent(stack=True) needs parents that are all read over {1:T}, and separate=False")
         pasts = [Memory(spec, entries, +1) for entries in _groups(past, spec.separate)]
         under = pasts[0] if spec.stack else None
         futures = [Memory(spec, entries, -1, under) for entries in _groups(future, spec.separate)]
@@ -290,20 +290,20 @@ class RecurrentNetwork(Network):
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         values = self.extractors.of(given, lengths)
-        known: dict[int, Tensor] = {}
+        known_parts: dict[int, Tensor] = {}
         memories: list[tuple[Memory, MemoryState]] = []
         for i, memory in enumerate(self.memories):
             if all(parent.name in given for parent, _ in memory.entries):
-                known[i] = memory(values, given, lengths)
+                known_parts[i] = memory(values, given, lengths)
             else:
                 memories.append((memory, memory.start(values, batch, lengths)))
         live: list[tuple[Input, int]] = []
         for i, (parent, lag) in enumerate(self.points, len(self.memories)):
             if parent.name in given:
-                known[i] = part(values[parent.name], lag)
+                known_parts[i] = part(values[parent.name], lag)
             elif lag is not None:
                 live.append((parent, lag))
-        hoisted = self.join.hoist(known, batch, length)
+        hoisted = self.join.hoist(known_parts, batch, length)
         return RecurrentState(hoisted, memories, live, self.extractors.start(length), dict(given), lengths)
 
     @override
@@ -336,8 +336,8 @@ class RecurrentNetwork(Network):
             return None
         ((parent, lag, _),) = memory_state.live
 
-        def remember(drawn: Tensor, states: Tensor) -> None:
-            store_result(memory, memory.key({**state.given, parent.name: drawn}, memory_state.lengths), states)
+        def remember(child: Tensor, states: Tensor) -> None:
+            store_result(memory, memory.key({**state.given, parent.name: child}, memory_state.lengths), states)
 
         return Chain(lag, self.join, state.hoisted, self._layers(parent.name), cell, remember)
 
@@ -370,8 +370,8 @@ class RecurrentState:
 
     def select(self, rows: Tensor) -> RecurrentState:
         """Return the selected rows; the known parents are unchanged."""
-        moved = {name: select(getattr(self, name), rows) for name in ("hoisted", "memories", "extracted", "lengths")}
-        return replace(self, **moved)
+        selected = {name: select(getattr(self, name), rows) for name in ("hoisted", "memories", "extracted", "lengths")}
+        return replace(self, **selected)
 
 
 def tie(first: Any, *others: Any) -> None:
@@ -384,8 +384,8 @@ def tie(first: Any, *others: Any) -> None:
     """
     shape = _shape(first)
     for other in others:
-        if (theirs := _shape(other)) != shape:
-            raise ValueError(f"cannot tie memories of different pasts: one has {shape}, the other {theirs}")
+        if (other_shape := _shape(other)) != shape:
+            raise ValueError(f"cannot tie memories of different pasts: one has {shape}, the other {other_shape}")
         replaced = other.past
         for memory in other.memories:
             if memory.under is replaced:

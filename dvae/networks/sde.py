@@ -73,8 +73,8 @@ class LinearSDE:
         gaps = [p for p in inputs if p.lags == (0,) and p.size == 1]
         if not (local and len(before) == len(gaps) == 1 and len(inputs) == 2):
             raise ValueError(
-                "a LinearSDE network goes from a variable's last value over a gap of size 1, p(z_t | z_{t-1}, d_t), "
-                + _but(inputs, size)
+                "a LinearSDE network reads a variable's last value and a gap of size 1, p(z_t | z_{t-1}, d_t), "
+                + _describe_parents(inputs, size)
             )
         return LinearSDENetwork(inputs, before[0], gaps[0].name, self.times)
 
@@ -107,15 +107,15 @@ class LinearSDEGuide:
         gaps = [p for p in inputs if p.name == self.gap and p.relation and p.relation.reads(0, 2) and p.size == 1]
         if not (local and len(before) == len(gaps) == 1):
             raise ValueError(
-                f"a LinearSDEGuide network goes from a variable's last value over a gap {self.gap} of size 1, such as "
-                f"q(z_t | z_{{t-1}}, x_{{1:T}}, {self.gap}_{{1:T}}), " + _but(inputs, size)
+                f"a LinearSDEGuide network reads a variable's last value and a gap {self.gap} of size 1, such as "
+                f"q(z_t | z_{{t-1}}, x_{{1:T}}, {self.gap}_{{1:T}}), " + _describe_parents(inputs, size)
             )
         return LinearSDEGuideNetwork(self, inputs, before[0])
 
 
-def _but(inputs: Sequence[Input], size: int) -> str:
+def _describe_parents(inputs: Sequence[Input], size: int) -> str:
     parents = ", ".join(f"{p.name} at {p.relation and p.relation.name} ({p.size})" for p in inputs)
-    return f"but for a child of size {size} the parents here are {parents}"
+    return f"but the parents of this child of size {size} are {parents}"
 
 
 class Equation(nn.Module):
@@ -133,8 +133,8 @@ class Equation(nn.Module):
         shortest, longest = times
         if not 0 < shortest <= longest < math.inf:
             raise ValueError(f"times must be positive, the shortest and the longest, got {times}")
-        places = (torch.arange(size) + 0.5) / size
-        self.log_rate = nn.Parameter(-math.log(shortest) - math.log(longest / shortest) * places)
+        quantiles = (torch.arange(size) + 0.5) / size
+        self.log_rate = nn.Parameter(-math.log(shortest) - math.log(longest / shortest) * quantiles)
         root = (0.5 * self.log_rate.detach()).exp()
         self.turning = nn.Parameter(0.3 * shortest * torch.randn(size, size) * root * root[:, None])  # dimensionless
         self.register_buffer("unit", torch.tensor(1 / shortest))
@@ -162,11 +162,11 @@ class Equation(nn.Module):
         """
 
         def compute() -> tuple[Tensor, Tensor]:
-            there = torch.ones_like(gaps[..., 0], dtype=torch.bool)
+            has_previous = torch.ones_like(gaps[..., 0], dtype=torch.bool)
             if lengths is not None:
-                there &= valid_steps(lengths, gaps.shape[1])
-            there[:, 0] = False
-            return self.over(gaps[..., 0], there, name)
+                has_previous &= valid_steps(lengths, gaps.shape[1])
+            has_previous[:, 0] = False
+            return self.over(gaps[..., 0], has_previous, name)
 
         return memoize(self, [gaps, lengths], compute)
 
@@ -185,13 +185,13 @@ class Equation(nn.Module):
         if (bad := there & ~((gaps > 0) & (gaps < math.inf))).any():
             row, t = bad.nonzero()[0].tolist()
             raise ValueError(
-                f"{name} is {gaps[row, t]:g} at step {first + t} of sequence {row}, counted from 0; a gap is the time "
-                "since the step before, in its own unit and above 0 (values at one time make one step)"
+                f"{name} is {gaps[row, t]:g} at step {first + t} of sequence {row}, counted from 0; a gap, the time "
+                "since the previous step, must be positive and finite: merge values at one time into one step"
             )
         distinct = gaps[there]
-        place = torch.arange(len(distinct), device=gaps.device)
+        positions = torch.arange(len(distinct), device=gaps.device)
         if not gaps.requires_grad:
-            distinct, place = distinct.unique(return_inverse=True)
+            distinct, positions = distinct.unique(return_inverse=True)
         refuse_half(self.log_rate.dtype)
         with torch.autocast(gaps.device.type, enabled=False):
             decay, covariance = transition(self.drift, self.noise, distinct.to(self.log_rate.dtype))
@@ -203,9 +203,9 @@ class Equation(nn.Module):
                     torch.eye(len(self.turning), dtype=decay.dtype, device=decay.device)[None],
                 ]
             )
-        which = torch.full(gaps.shape, len(distinct), device=gaps.device)
-        which[there] = place
-        return decay[which], whitening[which]
+        index = torch.full(gaps.shape, len(distinct), device=gaps.device)
+        index[there] = positions
+        return decay[index], whitening[index]
 
 
 class LinearSDENetwork(Network):
@@ -227,30 +227,30 @@ class LinearSDENetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        moved, whitening = self.equation.at_all(parents[self.gap], lengths, self.gap)
-        return _features(moved, None, whitening, shift(parents[self.before], -1))
+        decay, whitening = self.equation.at_all(parents[self.gap], lengths, self.gap)
+        return _features(decay, None, whitening, shift(parents[self.before], -1))
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        made = None
+        transitions = None
         if self.gap in given:
-            made = tuple(part.unbind(1) for part in self.equation.at_all(given[self.gap], lengths, self.gap))
-        return made, given[self.before].unbind(1) if self.before in given else None
+            transitions = tuple(part.unbind(1) for part in self.equation.at_all(given[self.gap], lengths, self.gap))
+        return transitions, given[self.before].unbind(1) if self.before in given else None
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        made, known = state
-        moved, whitening = self.drawn_over(t, drawn) if made is None else (part[t] for part in made)
-        return _features(moved, None, whitening, self._last(known, t, drawn, moved)), state
+        transitions, previous = state
+        decay, whitening = self.drawn_over(t, drawn) if transitions is None else (part[t] for part in transitions)
+        return _features(decay, None, whitening, self._last(previous, t, drawn, decay)), state
 
     def drawn_over(self, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
         """Return F and the whitening matrix of Q, (B, D, D) each, over gaps that the loop draws."""
         gaps = drawn[self.gap][t]
-        moved, whitening = self.equation.over(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), self.gap, t)
-        return moved[:, 0], whitening[:, 0]
+        decay, whitening = self.equation.over(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), self.gap, t)
+        return decay[:, 0], whitening[:, 0]
 
-    def _last(self, known: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], like: Tensor) -> Tensor:
-        return at(drawn[self.before] if known is None else known, t - 1, like, self.size)
+    def _last(self, previous: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], like: Tensor) -> Tensor:
+        return at(drawn[self.before] if previous is None else previous, t - 1, like, self.size)
 
 
 class LinearSDEGuideNetwork(LinearSDENetwork):
@@ -272,33 +272,35 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         if all(parent.name in given for parent in self.potential.inputs):
-            made = tuple(part.unbind(1) for part in self._at_all(given, length, lengths))
-            return made, given[self.before].unbind(1) if self.before in given else None, None
+            transitions = tuple(part.unbind(1) for part in self._at_all(given, length, lengths))
+            return transitions, given[self.before].unbind(1) if self.before in given else None, None
         others = {parent.name: given[parent.name] for parent in self.potential.inputs if parent.name in given}
         return *super().start(given, batch, length, lengths), self.potential.start(others, batch, length, lengths)
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        made, known, potential = state
+        transitions, previous, potential = state
         if potential is None:
-            moved, offset, whitening = (part[t] for part in made)
-            return _features(moved, offset, whitening, self._last(known, t, drawn, moved)), state
-        moved, whitening = self.drawn_over(t, drawn) if made is None else (part[t] for part in made)
+            decay, offset, whitening = (part[t] for part in transitions)
+            return _features(decay, offset, whitening, self._last(previous, t, drawn, decay)), state
+        decay, whitening = self.drawn_over(t, drawn) if transitions is None else (part[t] for part in transitions)
         features, potential = self.potential.step(potential, t, drawn)
-        last = self._last(known, t, drawn, moved)
-        return _features(*self.updated(moved, whitening, features), last), (made, known, potential)
+        last = self._last(previous, t, drawn, decay)
+        return _features(*self.updated(decay, whitening, features), last), (transitions, previous, potential)
 
     @override
     def select(self, state: Any, rows: Tensor) -> Any:
-        made, known, potential = state
-        return *select((made, known), rows), None if potential is None else self.potential.select(potential, rows)
+        transitions, previous, potential = state
+        return *select((transitions, previous), rows), None if potential is None else self.potential.select(
+            potential, rows
+        )
 
     def _at_all(
         self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        moved, whitening = self.equation.at_all(parents[self.gap], lengths, self.gap)
+        decay, whitening = self.equation.at_all(parents[self.gap], lengths, self.gap)
         others = {parent.name: parents[parent.name] for parent in self.potential.inputs}
-        return self.updated(moved, whitening, self.potential(others, length, lengths))
+        return self.updated(decay, whitening, self.potential(others, length, lengths))
 
     def updated(self, moved: Tensor, whitening: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return M (..., D, D), c (..., D) and V (..., D, D) of q(z_t | z_{t-1}, ...) = N(M z_{t-1} + c, (V'V)^-1).
@@ -310,7 +312,7 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
             features: (..., H) of the network of the other parents.
         """
         with torch.autocast(moved.device.type, enabled=False):
-            told, scale = self.out(features.to(moved)).split([self.size, self.size**2], dim=-1)
+            observation, scale = self.out(features.to(moved)).split([self.size, self.size**2], dim=-1)
             weight = scale.unflatten(-1, moved.shape[-2:])
             g = torch.linalg.solve_triangular(whitening.mT, weight, upper=True)
             identity = torch.eye(self.size, dtype=g.dtype, device=g.device)
@@ -318,12 +320,12 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
             root = torch.linalg.cholesky((identity + g @ g.mT).flip(-1, -2)).flip(-1, -2).mT
             inner = torch.linalg.cholesky(identity + g.mT @ g)
             gain = torch.linalg.solve_triangular(whitening, torch.cholesky_solve(g.mT, inner).mT, upper=False)
-            return moved - gain @ (weight.mT @ moved), (gain @ told[..., None])[..., 0], root @ whitening
+            return moved - gain @ (weight.mT @ moved), (gain @ observation[..., None])[..., 0], root @ whitening
 
 
-def _features(moved: Tensor, offset: Tensor | None, whitening: Tensor, before: Tensor) -> Tensor:
-    with torch.autocast(moved.device.type, enabled=False):
-        loc = (moved @ before.to(moved)[..., None])[..., 0]
+def _features(decay: Tensor, offset: Tensor | None, whitening: Tensor, before: Tensor) -> Tensor:
+    with torch.autocast(decay.device.type, enabled=False):
+        loc = (decay @ before.to(decay)[..., None])[..., 0]
     return torch.cat([loc if offset is None else loc + offset, whitening.flatten(-2)], dim=-1)
 
 
@@ -350,7 +352,7 @@ def transition(drift: Tensor, noise: Tensor, gaps: Tensor) -> tuple[Tensor, Tens
     change, covariance = ((powers @ torch.stack(p).flatten(1)).unflatten(-1, drift.shape) for p in (moves, spreads))
     identity, size = torch.eye(len(drift), dtype=drift.dtype, device=drift.device), len(drift)
     for _ in range(doublings):
-        moved = (identity + change) @ torch.cat([change, covariance], dim=-1)
-        covariance = torch.baddbmm(covariance, moved[..., size:], (identity + change).mT)
-        change = change + moved[..., :size]
+        product = (identity + change) @ torch.cat([change, covariance], dim=-1)
+        covariance = torch.baddbmm(covariance, product[..., size:], (identity + change).mT)
+        change = change + product[..., :size]
     return identity + change, covariance

@@ -71,7 +71,7 @@ class WholeDecoder(WholeEncoder):
         return WholeDecoderNetwork(self, inputs, local, size)
 
 
-def _refuse(steps: int, length: int) -> None:
+def _check_length(steps: int, length: int) -> None:
     if steps > length:
         raise ValueError(f"this network supports at most {length} steps, got {steps}")
 
@@ -82,8 +82,10 @@ class WholeEncoderNetwork(Network):
     def __init__(self, spec: WholeEncoder, inputs: Sequence[Input], local: bool):
         partial = [parent.name for parent in inputs if parent.relation not in (None, ALL)]
         if local or partial:
-            why = "the child is local" if local else f"not all of {', '.join(partial)} may be read"
-            raise ValueError(f"WholeEncoder makes a static child of all steps of its parents (x_{{1:T}}); {why}")
+            reason = "the child is local" if local else f"not all of {', '.join(partial)} may be read"
+            raise ValueError(
+                f"WholeEncoder needs a static child and parents read at all steps (x_{{1:T}}), but {reason}"
+            )
         super().__init__(inputs, False, spec.widths[-1])
         self.length = spec.length
         sizes = [parent.size * (1 if parent.relation is None else spec.length) for parent in inputs]
@@ -91,10 +93,10 @@ class WholeEncoderNetwork(Network):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        _refuse(length, self.length)
+        _check_length(length, self.length)
         parts = [parents[parent.name] for parent in self.inputs]
-        behind = self.length - length
-        flat = [part if part.dim() == 2 else functional.pad(part, (0, 0, 0, behind)).flatten(1) for part in parts]
+        padding = self.length - length
+        flat = [part if part.dim() == 2 else functional.pad(part, (0, 0, 0, padding)).flatten(1) for part in parts]
         features: Tensor = self.layers(torch.cat(flat, -1))
         return features
 
@@ -114,16 +116,16 @@ class Trunk(nn.Module):
 
     def features(self, given: Sequence[Tensor]) -> Tensor:
         """Return the features (B, H) that determine all steps."""
-        found: Tensor = self.hidden(torch.cat(list(given), -1))
-        return found
+        features: Tensor = self.hidden(torch.cat(list(given), -1))
+        return features
 
     def made(self, features: Tensor, steps: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:
         """Return all steps from the features, or compute only the given steps (K,) and coordinates."""
         weight, bias = (part.unflatten(0, (self.length, -1))[:, coordinates] for part in self.out.parameters())
         if steps is not None:
             weight, bias = weight[steps], bias[steps]
-        made: Tensor = functional.linear(features, weight.flatten(0, 1), bias.flatten()).unflatten(-1, bias.shape)
-        return made
+        values: Tensor = functional.linear(features, weight.flatten(0, 1), bias.flatten()).unflatten(-1, bias.shape)
+        return values
 
 
 class WholeDecoderNetwork(FixedLengthNetwork):
@@ -131,12 +133,12 @@ class WholeDecoderNetwork(FixedLengthNetwork):
 
     def __init__(self, spec: WholeDecoder, inputs: Sequence[Input], local: bool, size: int):
         if not local or any(parent.relation is not None for parent in inputs):
-            raise ValueError("WholeDecoder makes a local child of static parents alone, such as p(x_t | z)")
+            raise ValueError("WholeDecoder needs a local child with only static parents, such as p(x_t | z)")
         super().__init__(inputs, True, size)
         sizes = spec.sizes or {spec.name: size}
         if sizes.get(spec.name) != size:
             raise ValueError(
-                f"{spec.name} has {size} coordinates, but variables that share have the sizes {dict(sizes)}"
+                f"{spec.name} has {size} coordinates, but `sizes` of the shared perceptron is {dict(sizes)}"
             )
         ends = dict(zip(sizes, accumulate(sizes.values()), strict=True))
         self.places = slice(ends[spec.name] - size, ends[spec.name])
@@ -144,7 +146,7 @@ class WholeDecoderNetwork(FixedLengthNetwork):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        _refuse(length, self.trunk.length)
-        given = [parents[parent.name] for parent in self.inputs]
-        made: Tensor = memoize(self.trunk, given, lambda: self.trunk(given))[:, :length, self.places]
-        return made
+        _check_length(length, self.trunk.length)
+        values = [parents[parent.name] for parent in self.inputs]
+        steps: Tensor = memoize(self.trunk, values, lambda: self.trunk(values))[:, :length, self.places]
+        return steps

@@ -40,9 +40,9 @@ class Reader:
         context: names of the variables that a batch must give.
         view: transformation of the data that the model sees.
         extras: names of other entries that a batch may have.
-        made: data variables that are deterministic given their parents, and are not passed to a program.
+        made: names of data variables that are deterministic given their parents; they are not passed to a program.
         distributions: conditionals of the data, which give the support and the events of the values.
-        density: whether the data have a density, and a view that changes volume needs a log-determinant.
+        density: whether the data have a density, so that a view that changes volume needs a log-determinant.
         grouped: names of static latents that groups of sequences share.
     """
 
@@ -78,53 +78,53 @@ class Reader:
         if batch is None:
             return Batch()
         names = tuple(dict.fromkeys((*self.view.names, *self.sizes)))
-        whole = WHOLE if self.view.parts else self.observed[0]
+        whole_name = WHOLE if self.view.parts else self.observed[0]
         refuse_table(batch)
         if not isinstance(batch, Mapping):
             if len(self.observed) > 1 and not self.view.parts:
                 raise ValueError(
                     f"a batch of {', '.join(self.observed)} must be a mapping of these names, not one tensor"
                 )
-            batch = {whole: batch}
+            batch = {whole_name: batch}
         if unknown := [name for name in batch if name not in (*names, *self.extras, *Batch.reserved)]:
             raise ValueError(
                 f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
             )
-        exact = {*wide, whole, *self.view.names} if wide else set()  # the view computes the variables from these
+        exact = {*wide, whole_name, *self.view.names} if wide else set()  # the view computes the variables from these
         values = _tensors(Batch(batch), dtype, names, exact)
         if "mask" in values:
-            values["mask"] = values.masks(whole)
+            values["mask"] = values.masks(whole_name)
             for name, mask in values.masks().items():
                 self._check_mask(name, mask, values)
-        shown = self.view(values)
-        made = {name for name in shown if name in self.made and name not in values}
-        seen = Batch({name: value for name, value in shown.items() if name not in made and name != "view_inputs"})
-        if self.density and whole in values and values.log_det is None and not self.view.keeps_volume:
-            seen["log_det"] = self.view.counted(values)
-        narrow = [n for n, v in seen.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
-        seen |= {name: _narrowed(name, seen[name], dtype, seen) for name in narrow}
-        if "mask" in seen:  # masks of context fill its values and are then dropped
-            known = {name: mask for name, mask in seen.masks().items() if name in seen}
-            for name in known.keys() & self.distributions.keys():
+        viewed = self.view(values)
+        made_names = {name for name in viewed if name in self.made and name not in values}
+        result = Batch(
+            {name: value for name, value in viewed.items() if name not in made_names and name != "view_inputs"}
+        )
+        if self.density and whole_name in values and values.log_det is None and not self.view.keeps_volume:
+            result["log_det"] = self.view.counted(values)
+        narrow = [n for n, v in result.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
+        result |= {name: _cast(name, result[name], dtype, result) for name in narrow}
+        if "mask" in result:  # masks of context fill its values and are then dropped
+            masks = {name: mask for name, mask in result.masks().items() if name in result}
+            for name in masks.keys() & self.distributions.keys():
                 for event in map(list, self.distributions[name].events):
-                    if not torch.equal(known[name][..., event].any(-1), known[name][..., event].all(-1)):
+                    if not torch.equal(masks[name][..., event].any(-1), masks[name][..., event].all(-1)):
                         raise ValueError(
                             f"the mask of {name} hides some entries of a step and not others, but its distribution has "
-                            "one "
-                            f"density for {len(event)} of them; hide them together, or give {name} a distribution with "
-                            "one for "
-                            "each, such as Normal()"
+                            f"one density for {len(event)} of them; hide them together, or give {name} a distribution "
+                            "with one for each, such as Normal()"
                         )
-            fill = {name: means[name].to(seen[name].dtype) if name in means else 0.0 for name in known}
-            seen |= {name: torch.where(mask, seen[name], fill[name]) for name, mask in known.items()}
-            kept = {*self.observed, self.view.history}
-            seen["mask"] = {name: mask for name, mask in known.items() if name in kept}
-        return seen
+            fill = {name: means[name].to(result[name].dtype) if name in means else 0.0 for name in masks}
+            result |= {name: torch.where(mask, result[name], fill[name]) for name, mask in masks.items()}
+            kept_names = {*self.observed, self.view.history}
+            result["mask"] = {name: mask for name, mask in masks.items() if name in kept_names}
+        return result
 
     def _check_mask(self, name: str, mask: Tensor, values: Batch) -> None:
         if name not in (*self.observed, self.view.history, WHOLE) or name not in values:
-            given = {n: v for n, v in values.items() if isinstance(v, Tensor)}
-            raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(given)}")
+            tensors = {n: v for n, v in values.items() if isinstance(v, Tensor)}
+            raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(tensors)}")
         if mask.shape != values[name].shape or mask.dtype != torch.bool:
             raise ValueError(
                 f"the mask of {name} is {mask.dtype} {tuple(mask.shape)}; expected bool {tuple(values[name].shape)}, "
@@ -157,7 +157,7 @@ class Reader:
         for name, value in values.items():
             self.check(name, value)
         size, length = _extent(values, length, size)
-        given = list(values.values())
+        tensors = list(values.values())
         self._extend_history(factorization, values, length)
         local = {name: v for name, v in values.items() if v.dim() == 3}
         prefix = {name: v for name, v in local.items() if v.shape[1] < length}
@@ -165,11 +165,11 @@ class Reader:
             raise ValueError(f"expected {length} steps (fewer of data to continue), the batch holds {shapes(local)}")
         if lengths is not None:
             if lengths.is_floating_point() or lengths.shape != (size,):
-                raise ValueError(_no_lengths(lengths, length))
+                raise ValueError(_lengths_message(lengths, length))
             valid = valid_steps(lengths, length)[..., None]
             values |= {name: v.masked_fill(~valid, 0) for name, v in values.items() if v.dim() == 3}
         self._check_context(factorization, values)
-        checked = [length, lengths, *given, *masks.values()]  # memoized for guide and model
+        checked = [length, lengths, *tensors, *masks.values()]  # memoized for guide and model
         memoize(self, checked, lambda: self._check_values(values, masks, lengths, length))
         return Rollout(
             factorization=factorization,
@@ -197,40 +197,41 @@ class Reader:
 
     def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
         for factor in factorization.factors:
-            if lacking := [p for p in factor.parents if p.name in self.context and p.name not in values]:
-                given = ", ".join(f"{p.name} (B, {'T, ' * p.local}{self.sizes[p.name]})" for p in lacking)
+            if missing := [p for p in factor.parents if p.name in self.context and p.name not in values]:
+                expected = ", ".join(f"{p.name} (B, {'T, ' * p.local}{self.sizes[p.name]})" for p in missing)
                 raise ValueError(
-                    f"{factor} reads {given}, context that the batch must contain; it has {shapes(values) or 'nothing'}"
+                    f"{factor} reads {expected}, context that the batch must contain; it has "
+                    f"{shapes(values) or 'nothing'}"
                 )
 
     def _check_values(
         self, values: Mapping[str, Tensor], masks: Mapping[str, Tensor], lengths: Tensor | None, length: int
     ) -> None:
         """Check that values are finite and in the support, and lengths valid, with one synchronisation of the GPU."""
-        wrong = {name: ~torch.isfinite(value.sum()) for name, value in values.items()}  # a NaN survives the sum
+        not_finite = {name: ~torch.isfinite(value.sum()) for name, value in values.items()}  # a NaN survives the sum
         outside = {
-            name: found
+            name: invalid
             for name in values.keys() & self.distributions.keys()
-            if (found := self._outside(name, values[name], masks.get(name), lengths)) is not None
+            if (invalid := self._outside(name, values[name], masks.get(name), lengths)) is not None
         }
-        verdict = [*wrong.values(), *(found.any() for found in outside.values())]
+        verdict = [*not_finite.values(), *(invalid.any() for invalid in outside.values())]
         verdict += [] if lengths is None else [((lengths < 1) | (lengths > length)).any()]
         if not verdict or not torch.stack(verdict).any():
             return
         if lengths is not None and (lengths.min() < 1 or lengths.max() > length):
-            raise ValueError(_no_lengths(lengths, length))
-        for name, bad in wrong.items():
+            raise ValueError(_lengths_message(lengths, length))
+        for name, bad in not_finite.items():
             if bad:
                 raise ValueError(
                     f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
                 )
-        for name, found in outside.items():
-            if found.any():
-                distribution, place = self.distributions[name], found.nonzero()[0].tolist()
+        for name, invalid in outside.items():
+            if invalid.any():
+                distribution, index = self.distributions[name], invalid.nonzero()[0].tolist()
                 raise ValueError(
-                    f"{name} holds {values[name][tuple(place)].item():g} (sequence {place[0]}, coordinate {place[-1]}),"
+                    f"{name} holds {values[name][tuple(index)].item():g} (sequence {index[0]}, coordinate {index[-1]}),"
                     f" but under {distribution.factor}, {distribution.head.label}, values are "
-                    f"{_meaning(distribution.support)}; give {name} another"
+                    f"{_describe_support(distribution.support)}; give {name} another"
                     " distribution, move such entries inside, or hide them by the 'mask' of the batch"
                 )
 
@@ -239,13 +240,13 @@ class Reader:
         distribution = self.distributions[name]
         if (support := distribution.support) is None:
             return None
-        wrong = ~support.check(value)
-        wrong = wrong[..., None].expand_as(value) if distribution.whole else wrong
+        outside = ~support.check(value)
+        outside = outside[..., None].expand_as(value) if distribution.whole else outside
         if mask is not None:
-            wrong = wrong & mask
+            outside = outside & mask
         if lengths is not None and value.dim() == 3:
-            wrong = wrong & valid_steps(lengths, value.shape[1])[..., None]
-        return wrong
+            outside = outside & valid_steps(lengths, value.shape[1])[..., None]
+        return outside
 
     def check(self, name: str, value: Tensor) -> None:
         """Check that a value has the shape (B, T, D), or (B, D) if it is static.
@@ -261,25 +262,25 @@ class Reader:
             raise ValueError(f"{name} has no steps: shape {tuple(value.shape)}")
 
 
-def _no_lengths(lengths: Tensor, length: int) -> str:
+def _lengths_message(lengths: Tensor, length: int) -> str:
     return f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}"
 
 
 def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
     """Return entries as tensors; floating-point values and these names are cast, counts and masks are not."""
-    found = Batch()
-    for name, each in batch.items():
-        if isinstance(each, Mapping):
-            found[name] = _tensors(Batch(each), dtype, names if name == "view_inputs" else (), ())
+    tensors = Batch()
+    for name, value in batch.items():
+        if isinstance(value, Mapping):
+            tensors[name] = _tensors(Batch(value), dtype, names if name == "view_inputs" else (), ())
             continue
-        tensor = tensor_of(each)
+        tensor = tensor_of(value)
         if tensor.is_floating_point() or name in names:
-            tensor = tensor.double() if name in wide else _narrowed(name, tensor, dtype, batch)
-        found[name] = tensor
-    return found
+            tensor = tensor.double() if name in wide else _cast(name, tensor, dtype, batch)
+        tensors[name] = tensor
+    return tensors
 
 
-def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Tensor:
+def _cast(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Tensor:
     """Return the value in the precision of the model.
 
     Raises:
@@ -295,26 +296,26 @@ def _narrowed(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Ten
             return value.to(dtype)
     mean, spread = _moments(name, value, batch)
     size = mean.abs()
-    wrong = (spread < RESOLVED * size) & (spread > ROUNDING * size)
-    if wrong.any():
-        place = int(wrong.nonzero()[0])
+    imprecise = (spread < RESOLVED * size) & (spread > ROUNDING * size)
+    if imprecise.any():
+        coordinate = int(imprecise.nonzero()[0])
         raise ValueError(
-            f"coordinate {place} of {name} has mean {mean[place]:.9g} and standard deviation {spread[place]:.3g}, "
-            f"which float32 does not resolve; call model.standardise({name!r}).fit(values), which subtracts the mean "
-            "in float64, or subtract it yourself"
+            f"coordinate {coordinate} of {name} has mean {mean[coordinate]:.9g} and standard deviation "
+            f"{spread[coordinate]:.3g}, which float32 does not resolve; call "
+            f"model.standardise({name!r}).fit(values), which subtracts the mean in float64, or subtract it yourself"
         )
     return value.to(dtype)
 
 
 def _moments(name: str, value: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation (D,) of the observed entries in float64; NaN without any."""
-    mask, lengths, known = batch.mask(name), batch.lengths, value.double()
+    mask, lengths, values = batch.mask(name), batch.lengths, value.double()
     if mask is not None and mask.shape == value.shape:
-        known = torch.where(torch.as_tensor(mask, device=value.device), known, torch.nan)
+        values = torch.where(torch.as_tensor(mask, device=value.device), values, torch.nan)
     if lengths is not None and value.dim() == 3:
         valid = valid_steps(torch.as_tensor(lengths, device=value.device), value.shape[1])
-        known = torch.where(valid[..., None], known, torch.nan)
-    rows = known.flatten(0, -2)
+        values = torch.where(valid[..., None], values, torch.nan)
+    rows = values.flatten(0, -2)
     mean = rows.nanmean(0)
     return mean, (rows - mean).square().nanmean(0).sqrt()
 
@@ -330,21 +331,23 @@ def check_scale(batch: AnyBatch, names: Collection[str]) -> None:
         ValueError: if the largest standard deviation is below `units.SMALLEST`, but not 0.
     """
     refuse_table(batch)
-    given = Batch(batch if isinstance(batch, Mapping) else {WHOLE: batch})
-    for name in given.keys() & {*names}:
-        value = tensor_of(given[name])
+    tensors = Batch(batch if isinstance(batch, Mapping) else {WHOLE: batch})
+    for name in tensors.keys() & {*names}:
+        value = tensor_of(tensors[name])
         if not value.is_floating_point() or value.dim() < 2 or not value.numel():
             continue
-        mean, spread = _moments(name, value, given)
+        mean, spread = _moments(name, value, tensors)
         largest = torch.where(spread > ROUNDING * mean.abs(), spread, 0.0).max().item()
         if 0 < largest < SMALLEST:
             raise ValueError(f"the standard deviation of {name} is {largest:g}; {TOO_SMALL}")
 
 
-def _meaning(support: Any) -> str:
+def _describe_support(support: Any) -> str:
     """Return the support in words."""
     if isinstance(support, ProductSupport):
-        return "; ".join(f"of {', '.join(map(str, places))}: {_meaning(own)}" for places, own in support.parts)
+        return "; ".join(
+            f"of {', '.join(map(str, places))}: {_describe_support(part)}" for places, part in support.parts
+        )
     while hasattr(support, "base_constraint"):
         support = support.base_constraint
     return {
@@ -392,11 +395,11 @@ def repeat(value: Any, samples: int) -> Any:
     if not isinstance(value, Mapping):
         return repeat_batch(value, samples)
     batch = value if isinstance(value, Batch) else Batch(value)
-    found = batch.map(partial(repeat_batch, n=samples))
+    repeated = batch.map(partial(repeat_batch, n=samples))
     if batch.group is not None:
-        found["group"] = Groups.of(batch.group).repeat(samples).place
-    found.reader = batch.reader
-    return found
+        repeated["group"] = Groups.of(batch.group).repeat(samples).place
+    repeated.reader = batch.reader
+    return repeated
 
 
 def rows(value: Any, part: slice) -> Any:
@@ -422,13 +425,13 @@ def in_chunks(
     """
     if samples < 1 or chunk < 1:
         raise ValueError(f"samples and chunk must be at least 1, got {samples} and {chunk}")
-    found: dict[str, Tensor] = {}
+    results: dict[str, Tensor] = {}
     for first in range(0, max(size, 1), chunk):  # runs once for an empty batch too, so that `make` raises
         part = slice(first, min(first + chunk, size))
         at_once = chunk // max(part.stop - first, 1)
         for start in range(0, samples, at_once):
             for name, value in make(part, min(at_once, samples - start)).items():
-                if name not in found:
-                    found[name] = value.new_empty(samples, size, *value.shape[2:])
-                found[name][start : start + at_once, part] = value
-    return found
+                if name not in results:
+                    results[name] = value.new_empty(samples, size, *value.shape[2:])
+                results[name][start : start + at_once, part] = value
+    return results

@@ -104,8 +104,7 @@ class Conditional(nn.Module):
                 expected = f"distributions.{self.network.head.__name__}"
                 raise ValueError(
                     f"the features of {factor} by {network} are the parameters of a {expected}, but its distribution "
-                    f"is {distribution}; "
-                    f"give it {expected}()"
+                    f"is {distribution}; give it {expected}()"
                 )
         features = 0 if self.network is None else self.network.features
         self.head = distribution.build(Shape(self.size, features, factor.local, factor.child, data, guide))
@@ -119,11 +118,11 @@ class Conditional(nn.Module):
         self.events = [range(self.size)] if self.whole else self.head.events
         """Groups of coordinates; each group is one event and is observed as a whole."""
         self.register_buffer("interior_point", self.head.interior_point(self.size), persistent=False)
-        self._seen = False  # whether a distribution was compared with its declaration
+        self._is_checked = False  # whether a distribution was compared with its declaration
         for length in range(2, 9):
             self.check(length)
 
-    def _declared(self, distribution: TorchDistribution) -> None:
+    def _check_declaration(self, distribution: TorchDistribution) -> None:
         """Check that a distribution matches the declaration of its `ConditionalDistribution`.
 
         Raises:
@@ -135,8 +134,8 @@ class Conditional(nn.Module):
         ):
             raise ValueError(
                 f"the distribution of {self.factor} makes a {type(distribution).__name__} of batch "
-                f"{tuple(distribution.batch_shape)} and event "
-                f"{tuple(distribution.event_shape)}; by its event_dim = {self.head.event_dim} it has "
+                f"{tuple(distribution.batch_shape)} and event {tuple(distribution.event_shape)}; by its event_dim = "
+                f"{self.head.event_dim} it has "
                 + (f"the event {event}" if self.whole else f"no event, and the last dimension {self.size} in its batch")
             )
         support: Any = None
@@ -147,11 +146,10 @@ class Conditional(nn.Module):
             if not declared or support.is_discrete != self.discrete:
                 raise ValueError(
                     f"the distribution of {self.factor} makes a {type(distribution).__name__} on {support}; declare it "
-                    "in the class of "
-                    "the distribution: support (of torch.distributions.constraints), and discrete = "
+                    "in the class of the distribution: support (of torch.distributions.constraints), and discrete = "
                     f"{support.is_discrete}"
                 )
-        self._seen = True
+        self._is_checked = True
 
     def check(self, length: int) -> None:
         """Check that a residual distribution reads the child's previous value, at sequences of this length.
@@ -159,13 +157,12 @@ class Conditional(nn.Module):
         Raises:
             ValueError: if the factor does not read the child's own value one step before.
         """
-        own = self.factor.parent(self.factor.child)
-        if self.head.residual and not (own and own.relation and own.relation.reads(-1, length)):
+        previous = self.factor.parent(self.factor.child)
+        if self.head.residual and not (previous and previous.relation and previous.relation.reads(-1, length)):
             raise ValueError(
                 f"{self.factor} has a residual distribution, which adds {self.factor.child}_{{t-1}}, but it does not "
-                "read that "
-                f"at {length} steps; add {self.factor.child}_{{t-1}} or {self.factor.child}_{{<t}} to its parents, or "
-                "use residual=0"
+                f"read that at {length} steps; add {self.factor.child}_{{t-1}} or {self.factor.child}_{{<t}} to its "
+                "parents, or use residual=0"
             )
 
     def scored(self, value: Tensor, counted: Tensor | None) -> Tensor:
@@ -196,37 +193,41 @@ class Conditional(nn.Module):
         if self.network is None:
             shape = (batch, length, 0) if self.factor.local else (batch, 0)
             return self._rescale(self.head(like(self.head).new_empty(shape)))
-        read = self._read(parents, batch, lengths)
-        features = self.network(read, length, lengths)
+        inputs = self._read(parents, batch, lengths)
+        features = self.network(inputs, length, lengths)
         features = features if groups is None else groups.pool(features)
         previous = None
         if self.head.residual:
-            previous = shift((parents if self._made_in is None else read)[self.factor.child], -1)
+            previous = shift((parents if self._output_units is None else inputs)[self.factor.child], -1)
         return self._rescale(self.head(features, previous))
 
     def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
         """Return the parents, standardised and with their indicators; a constant if the factor has none."""
         if not self.parents:
             return {CONSTANT: next(self.parameters()).new_ones(batch, 1)}
-        read = [*self.parents, *map(presence, self.parents)]
-        found = {name: values[name] for name in read if name in values}
-        found |= {n: memoize_valid(self.units[n], v, lengths) for n, v in found.items() if n in self.units}
-        told = {n: self._indicated(found[n], values.get(indicator(n)), lengths) for n in self.indicators if n in found}
-        return found | told
+        names = [*self.parents, *map(presence, self.parents)]
+        inputs = {name: values[name] for name in names if name in values}
+        inputs |= {n: memoize_valid(self.units[n], v, lengths) for n, v in inputs.items() if n in self.units}
+        indicated = {
+            n: self._append_indicators(inputs[n], values.get(indicator(n)), lengths)
+            for n in self.indicators
+            if n in inputs
+        }
+        return inputs | indicated
 
-    def _indicated(self, value: Tensor, seen: Tensor | None, lengths: Tensor | None) -> Tensor:
+    def _append_indicators(self, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor:
         """Return the value, (B, T, D) or (B, D), with its indicators appended; these are 0 at padding."""
 
         def compute() -> Tensor:
-            told = torch.ones_like(value) if seen is None else seen.to(value)
+            indicators = torch.ones_like(value) if mask is None else mask.to(value)
             if lengths is not None and value.dim() == 3:
-                told = told * valid_steps(lengths, value.shape[1])[..., None]
-            return torch.cat([value, told], -1)
+                indicators = indicators * valid_steps(lengths, value.shape[1])[..., None]
+            return torch.cat([value, indicators], -1)
 
-        return memoize(self, [value, seen, lengths], compute)
+        return memoize(self, [value, mask, lengths], compute)
 
     @property
-    def _made_in(self) -> Units | None:
+    def _output_units(self) -> Units | None:
         """Units of the child, if the parameters of its distribution can be transformed to them."""
         return self.units.get(self.factor.child) if self.head.location_scale else None
 
@@ -234,7 +235,7 @@ class Conditional(nn.Module):
         if parameters and torch.is_autocast_enabled(parameters[0].device.type):
             # networks may compute in half precision, but densities, divergences and draws must not
             parameters = tuple(parameter.to(like(self).dtype) for parameter in parameters)
-        units = self._made_in
+        units = self._output_units
         if units is None:
             return parameters
         offset = self.offset
@@ -244,7 +245,7 @@ class Conditional(nn.Module):
     @property
     def offset(self) -> Tensor | None:
         """Mean (D,) in float64 that parameters exclude; None if values are in the model's precision."""
-        units = self._made_in
+        units = self._output_units
         if units is None or not units.wide or not self.head.centred:
             return None
         return units.mean if self.head.centred is True else units.mean * constant(self.head.centred, units.mean)
@@ -257,24 +258,24 @@ class Conditional(nn.Module):
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         """Return the distribution of the child for these parameters (`ConditionalDistribution.distribution`)."""
         distribution, offset = self.head.distribution(parameters), self.offset
-        if not self._seen:
-            self._declared(distribution)
+        if not self._is_checked:
+            self._check_declaration(distribution)
         return distribution if offset is None else OffsetDistribution(distribution, offset, parameters[0].dtype)
 
     def mean(self, parameters: Parameters) -> Tensor:
         """Return the mean of the child, (..., D)."""
-        return self._placed(self.head.mean(parameters))
+        return self._add_offset(self.head.mean(parameters))
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         """Return values (..., D) of the child (`ConditionalDistribution.draw`)."""
-        return self._placed(self.head.draw(parameters, noise))
+        return self._add_offset(self.head.draw(parameters, noise))
 
     @property
     def drawing(self) -> Callable[[Parameters, Tensor], Tensor]:
         """`draw` for use in a loop: the method of the distribution itself if values have no offset."""
         return self.head.draw if self.offset is None else self.draw
 
-    def _placed(self, value: Tensor) -> Tensor:
+    def _add_offset(self, value: Tensor) -> Tensor:
         offset = self.offset
         return value if offset is None else value + offset
 
@@ -284,8 +285,8 @@ class Conditional(nn.Module):
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
         # these are read from the draws, even if given
-        own = self.factor.child if self.head.residual and self._made_in is not None else None
-        live = [name for name in self.units if name in self.parents and (name not in given or name == own)]
+        child = self.factor.child if self.head.residual and self._output_units is not None else None
+        live = [name for name in self.units if name in self.parents and (name not in given or name == child)]
         if not live:
             return state
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
@@ -297,15 +298,17 @@ class Conditional(nn.Module):
         """
         if self.network is None:
             return tuple(p[t] for p in state), state
-        inner, read = self._without_unit(state, drawn)
+        inner, inputs = self._standardise_draws(state, drawn)
         if count > 1:
-            features, inner = self.network.forward_last(inner, t + 1 - count, count, read)
+            features, inner = self.network.forward_last(inner, t + 1 - count, count, inputs)
         else:
-            features, inner = self.network.step(inner, t, read)
+            features, inner = self.network.step(inner, t, inputs)
         previous = None
         if self.head.residual:
-            previous = at((drawn if self._made_in is None else read)[self.factor.child], t - 1, features, self.size)
-        return self._rescale(self.head(features, previous, t)), self._advanced(state, inner)
+            previous = at(
+                (drawn if self._output_units is None else inputs)[self.factor.child], t - 1, features, self.size
+            )
+        return self._rescale(self.head(features, previous, t)), self._with_network_state(state, inner)
 
     def forward_chunk(
         self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
@@ -313,20 +316,22 @@ class Conditional(nn.Module):
         """Return the parameters (B, N, D) at N steps from t on, with all their inputs known, and the next state."""
         if self.network is None:
             return tuple(torch.stack(p[t : t + count], dim=1) for p in state), state
-        inner, read = self._without_unit(state, drawn)
-        features, inner = self.network.forward_chunk(inner, t, count, read)
+        inner, inputs = self._standardise_draws(state, drawn)
+        features, inner = self.network.forward_chunk(inner, t, count, inputs)
         previous = None
         if self.head.residual:
-            own = (drawn if self._made_in is None else read)[self.factor.child]
-            previous = stack_steps(own, t - 1, count, features, self.size)
-        return self._rescale(self.head(features, previous, t)), self._advanced(state, inner)
+            values = (drawn if self._output_units is None else inputs)[self.factor.child]
+            previous = stack_steps(values, t - 1, count, features, self.size)
+        return self._rescale(self.head(features, previous, t)), self._with_network_state(state, inner)
 
-    def _without_unit(self, state: Any, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
+    def _standardise_draws(self, state: Any, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
         """Return the state of the network, and the draws standardised as the network reads them."""
         if not isinstance(state, Standardised):
             return state, drawn
-        found = {n: extend_features(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()}
-        return state.network, {**drawn, **found}
+        standardised = {
+            n: extend_features(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()
+        }
+        return state.network, {**drawn, **standardised}
 
     def select(self, state: Any, rows: Tensor) -> Any:
         """Return the state with these rows (N,) of its batch (`networks.loop.select`)."""
@@ -338,7 +343,7 @@ class Conditional(nn.Module):
         return Standardised(self.network.select(state.network, rows), kept, lengths)
 
     @staticmethod
-    def _advanced(state: Any, inner: Any) -> Any:
+    def _with_network_state(state: Any, inner: Any) -> Any:
         """Return the state with the next state of the network."""
         if not isinstance(state, Standardised):
             return inner
@@ -368,7 +373,7 @@ class Conditional(nn.Module):
         def back(values: Tensor) -> Tensor:
             return values.transpose(0, 1) if direction > 0 else values.flip(0).transpose(0, 1)
 
-        *drawn, states = gaussian_chain(
+        *results, states = gaussian_chain(
             into(hoisted.base),
             into(noise),
             [(hoisted.weights[0], None), *following],
@@ -377,7 +382,7 @@ class Conditional(nn.Module):
             min_scale=self.head.min_scale,
             activation=join.kind,
         )
-        value, *parameters = map(back, drawn)
+        value, *parameters = map(back, results)
         if form.keep is not None and states is not None:
             form.keep(value, back(states))
         return value, tuple(parameters)

@@ -135,8 +135,8 @@ class EnumerationPlan:
     def windows(self) -> dict[str, Window]:
         """Windows by child, for the factors of summed-out latents and their readers, in the order of the model."""
         ordered = (self.generative.factor(name) for block in self.generative.blocks for name in block.names)
-        found = {factor.child: self._window(factor) for factor in ordered}
-        return {name: w for name, w in found.items() if name in self.sizes or w.statics or w.chain}
+        windows = {factor.child: self._window(factor) for factor in ordered}
+        return {name: w for name, w in windows.items() if name in self.sizes or w.statics or w.chain}
 
     @cached_property
     def readers(self) -> tuple[str, ...]:
@@ -152,14 +152,14 @@ class EnumerationPlan:
         """Check that the model does not read data that are replaced by its own means or by noise.
 
         Raises:
-            ValueError: if it does, since the replacements depend on the states.
+            ValueError: if the model reads replaced data, since the replacements depend on the states.
         """
-        read = {parent.name for factor in self.generative.factors for parent in factor.parents}
-        if fed := sorted(read.intersection(replaced)):
+        parents = {parent.name for factor in self.generative.factors for parent in factor.parents}
+        if unsupported := sorted(parents.intersection(replaced)):
             raise ValueError(
                 f"{', '.join(self.sizes)} cannot be summed out, as the model reads its own means or noise in place "
-                f"of {', '.join(fed)}. This happens at missing entries and in scheduled sampling, and depends on the "
-                "states; fill the entries, or let no factor read them"
+                f"of {', '.join(unsupported)}. This happens at missing entries and in scheduled sampling, and depends "
+                "on the states; fill the entries, or let no factor read them"
             )
 
     def _window(self, factor: Factor) -> Window:
@@ -194,25 +194,25 @@ class EnumerationPlan:
                 "are enumerated; use fewer steps"
             )
         digits = np.stack(np.unravel_index(np.arange(count), sizes)).T
-        found = {}
+        sequences = {}
         for name, size in self.sizes.items():
-            own, digits = np.split(digits, [length if name in self.chain else 1], 1)
-            values = one_hot(torch.from_numpy(own.astype(np.int64)), size).double()
-            found[name] = values if name in self.chain else values[:, 0]
-        return found
+            indices, digits = np.split(digits, [length if name in self.chain else 1], 1)
+            values = one_hot(torch.from_numpy(indices.astype(np.int64)), size).double()
+            sequences[name] = values if name in self.chain else values[:, 0]
+        return sequences
 
     def patterns(self, window: Window, length: int) -> dict[str, Tensor]:
         """Return the states at which a factor is evaluated: name to integers (n, T), or (n,) for static latents."""
         sizes = [self.sizes[name] for name in window.statics]
         sizes += [self.sizes[name] for name in window.chain for _ in range(window.period)]
         digits = np.stack(np.unravel_index(np.arange(math.prod(sizes)), sizes or [1])).astype(np.int64)
-        found = {name: torch.from_numpy(row) for name, row in zip(window.statics, digits, strict=False)}
+        states = {name: torch.from_numpy(row) for name, row in zip(window.statics, digits, strict=False)}
         repeated = np.arange(length) % window.period
         for name, rows in zip(
             window.chain, np.split(digits[len(window.statics) :], len(window.chain) or 1), strict=False
         ):
-            found[name] = torch.from_numpy(rows.T[:, repeated].copy())
-        return found
+            states[name] = torch.from_numpy(rows.T[:, repeated].copy())
+        return states
 
     def places(self, window: Window, length: int) -> Tensor:
         """Return the index (T, J) of the pattern that a factor sees in each joint state.
@@ -225,30 +225,30 @@ class EnumerationPlan:
         sizes = [self.sizes[name] for name, _ in names]
         digits = dict(zip(names, np.unravel_index(np.arange(math.prod(sizes)), sizes or [1]), strict=False))
         t = np.arange(length)[:, None] if window.factor.local else np.zeros((1, 1), int)
-        place = np.zeros((len(t), math.prod(sizes)), np.int64)
+        index = np.zeros((len(t), math.prod(sizes)), np.int64)
         for name in window.statics:
-            place = place * self.sizes[name] + digits[name, None]
+            index = index * self.sizes[name] + digits[name, None]
         for name in window.chain:
             for residue in range(window.period):  # the lag, seen from t, of the step with this residue
                 lag = window.low + (t - window.low - residue) % window.period
-                rows = np.stack([digits[name, own] for own in range(window.low, window.high + 1)])
-                place = place * self.sizes[name] + rows[lag[:, 0] - window.low]
-        own = window.factor.child
-        if own in self.sizes:
-            place = place * self.sizes[own] + digits[own, 0 if window.factor.local else None]
-        return torch.from_numpy(place)
+                rows = np.stack([digits[name, offset] for offset in range(window.low, window.high + 1)])
+                index = index * self.sizes[name] + rows[lag[:, 0] - window.low]
+        offset = window.factor.child
+        if offset in self.sizes:
+            index = index * self.sizes[offset] + digits[offset, 0 if window.factor.local else None]
+        return torch.from_numpy(index)
 
     @torch.inference_mode(False)
     def placed(self, window: Window, length: int, device: torch.device) -> tuple[dict[str, Tensor], Tensor]:
         """Return patterns and places on a device; each transfer happens once."""
         key = window.factor.child, length, device
-        if key not in self._placed:
-            told = {name: value.to(device) for name, value in self.patterns(window, length).items()}
-            self._placed[key] = told, self.places(window, length).to(device)
-        return self._placed[key]
+        if key not in self._device_patterns:
+            patterns = {name: value.to(device) for name, value in self.patterns(window, length).items()}
+            self._device_patterns[key] = patterns, self.places(window, length).to(device)
+        return self._device_patterns[key]
 
     @cached_property
-    def _placed(self) -> dict[Any, tuple[dict[str, Tensor], Tensor]]:
+    def _device_patterns(self) -> dict[Any, tuple[dict[str, Tensor], Tensor]]:
         return {}
 
 
@@ -277,18 +277,18 @@ class Enumeration:
     def _logs(self, name: str, window: Window) -> Tensor:
         """Return log densities or probabilities in all joint states, (B or 1, T, M, K^L, K), or (B or 1, M)."""
         sums, run, local = self.sums, self.rollout, window.factor.local
-        conditional, own = run.conditionals[name], name in sums.sizes
-        told, places = sums.placed(window, run.length, like(conditional).device)
-        count = len(next(iter(told.values()))) if told else 1
-        values = {n: one_hot(v, sums.sizes[n]).to(like(conditional)) for n, v in told.items()}
+        conditional, is_summed = run.conditionals[name], name in sums.sizes
+        patterns, places = sums.placed(window, run.length, like(conditional).device)
+        count = len(next(iter(patterns.values()))) if patterns else 1
+        values = {n: one_hot(v, sums.sizes[n]).to(like(conditional)) for n, v in patterns.items()}
         if values.keys() == {*conditional.parents}:  # equal for all sequences
             parameters = conditional(values, count, run.length)
         else:
-            again = run.repeat(count)
-            again.values |= {n: v.repeat_interleave(run.batch, 0) for n, v in values.items()}
-            parameters = conditional(again.known, again.batch, run.length, again.lengths)
+            repeated = run.repeat(count)
+            repeated.values |= {n: v.repeat_interleave(run.batch, 0) for n, v in values.items()}
+            parameters = conditional(repeated.known, repeated.batch, run.length, repeated.lengths)
         distribution = conditional.distribution(tuple(p.unflatten(0, (count, -1)) for p in parameters))
-        if own:
+        if is_summed:
             logs = distribution.logits  # type: ignore[attr-defined]
         else:
             mask = run.mask(name)
@@ -303,17 +303,17 @@ class Enumeration:
     @cached_property
     def shares(self) -> dict[str, Tensor]:
         """Log density of each reader given all earlier variables, by name: (B, T), or (B,) if static."""
-        before = self._filtered(self._start, self._steps)[:, :-1, ..., None].expand_as(self._steps)
-        found = {}
-        for logs, sofar in ((self._static, torch.zeros_like(self._start)), (self._local, before)):
+        filtered = self._forward(self._start, self._steps)[:, :-1, ..., None].expand_as(self._steps)
+        shares = {}
+        for logs, sofar in ((self._static, torch.zeros_like(self._start)), (self._local, filtered)):
             states = tuple(range(1 if logs is self._static else 2, sofar.dim()))
             for name, each in logs.items():
                 last, sofar = sofar, sofar + each
                 if name not in self.sums.sizes:
-                    found[name] = sofar.logsumexp(states) - last.logsumexp(states)
-        return found
+                    shares[name] = sofar.logsumexp(states) - last.logsumexp(states)
+        return shares
 
-    def _filtered(self, start: Tensor, steps: Tensor) -> Tensor:
+    def _forward(self, start: Tensor, steps: Tensor) -> Tensor:
         """Return the log joint (B, T + 1, M, K^L) of states and variables so far, up to a constant per step."""
         alpha = start[..., None].expand(*start.shape, self.sums.width**self.sums.lag)
         steps = steps - steps.detach().amax((2, 3, 4), keepdim=True)  # a large sum would lose digits
@@ -325,36 +325,36 @@ class Enumeration:
     def draw(self) -> dict[str, Tensor]:
         """Draw states from their posterior given all other variables, one-hot: (B, T, C), or (B, C) if static."""
         width, rows = self.sums.width, torch.arange(len(self._start), device=self._start.device)
-        joint = (self._filtered(self._start, self._steps)[:, :-1, ..., None] + self._steps).flatten(3)
-        last = _drawn(joint[:, -1].flatten(1))
+        joint = (self._forward(self._start, self._steps)[:, :-1, ..., None] + self._steps).flatten(3)
+        last = _draw_index(joint[:, -1].flatten(1))
         static, window = last // joint.shape[-1], last % joint.shape[-1]
         symbols = [window % width]
         for t in reversed(range(joint.shape[1] - 1)):  # the window of the next step contains all but the oldest state
-            known = window // width
-            oldest = _drawn(joint[rows, t, static].unflatten(1, (width, -1))[rows, :, known])
-            window = oldest * width**self.sums.lag + known
+            newer = window // width
+            oldest = _draw_index(joint[rows, t, static].unflatten(1, (width, -1))[rows, :, newer])
+            window = oldest * width**self.sums.lag + newer
             symbols.append(window % width)
-        found = {}
+        states = {}
         for names, number in ((self.sums.statics, static), (self.sums.chain, torch.stack(symbols[::-1], 1))):
             for name in reversed(names):
-                found[name] = one_hot(number % self.sums.sizes[name], self.sums.sizes[name]).to(self._start)
+                states[name] = one_hot(number % self.sums.sizes[name], self.sums.sizes[name]).to(self._start)
                 number = number // self.sums.sizes[name]
-        return found
+        return states
 
     @torch.enable_grad()
     def probabilities(self) -> dict[str, Tensor]:
         """Return posterior probabilities (B, T, C), or (B, C) if static, as gradients of the log density."""
         parts = [part.detach().contiguous().requires_grad_() for part in (self._start, self._steps)]
-        total = self._filtered(*parts)[:, -1].flatten(1).logsumexp(1).sum()
+        total = self._forward(*parts)[:, -1].flatten(1).logsumexp(1).sum()
         static, steps = torch.autograd.grad(total, parts)
-        found = {}
+        posterior = {}
         for names, each in ((self.sums.statics, static), (self.sums.chain, steps.sum((2, 3)))):
-            apart = each.unflatten(-1, [self.sums.sizes[name] for name in names] or [1])
+            joint = each.unflatten(-1, [self.sums.sizes[name] for name in names] or [1])
             first = each.dim() - 1
-            for place, name in enumerate(names):
-                others = [first + other for other in range(len(names)) if other != place]
-                found[name] = apart.sum(others) if others else apart
-        return found
+            for index, name in enumerate(names):
+                others = [first + other for other in range(len(names)) if other != index]
+                posterior[name] = joint.sum(others) if others else joint
+        return posterior
 
 
 def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
@@ -366,16 +366,16 @@ def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
         start: log weights (..., B, M, W) of the states at the start.
         steps: log densities (B, T, M, W, K) of each step from each of the W states.
     """
-    batch, length, kept, window, width = steps.shape
-    if length >= 4 * BLOCK and batch * kept * window**2 * width <= WIDE:
-        padded = torch.cat([steps, steps.new_zeros(batch, -length % BLOCK, kept, window, width)], 1)
+    batch, length, statics, window, width = steps.shape
+    if length >= 4 * BLOCK and batch * statics * window**2 * width <= WIDE:
+        padded = torch.cat([steps, steps.new_zeros(batch, -length % BLOCK, statics, window, width)], 1)
         blocks = padded.unflatten(1, (-1, BLOCK)).flatten(0, 1)
         never = torch.finfo(steps.dtype).min / 1000  # infinite values have no gradient
-        each = torch.full_like(steps[0, 0, 0, :, :1].expand(-1, window), never).fill_diagonal_(0.0)
-        own = forward_sums(each[:, None, None].expand(-1, len(blocks), kept, -1), blocks)[:, :, 1:]
-        own = own.unflatten(1, (batch, -1))  # (W, B, blocks, BLOCK, M, W)
-        starts = forward_sums(start, own[:, :, :, -1].movedim(0, 3))[:, :-1]
-        joint = starts.movedim(3, 0)[:, :, :, None, :, None] + own
+        identity = torch.full_like(steps[0, 0, 0, :, :1].expand(-1, window), never).fill_diagonal_(0.0)
+        within = forward_sums(identity[:, None, None].expand(-1, len(blocks), statics, -1), blocks)[:, :, 1:]
+        within = within.unflatten(1, (batch, -1))  # (W, B, blocks, BLOCK, M, W)
+        starts = forward_sums(start, within[:, :, :, -1].movedim(0, 3))[:, :-1]
+        joint = starts.movedim(3, 0)[:, :, :, None, :, None] + within
         return torch.cat([start[:, None], joint.logsumexp(0).flatten(1, 2)[:, :length]], 1)
     alphas = [start]
     for step in steps.unbind(1):
@@ -384,6 +384,6 @@ def forward_sums(start: Tensor, steps: Tensor) -> Tensor:
     return torch.stack(alphas, -3)
 
 
-def _drawn(logits: Tensor) -> Tensor:
+def _draw_index(logits: Tensor) -> Tensor:
     """Draw an index of the last dimension with these logits."""
     return torch.multinomial(logits.softmax(-1), 1)[:, 0]

@@ -116,7 +116,7 @@ class DynamicalVAE(nn.Module):
             raise TypeError(f"the view is {kind_of(view)}; expected an instance such as dvae.data.views.View()")
         self.view = view or View()
         observed = tuple(self.view.parts or observed)
-        self.sizes = _checked_sizes(sizes)
+        self.sizes = _check_sizes(sizes)
         self.summed = tuple(n for n, size in self.sizes.items() if isinstance(size, Discrete) and n not in observed)
         self.inference = guide(self.generative, inference, observed, masks, self.summed)
         self.latents, self.observed, self.context = check_pair(
@@ -175,12 +175,12 @@ class DynamicalVAE(nn.Module):
 
     def _conditionals(self, factors: Iterable[Factor], guides: Mapping[str, Conditional] | None = None) -> Any:
         def pick(table: Mapping[str, Any], factor: Factor) -> Any:
-            own = f"{factor.kind}({factor.child})"
+            key = f"{factor.kind}({factor.child})"
             if table is self.distributions and isinstance(self.sizes[factor.child], Discrete):
-                return table.get(own, FAMILIES["category"])
+                return table.get(key, FAMILIES["category"])
             if table is self.distributions and factor.kind == "p" and not factor.parents:
-                return table.get(own, StandardNormal())
-            return table.get(own, table.get(factor.kind, table["default"]))
+                return table.get(key, StandardNormal())
+            return table.get(key, table.get(factor.kind, table["default"]))
 
         return nn.ModuleDict(
             {
@@ -213,13 +213,12 @@ class DynamicalVAE(nn.Module):
         for name in self.latents:
             for conditional in (self.generator[name], self.encoder[name]):
                 if conditional.discrete or (conditional is self.encoder[name] and not conditional.reparameterised):
-                    what = "are discrete" if conditional.discrete else "are not reparameterised"
+                    problem = "are discrete" if conditional.discrete else "are not reparameterised"
                     raise ValueError(
-                        f"the draws of the latent {name} {what} by the distribution of {conditional.factor}, so that "
-                        "no "
+                        f"draws of the latent {name} from the distribution of {conditional.factor} {problem}, so no "
                         f"gradient would reach the guide through them; give it a continuous distribution such as "
-                        f"distributions.Normal(), name {name} as observed where it is data, or have a categorical one "
-                        f"summed out: sizes={{{name!r}: dvae.Discrete(states)}}"
+                        f"distributions.Normal(), name {name} as observed if it is data, or sum out a categorical "
+                        f"one: sizes={{{name!r}: dvae.Discrete(states)}}"
                     )
         for name in self.summed:
             if (distribution := self.generator[name].head.label) != "OneHotCategorical":
@@ -230,7 +229,7 @@ class DynamicalVAE(nn.Module):
 
     @torch.inference_mode(False)
     def standardise(self, name: str, coordinates: Sequence[Coordinate] = ()) -> Units:
-        """Make the networks read a variable standardised; call `fit` on the result to set mean and scale.
+        """Make the networks read a standardised variable; call `fit` on the result to set mean and scale.
 
         If the distribution of the variable has a location and a scale (`ConditionalDistribution.location_scale`),
         networks also produce its parameters standardised. Probabilities and rates are produced unchanged. Densities and
@@ -255,8 +254,8 @@ class DynamicalVAE(nn.Module):
     @property
     def wide(self) -> frozenset[str]:
         """Names of the variables whose values are in float64 whatever the precision of the model."""
-        read = (name for name, units in self.units.items() if units.wide)
-        return frozenset(n for n in read if n not in self.observed or self.generator[n].offset is not None)
+        names = (name for name, units in self.units.items() if units.wide)
+        return frozenset(n for n in names if n not in self.observed or self.generator[n].offset is not None)
 
     @property
     def likelihood(self) -> bool:
@@ -305,9 +304,9 @@ class DynamicalVAE(nn.Module):
         """
         if guide:
             return self.reader.rollout(self.inference, self.encoder, self.read(batch), length, size)
-        found = self.reader.rollout(self.generative, self.generator, self.read(batch), length, size)
-        found.sums = self.sums
-        return found
+        run = self.reader.rollout(self.generative, self.generator, self.read(batch), length, size)
+        run.sums = self.sums
+        return run
 
     # The Pyro program ----------------------------------------------------------------------------------------------
 
@@ -353,8 +352,8 @@ class DynamicalVAE(nn.Module):
         rollout = self.rollout(data, length, size)
         prefixed = dict(rollout.prefix)
         for name, value in (prefix or {}).items():
-            told = name in self.summed and not self.generative.local(name)
-            if not told and (
+            is_state = name in self.summed and not self.generative.local(name)
+            if not is_state and (
                 name not in (*self.latents, *self.summed) or value.dim() != 3 or value.shape[1] > rollout.length
             ):
                 raise ValueError(
@@ -362,7 +361,7 @@ class DynamicalVAE(nn.Module):
                     f"of the latents {', '.join(self.latents)}, O at most {rollout.length}"
                 )
             self.reader.check(name, value)
-            (rollout.states if told else prefixed)[name] = value
+            (rollout.states if is_state else prefixed)[name] = value
         rollout.prefix = prefixed
         names = self.observed if mean_emission else ()
         rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
@@ -442,12 +441,12 @@ class DynamicalVAE(nn.Module):
         return tuple(name for block in self.generative.blocks for name in block.names if name in self.latents)
 
     def _check_draws(self, draws: Mapping[str, int]) -> None:
-        ours, orders = self.prior_order, (self.prior_order, self.latents)
+        prior, orders = self.prior_order, (self.prior_order, self.latents)
         rows = [dict(zip(o, accumulate((draws.get(n, 1) for n in o), mul), strict=True)) for o in orders]
         if set(draws) - set(self.latents) or rows[0] != rows[1]:
             raise ValueError(
                 f"draws must name latents, in one order for model and guide; got {', '.join(draws)}, where the model "
-                f"draws {', '.join(ours) or 'nothing'} and the guide {', '.join(self.latents) or 'nothing'}"
+                f"draws {', '.join(prior) or 'nothing'} and the guide {', '.join(self.latents) or 'nothing'}"
             )
         if any(count < 1 for count in draws.values()):
             raise ValueError(f"draws must be numbers from 1, got {dict(draws)}")
@@ -609,7 +608,7 @@ class DynamicalVAE(nn.Module):
             yield
 
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
-        """Return a batch by name, in the model's precision and seen through its view, with missing entries filled.
+        """Return a batch by name, in the model's precision and representation, with missing entries filled.
 
         A batch that was read before is returned unchanged. Shared variables are drawn if the batch does not give them,
         at a Pyro site outside the plate. Model and guide use the same draw, which therefore adds nothing to a bound. A
@@ -643,11 +642,13 @@ class DynamicalVAE(nn.Module):
             if name not in data:
                 distribution = spec.distribution(self.sizes[name], curriculum)
                 value = one[name] if name in one else pyro.sample(name, distribution, infer=SHARED)
-                data[name] = memoize(self, [value, size], partial(self._of_each, value, size))  # memoized for both
+                data[name] = memoize(
+                    self, [value, size], partial(self._expand_shared, value, size)
+                )  # memoized for both
         data.reader = None if precise else reader
         return data
 
-    def _of_each(self, value: Tensor, size: int) -> Tensor:
+    def _expand_shared(self, value: Tensor, size: int) -> Tensor:
         return value.to(like(self)).expand(size, -1)
 
     def to_data_space(self, values: Mapping[str, Tensor], data: Batch | None = None) -> dict[str, Tensor]:
@@ -655,8 +656,8 @@ class DynamicalVAE(nn.Module):
 
         Args:
             values: name to (..., B, T, D), in the model's space.
-            data: the batch that they belong to, as returned by `read`. It holds what the view needs for the way back,
-                such as a heading; without it that part of the transformation is not undone.
+            data: the batch that they belong to, as returned by `read`. It contains what the inverse of the view needs,
+                such as a heading; without it, that part of the transformation is not inverted.
 
         Returns:
             The same values; if the view splits the data into parts, the whole is added.
@@ -680,7 +681,7 @@ def _note(factorization: Factorization, rollout: Rollout) -> Any:
     return {"program": factorization, "run": rollout}
 
 
-def _checked_sizes(sizes: Mapping[str, int]) -> dict[str, int]:
+def _check_sizes(sizes: Mapping[str, int]) -> dict[str, int]:
     if not isinstance(sizes, Mapping):
         raise TypeError(f'sizes is {sizes!r}; expected the size of every variable by name, such as {{"z": 2, "x": 3}}')
     for name, size in sizes.items():
@@ -693,6 +694,6 @@ def _by_factor(given: Any, default: Any, what: str) -> dict[str, Any]:
     table = dict(given) if isinstance(given, Mapping) else {} if given is None else {"default": given}
     for key, spec in table.items():
         if isinstance(spec, type) or not hasattr(spec, "build"):
-            said = kind_of(spec) if isinstance(spec, type) else repr(spec)
-            raise ValueError(f"the {what} of {key!r} is {said}; expected a description such as {default!r}")
+            text = kind_of(spec) if isinstance(spec, type) else repr(spec)
+            raise ValueError(f"the {what} of {key!r} is {text}; expected a description such as {default!r}")
     return {"default": default, **table}

@@ -82,7 +82,7 @@ def _is_partial(run: Rollout) -> bool:
     return run.lengths is not None or bool(run.observed)
 
 
-_STARTS, _AWAY = 12, 0.6
+_N_STARTS, _START_SPREAD = 12, 0.6
 """Number of random starts in the search for the best reduced model, and standard deviation of their weights' noise."""
 
 
@@ -113,7 +113,7 @@ class Oracle:
     Raises:
         TypeError: if `model` is not a model or `steps` is not an integer.
         ValueError: if the model is not linear-Gaussian given its discrete states, or has context or energies. Methods
-            raise it if a batch has another length, has groups, or misses a data variable.
+            raise it if a batch has another length or groups, or lacks a data variable.
 
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
@@ -163,7 +163,7 @@ class Oracle:
     def _stack(self, values: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
         return torch.cat([values[name].flatten(1) for name in names], dim=1)
 
-    def _counted(self, names: tuple[str, ...], run: Rollout | None, observed: bool = True) -> Tensor:
+    def _count_mask(self, names: tuple[str, ...], run: Rollout | None, observed: bool = True) -> Tensor:
         """Return (R, N), 1 at entries that count and 0 at padding; R is 1 if all entries count.
 
         With `observed`, missing entries do not count either.
@@ -184,9 +184,9 @@ class Oracle:
     ) -> _System:
         """Return the conditionals as affine functions, from their locations at 0 and at every unit vector."""
         columns = (*names, *data)
-        there, real = (self._counted(each, run, observed=False) for each in (columns, names))
-        rows, count = there.shape
-        probes = torch.cat([there.new_zeros(rows, 1, count), torch.diag_embed(there)], dim=1).flatten(0, 1)
+        valid, valid_own = (self._count_mask(each, run, observed=False) for each in (columns, names))
+        rows, count = valid.shape
+        probes = torch.cat([valid.new_zeros(rows, 1, count), torch.diag_embed(valid)], dim=1).flatten(0, 1)
         parts = probes.to(like(self.model)).split([self._size(name) for name in columns], dim=1)
         values = {
             name: part.unflatten(1, (self.steps, -1)) if self.model.generative.local(name) else part
@@ -194,7 +194,7 @@ class Oracle:
         }
         lengths = None if run is None or run.lengths is None else run.lengths.repeat_interleave(count + 1)
         observed = {} if run is None else run.observed
-        values |= {indicator(name): seen.repeat_interleave(count + 1, 0) for name, seen in observed.items()}
+        values |= {indicator(name): mask.repeat_interleave(count + 1, 0) for name, mask in observed.items()}
         located, scales = [], []
         for name in names:
             conditional = conditionals[name]
@@ -202,11 +202,11 @@ class Oracle:
             location, scale = conditional(values, len(probes), self.steps, lengths)
             located.append(location.flatten(1).unflatten(0, (rows, -1)).double())
             scales.append(scale.flatten(1).unflatten(0, (rows, -1))[:, 0].double())
-        location = torch.cat(located, dim=2) * real[:, None]
+        location = torch.cat(located, dim=2) * valid_own[:, None]
         weights = (location[:, 1:] - location[:, :1]).mT
-        own = len(real.t())
-        scale = torch.where(real > 0, torch.cat(scales, dim=1), 1.0)
-        return _System(weights[..., :own], weights[..., own:], location[:, 0], scale)
+        n_own = len(valid_own.t())
+        scale = torch.where(valid_own > 0, torch.cat(scales, dim=1), 1.0)
+        return _System(weights[..., :n_own], weights[..., n_own:], location[:, 0], scale)
 
     def _require_linear(self, conditional: Conditional) -> None:
         units = self.model.units
@@ -214,10 +214,13 @@ class Oracle:
         if not linear and not (conditional.network is None and isinstance(conditional.head, Gaussian)):
             raise ValueError(
                 f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
-                "distributions.FixedNormal, as dvae.program.oracle.surrogate builds, or without parents a normal"
+                "distributions.FixedNormal, as in dvae.linear_gaussian_surrogate, or a normal if it has no "
+                "parents"
             )
-        if read := [name for name in conditional.parents if name in units and units[name].logarithms]:
-            raise ValueError(f"{conditional.factor} reads logarithms of {', '.join(read)}, and is not linear in them")
+        if log_parents := [name for name in conditional.parents if name in units and units[name].logarithms]:
+            raise ValueError(
+                f"{conditional.factor} reads logarithms of {', '.join(log_parents)}, so it is not linear in them"
+            )
 
     def _joint(self) -> tuple[Tensor, Tensor]:
         """Return mean and precision of (latents, data) under the model, both stacked variable by variable.
@@ -242,18 +245,18 @@ class Oracle:
         model, names = self.model, (*self.model.latents, *self.model.observed)
         system = self._system(model.generator, names, model.summed, run)
         identity = torch.eye(system.bias.shape[1], dtype=torch.float64)
-        rest = identity - system.weights
-        missing = self._counted(names, run, observed=False) - self._counted(names, run)
-        kept = 1 - missing
+        lhs = identity - system.weights
+        missing = self._count_mask(names, run, observed=False) - self._count_mask(names, run)
+        present = 1 - missing
         # without missing entries, which are replaced wherever they are read
-        own = torch.linalg.solve(identity - missing[..., None] * system.weights, rest, left=False)
-        white = (kept / system.scale)[..., None] * own * kept[:, None] + torch.diag_embed(missing)
-        moved, logs = system.bias[:, None], torch.zeros(1, dtype=torch.float64)
+        replaced = torch.linalg.solve(identity - missing[..., None] * system.weights, lhs, left=False)
+        white = (present / system.scale)[..., None] * replaced * present[:, None] + torch.diag_embed(missing)
+        offset, logs = system.bias[:, None], torch.zeros(1, dtype=torch.float64)
         if model.sums is not None:
             states = model.sums.state_sequences(self.steps)
             logs = sum((self._log_probability(name, states) for name in model.summed), logs)
-            moved = moved + self._stack(states, model.summed) @ system.data_weights.mT
-        means = torch.linalg.solve(rest, moved.mT).mT * kept[:, None]
+            offset = offset + self._stack(states, model.summed) @ system.data_weights.mT
+        means = torch.linalg.solve(lhs, offset.mT).mT * present[:, None]
         return logs, means, white.mT @ white
 
     def _log_probability(self, name: str, states: Mapping[str, Tensor]) -> Tensor:
@@ -266,31 +269,31 @@ class Oracle:
     def _guide(self, run: Rollout | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return gain on the data, offset, and a root R of the covariance R R' of q(latents | data), for each row."""
         system = self._system(self.model.encoder, self.model.latents, self.model.observed, run)
-        rest = torch.eye(system.bias.shape[1], dtype=torch.float64) - system.weights
+        lhs = torch.eye(system.bias.shape[1], dtype=torch.float64) - system.weights
         right = torch.cat([system.data_weights, system.bias[..., None], torch.diag_embed(system.scale)], dim=-1)
-        solved = torch.linalg.solve(rest, right)
+        solved = torch.linalg.solve(lhs, right)
         data = system.data_weights.shape[-1]
         return solved[..., :data], solved[..., data], solved[..., data + 1 :]
 
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
         """Return log p(x), (B,), of data (B, T, D), or of their observed entries."""
-        seen = self.model.read(x)
-        run = self._run(seen)
-        evidence: Tensor = self._weighed(run, *self._mixture(run)).logsumexp(1)
-        return evidence if seen.log_det is None else evidence + seen.volume
+        batch = self.model.read(x)
+        run = self._run(batch)
+        evidence: Tensor = self._log_joint(run, *self._mixture(run)).logsumexp(1)
+        return evidence if batch.log_det is None else evidence + batch.volume
 
-    def _weighed(self, run: Rollout, logs: Tensor, means: Tensor, precision: Tensor) -> Tensor:
+    def _log_joint(self, run: Rollout, logs: Tensor, means: Tensor, precision: Tensor) -> Tensor:
         """Return the log joint (B, C) of the data and each state sequence."""
-        counted = self._counted(self.model.observed, run)
-        data = self._stack(run.values, self.model.observed) * counted
+        mask = self._count_mask(self.model.observed, run)
+        data = self._stack(run.values, self.model.observed) * mask
         start = means.shape[-1] - data.shape[1]
         covariance = torch.linalg.inv(precision)[:, None, start:, start:]
         distribution = torch.distributions.MultivariateNormal(means[..., start:], covariance)
         # uncounted entries are 0, and independent N(0, 1)
-        weighed: Tensor = (
-            logs + distribution.log_prob(data[:, None]) + (1 - counted).sum(1, True) * math.log(2 * math.pi) / 2
+        log_joint: Tensor = (
+            logs + distribution.log_prob(data[:, None]) + (1 - mask).sum(1, True) * math.log(2 * math.pi) / 2
         )
-        return weighed
+        return log_joint
 
     def posterior(self, x: Tensor | Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return mean (B, N) and covariance of the latents given data (B, T, D); 0 at padding.
@@ -300,19 +303,19 @@ class Oracle:
         """
         run = self._run(x)
         logs, means, precision = self._mixture(run)
-        found, within = self._given_states(run, means, precision)
-        real = self._counted(self.model.latents, run)
-        within = within * real[:, None] * real[..., None]
+        state_means, within = self._given_states(run, means, precision)
+        valid = self._count_mask(self.model.latents, run)
+        within = within * valid[:, None] * valid[..., None]
         if not self.model.summed:
-            return found[:, 0], within if _is_partial(run) else within[0]
-        weights = self._weighed(run, logs, means, precision).softmax(1)
-        mean = torch.einsum("bc,bci->bi", weights, found)
-        away = found - mean[:, None]
-        return mean, within + torch.einsum("bc,bci,bcj->bij", weights, away, away)
+            return state_means[:, 0], within if _is_partial(run) else within[0]
+        weights = self._log_joint(run, logs, means, precision).softmax(1)
+        mean = torch.einsum("bc,bci->bi", weights, state_means)
+        difference = state_means - mean[:, None]
+        return mean, within + torch.einsum("bc,bci,bcj->bij", weights, difference, difference)
 
     def _given_states(self, run: Rollout, means: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean (B, C, N) and covariance (R, N, N) of the latents given the data and each state sequence."""
-        data = self._stack(run.values, self.model.observed) * self._counted(self.model.observed, run)
+        data = self._stack(run.values, self.model.observed) * self._count_mask(self.model.observed, run)
         n = means.shape[-1] - data.shape[1]
         within = torch.linalg.inv(precision[:, :n, :n])
         gain = -within @ precision[:, :n, n:]
@@ -407,11 +410,11 @@ def kl_gap(
     if min(steps, seeds) < 1:
         raise ValueError(f"a cost needs at least 1 step and 1 model, got {steps} and {seeds}")
     model = Factorization.parse(generative)
-    read = guide(model, inference, observed)
-    context = _context(model, read)
-    model, data = _drawing(model, context), (*observed, *(factor.child for factor in context))
+    parsed = guide(model, inference, observed)
+    context = _context(model, parsed)
+    model, data = _with_context(model, context), (*observed, *(factor.child for factor in context))
     gaps = [
-        Oracle(linear_gaussian_surrogate(model, read, sizes, steps, seed, data), steps).fit_guide()
+        Oracle(linear_gaussian_surrogate(model, parsed, sizes, steps, seed, data), steps).fit_guide()
         for seed in range(seeds)
     ]
     return torch.tensor(gaps, dtype=torch.float64)
@@ -423,7 +426,7 @@ def _context(model: Factorization, other: Factorization) -> tuple[Factor, ...]:
     return tuple(Factor("p", name, each) for name, each in local.items())
 
 
-def _drawing(model: Factorization, context: tuple[Factor, ...]) -> Factorization:
+def _with_context(model: Factorization, context: tuple[Factor, ...]) -> Factorization:
     """Return the model extended by factors for its context."""
     return replace(model, factors=(*context, *model.factors))
 
@@ -460,20 +463,24 @@ def model_kl_gap(
     """
     if min(steps, seeds) < 1:
         raise ValueError(f"a cost needs at least 1 step and 1 model, got {steps} and {seeds}")
-    whole, less = Factorization.parse(generative), Factorization.parse(reduced)
-    if {*whole.variables} != {*less.variables}:
-        names = ", ".join(whole.variables)
-        raise ValueError(f"a reduced model must have the variables of the whole one, {names}, got {less.text!r}")
-    context = _context(whole, less)
-    whole, less, data = _drawing(whole, context), _drawing(less, context), (*observed, *(f.child for f in context))
-    lost = [
-        _lost(Oracle(linear_gaussian_surrogate(whole, None, sizes, steps, seed, data), steps), less)
+    model, smaller = Factorization.parse(generative), Factorization.parse(reduced)
+    if {*model.variables} != {*smaller.variables}:
+        names = ", ".join(model.variables)
+        raise ValueError(f"a reduced model must have the variables {names} of the full model, got {smaller.text!r}")
+    context = _context(model, smaller)
+    model, smaller, data = (
+        _with_context(model, context),
+        _with_context(smaller, context),
+        (*observed, *(f.child for f in context)),
+    )
+    losses = [
+        _evidence_loss(Oracle(linear_gaussian_surrogate(model, None, sizes, steps, seed, data), steps), smaller)
         for seed in range(seeds)
     ]
-    return torch.tensor(lost, dtype=torch.float64)
+    return torch.tensor(losses, dtype=torch.float64)
 
 
-def _lost(oracle: Oracle, less: Factorization) -> float:
+def _evidence_loss(oracle: Oracle, reduced: Factorization) -> float:
     """Return the smallest KL between the data's normal under the model and under a reduced model.
 
     A model is R v = e, for its variables v minus their means and standard normal e. Biases of the data give a reduced
@@ -492,7 +499,7 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
     entropy = len(covariance) + np.linalg.slogdet(covariance)[1]
 
     def reads(child: str, parent: str) -> np.ndarray:
-        return np.kron(less.mask(child, parent, oracle.steps), np.ones((model.sizes[child], model.sizes[parent])))
+        return np.kron(reduced.mask(child, parent, oracle.steps), np.ones((model.sizes[child], model.sizes[parent])))
 
     free = np.block([[reads(child, parent) for parent in names] for child in names]) > 0
     noise = np.arange(n, len(scale))
@@ -501,11 +508,11 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
         r, log_scale = np.eye(len(scale)), values[: len(noise)]
         r[noise, noise], r[free] = np.exp(-log_scale), values[len(noise) :]
         precision = r.T @ r
-        onto = np.hstack([-np.linalg.solve(precision[:n, :n], precision[:n, n:]).T, np.eye(len(noise))])
-        margin = onto @ precision @ onto.T
-        lost = 0.5 * ((margin * covariance).sum() - np.linalg.slogdet(margin)[1] - entropy)
-        slope = r @ onto.T @ (covariance - np.linalg.inv(margin)) @ onto
-        return lost, np.concatenate([-slope[noise, noise] * r[noise, noise], slope[free]])
+        projection = np.hstack([-np.linalg.solve(precision[:n, :n], precision[:n, n:]).T, np.eye(len(noise))])
+        margin = projection @ precision @ projection.T
+        loss = 0.5 * ((margin * covariance).sum() - np.linalg.slogdet(margin)[1] - entropy)
+        slope = r @ projection.T @ (covariance - np.linalg.inv(margin)) @ projection
+        return loss, np.concatenate([-slope[noise, noise] * r[noise, noise], slope[free]])
 
     # bounded, since the best noise scale may be 0, with infinite precision
     bounds = [(-10.0, None)] * len(noise) + [(None, None)] * int(free.sum())
@@ -517,10 +524,10 @@ def _lost(oracle: Oracle, less: Factorization) -> float:
     start = np.concatenate([np.log(scale[n:]), root[free]])
     least = search(start, 20_000).fun
     if n and least > 1e-9:  # convex without latents, and never below 0
-        chance = np.random.default_rng(0)
-        steps = _AWAY * chance.standard_normal((_STARTS, free.sum()))
+        generator = np.random.default_rng(0)
+        steps = _START_SPREAD * generator.standard_normal((_N_STARTS, free.sum()))
         starts = [start + np.concatenate([np.zeros(len(noise)), step]) for step in steps]
-        best = min((search(each, 100) for each in starts), key=lambda found: found.fun)
+        best = min((search(point, 100) for point in starts), key=lambda result: result.fun)
         least = min(least, search(best.x, 20_000).fun)
     return float(least)
 
@@ -550,10 +557,12 @@ def edge_costs(
         {'x_t to z_t': True, 'z_{t-1} to z_t': False}
     """
     model = Factorization.parse(generative)
-    written = guide(model, inference, observed)
-    known = sizes or ones(model, written)
-    whole = kl_gap(model, written, known, steps, seeds, observed)
-    return _costliest_first(written, lambda less: kl_gap(model, less, known, steps, seeds, observed) - whole)
+    inverse = guide(model, inference, observed)
+    dimensions = sizes or ones(model, inverse)
+    baseline = kl_gap(model, inverse, dimensions, steps, seeds, observed)
+    return _costliest_first(
+        inverse, lambda reduced: kl_gap(model, reduced, dimensions, steps, seeds, observed) - baseline
+    )
 
 
 def model_edge_costs(
@@ -581,8 +590,8 @@ def model_edge_costs(
         {'x_{<t} to x_t': True, 'z_t to x_t': True, 'z_{t-1} to z_t': False}
     """
     model = Factorization.parse(generative)
-    known = sizes or {**ones(model), **dict.fromkeys(observed, 2)}
-    return _costliest_first(model, lambda less: model_kl_gap(model, less, known, steps, seeds, observed))
+    dimensions = sizes or {**ones(model), **dict.fromkeys(observed, 2)}
+    return _costliest_first(model, lambda reduced: model_kl_gap(model, reduced, dimensions, steps, seeds, observed))
 
 
 def ones(*equations: Factorization) -> dict[str, int]:
@@ -590,7 +599,7 @@ def ones(*equations: Factorization) -> dict[str, int]:
     return dict.fromkeys((name for part in equations for name in (*part.variables, *part.context)), 1)
 
 
-def _costliest_first(written: Factorization, cost: Callable[[Factorization], Tensor]) -> dict[str, Tensor]:
+def _costliest_first(factorization: Factorization, cost: Callable[[Factorization], Tensor]) -> dict[str, Tensor]:
     """Return the cost of each edge by its name, largest mean first."""
-    found = {written.describe_edge(*edge): cost(written.without(*edge)) for edge in written.edges}
-    return dict(sorted(found.items(), key=lambda item: -float(item[1].mean())))
+    costs = {factorization.describe_edge(*edge): cost(factorization.without(*edge)) for edge in factorization.edges}
+    return dict(sorted(costs.items(), key=lambda item: -float(item[1].mean())))

@@ -20,12 +20,12 @@ def reference(model: Any, batch: AnyBatch) -> None:
     not drawn yet. A network that reads future values therefore changes the result. Slow.
     """
     rollout = model.rollout(batch)
-    known = {name: value for name, value in rollout.values.items() if name not in model.observed}
+    context = {name: value for name, value in rollout.values.items() if name not in model.observed}
     size, length = rollout.batch, rollout.length
 
     def distribution(name: str, sofar: Mapping[str, list[Tensor]]) -> Any:
         conditional = model.generator[name]
-        parents = dict(known)
+        parents = dict(context)
         for other, values in sofar.items():
             later = torch.randn(size, length - len(values), model.sizes[other]).to(like(model))
             parents[other] = torch.cat([torch.stack(values, 1), later], 1) if values else later
@@ -35,14 +35,14 @@ def reference(model: Any, batch: AnyBatch) -> None:
         for block in model.generative.blocks:
             if not model.generative.local(block.names[0]):
                 (name,) = block.names
-                own, parameters = distribution(name, {})
-                known[name] = pyro.sample(name, own.joint(parameters))
+                head, parameters = distribution(name, {})
+                context[name] = pyro.sample(name, head.joint(parameters))
                 continue
             sofar: dict[str, list[Tensor]] = {name: [] for name in block.names}
             for t in pyro.markov(range(length), history=length):
                 for name in block.names:
-                    own, parameters = distribution(name, sofar)
-                    at_t = own.joint(tuple(p[:, t] for p in parameters))
+                    head, parameters = distribution(name, sofar)
+                    at_t = head.joint(tuple(p[:, t] for p in parameters))
                     data = rollout.values[name][:, t] if name in model.observed else None
                     sofar[name].append(pyro.sample(f"{name}_{t + 1}", at_t, obs=data))
-            known |= {name: torch.stack(values, 1) for name, values in sofar.items()}
+            context |= {name: torch.stack(values, 1) for name, values in sofar.items()}

@@ -70,20 +70,20 @@ class ScheduledSampling:
 
     def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
         """Draw a mask (B, T, 1), True at frames that are replaced."""
-        fed = torch.rand(batch, length, 1, device=device) < self.probability
-        fed[:, : self.start] = False
+        mask = torch.rand(batch, length, 1, device=device) < self.probability
+        mask[:, : self.start] = False
         if self.blocks is not None:
-            kept, own = self.blocks
-            place = (torch.arange(length, device=device) - self.start) % (kept + own)
-            fed &= (place >= kept)[:, None]
-        return fed
+            n_kept, n_replaced = self.blocks
+            phase = (torch.arange(length, device=device) - self.start) % (n_kept + n_replaced)
+            mask &= (phase >= n_kept)[:, None]
+        return mask
 
     def fixed_frames(self, length: int) -> list[bool] | None:
         """Return which of T frames stay unchanged, if this is not random; otherwise None."""
         if self.probability < 1:
             return None
-        kept, own = self.blocks or (0, 1)
-        return [t < self.start or (t - self.start) % (kept + own) < kept for t in range(length)]
+        n_kept, n_replaced = self.blocks or (0, 1)
+        return [t < self.start or (t - self.start) % (n_kept + n_replaced) < n_kept for t in range(length)]
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ class Hidden:
     Args:
         entries: (B, T, 1 or D), or (B, D) of a static variable.
         detached: subset of the entries whose mean has no gradient, or None.
-        told: for each step, whether no sequence has such entries, if known without reading a tensor, which would
-            synchronise a GPU.
+        fixed_frames: for each step, whether no sequence has such entries; None if this is not known without reading a
+            tensor, which would synchronise a GPU.
     """
 
     entries: Tensor
@@ -183,9 +183,9 @@ class Rollout:
         for conditional in self.conditionals.values():
             conditional.check(self.length)
         self._block = {name: block for block in self.factorization.blocks for name in block.names}
-        self._drawn: dict[str, Tensor] = {}
+        self._draws: dict[str, Tensor] = {}
         self._evaluated: dict[str, tuple[Tensor, Parameters]] = {}
-        self._unfed = list(self.factorization.blocks)
+        self._pending = list(self.factorization.blocks)
         self._summation: Enumeration | None = None
         self._valid = None if self.lengths is None else valid_steps(self.lengths, self.length)[..., None]
 
@@ -204,8 +204,8 @@ class Rollout:
     def repeat(self, n: int) -> Rollout:
         """Return a new run with every row repeated n times, draw by draw."""
 
-        def each(values: Any) -> Any:
-            return {name: repeat_batch(value, n) for name, value in values.items()}
+        def each(tensors: Any) -> Any:
+            return {name: repeat_batch(value, n) for name, value in tensors.items()}
 
         return replace(
             self,
@@ -238,8 +238,8 @@ class Rollout:
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
-        known, groups = {**self.known, **self.history(name)}, self.groups if name in self.grouped else None
-        parameters = conditional(known, self.batch, self.length, self.lengths, groups)
+        parents, groups = {**self.known, **self.history(name)}, self.groups if name in self.grouped else None
+        parameters = conditional(parents, self.batch, self.length, self.lengths, groups)
         distribution = conditional.distribution(tuple(p.repeat(draws, *[1] * (p.dim() - 1)) for p in parameters))
         mask = self.mask(name)
         distribution = (distribution if mask is None else distribution.mask(mask)).to_event(
@@ -250,22 +250,22 @@ class Rollout:
     @property
     def known(self) -> dict[str, Tensor]:
         """Known values, with the presence masks of latents and the indicators of observed entries."""
-        there = {presence(name): steps for name, steps in self.present.items()}
+        presences = {presence(name): steps for name, steps in self.present.items()}
         return {
             **self.states,
             **self.values,
-            **there,
-            **{indicator(name): seen for name, seen in self.observed.items()},
+            **presences,
+            **{indicator(name): mask for name, mask in self.observed.items()},
         }
 
     def know(self, name: str, value: Tensor) -> None:
         """Record the value of a site, which later sites read."""
-        if name in self._drawn and not _same(value, self._drawn[name]):
-            handed_out = self.values.keys() & self._drawn.keys() & set(self._block[name].names)
+        if name in self._draws and not _same(value, self._draws[name]):
+            handed_out = self.values.keys() & self._draws.keys() & set(self._block[name].names)
             dependants = sorted(handed_out - {name})
             if dependants:
                 raise ValueError(
-                    f"{name} was set to a value after {', '.join(dependants)} had been drawn along with another draw "
+                    f"{name} was set to a value after {', '.join(dependants)} had been drawn with another value "
                     f"of it; pass {name} to the model as data instead of conditioning on it"
                 )
         self.values[name] = value
@@ -295,8 +295,11 @@ class Rollout:
         if not self._is_evaluated(name, value):
             history = self.history(name)  # this may run a loop that evaluates the variable
             if not self._is_evaluated(name, value):
-                known = {**self.known, name: value, **history}
-                self._evaluated[name] = (value, self.conditionals[name](known, self.batch, self.length, self.lengths))
+                parents = {**self.known, name: value, **history}
+                self._evaluated[name] = (
+                    value,
+                    self.conditionals[name](parents, self.batch, self.length, self.lengths),
+                )
         return self._evaluated[name][1]
 
     def _is_evaluated(self, name: str, value: Tensor) -> bool:
@@ -304,16 +307,16 @@ class Rollout:
 
     def draw(self, name: str) -> Tensor:
         """Draw (B, T, D) of a local variable, together with all variables in its loop over time."""
-        if name not in self._drawn or any(
+        if name not in self._draws or any(
             not _same(self.values.get(other, value), value)
-            for other, value in self._drawn.items()
+            for other, value in self._draws.items()
             if other in self._block[name].names
         ):
             if self.sums is not None:
                 self._draw_states(self._block[name])
-            self._drawn.update(self._run(self._block[name]))
-            self.states |= {n: v for n, v in self._drawn.items() if self.sums is not None and n in self.sums.sizes}
-        return self._drawn[name]
+            self._draws.update(self._run(self._block[name]))
+            self.states |= {n: v for n, v in self._draws.items() if self.sums is not None and n in self.sums.sizes}
+        return self._draws[name]
 
     def state(self, name: str) -> Tensor:
         """Draw a summed-out latent, (B, T, C) or (B, C), given the earlier draws."""
@@ -333,10 +336,10 @@ class Rollout:
     def summation(self) -> Enumeration:
         """The sum over discrete latents, given all other variables."""
         assert self.sums is not None
-        made = self._summation
-        if made is None or any(made.values.get(name) is not value for name, value in self.values.items()):
-            self._summation = made = Enumeration(self.sums, self)
-        return made
+        summation = self._summation
+        if summation is None or any(summation.values.get(name) is not value for name, value in self.values.items()):
+            self._summation = summation = Enumeration(self.sums, self)
+        return summation
 
     @property
     def noisy(self) -> Collection[str]:
@@ -350,71 +353,71 @@ class Rollout:
         scheduled sampling disables it.
         """
         if not self.hidden:
-            return self._fed
-        with torch.set_grad_enabled(self._fed_with_gradient and torch.is_grad_enabled()):
-            while self._block[name] in self._unfed:  # blocks read themselves and earlier ones
-                self._fed.update(self._feed(self._unfed.pop(0)))
-        return self._fed
+            return self._replacements
+        with torch.set_grad_enabled(self._has_gradient and torch.is_grad_enabled()):
+            while self._block[name] in self._pending:  # blocks read themselves and earlier ones
+                self._replacements.update(self._replace_hidden(self._pending.pop(0)))
+        return self._replacements
 
     @cached_property
-    def _fed(self) -> dict[str, Tensor]:
+    def _replacements(self) -> dict[str, Tensor]:
         """Name to (B, T, D): the noisy data of the feeding; `history` adds the means block by block."""
-        found: dict[str, Tensor] = {}
+        noisy: dict[str, Tensor] = {}
         if not isinstance(self.feeding, InputNoise) or not self.feeding.scale:
-            return found
+            return noisy
         for name in self.factorization.variables:  # a fixed order for the random draws
             if name in self.data and name in self.values and self.factorization.local(name):
                 value, units = self.values[name], self.conditionals[name].units.get(name)
                 noise = self.feeding.scale * torch.randn_like(value) * (1.0 if units is None else units.scale)
-                found[name] = self._hide(value + noise)
-        return found
+                noisy[name] = self._hide(value + noise)
+        return noisy
 
     @cached_property
-    def _fed_with_gradient(self) -> bool:
+    def _has_gradient(self) -> bool:
         return any(hidden.detached is not hidden.entries for hidden in self.hidden.values())
 
     @cached_property
     def hidden(self) -> dict[str, Hidden]:
         """Data entries that the model may not read: missing ones, and frames that scheduled sampling replaces."""
-        missing = {name: ~seen for name, seen in self.observed.items() if name in self.values and not seen.all()}
+        missing = {name: ~mask for name, mask in self.observed.items() if name in self.values and not mask.all()}
         hidden = {name: Hidden(entries) for name, entries in missing.items()}
         if not isinstance(self.feeding, ScheduledSampling) or not self.feeding.probability:
             return hidden
-        fed = self.feeding.frames(self.batch, self.length, next(iter(self.values.values())).device)
+        replaced = self.feeding.frames(self.batch, self.length, next(iter(self.values.values())).device)
         for name in self.data & self.values.keys():
             if self.factorization.local(name):
                 absent = missing.get(name)
-                entries = fed if absent is None else fed | absent
-                detached = None if self.feeding.gradient else fed if absent is None else fed & ~absent
+                entries = replaced if absent is None else replaced | absent
+                detached = None if self.feeding.gradient else replaced if absent is None else replaced & ~absent
                 hidden[name] = Hidden(
                     entries, detached, self.feeding.fixed_frames(self.length) if absent is None else None
                 )
         return hidden
 
-    def _feed(self, block: Block) -> dict[str, Tensor]:
+    def _replace_hidden(self, block: Block) -> dict[str, Tensor]:
         """Return the data of a block with the model's means at the hidden entries."""
         names = [name for name in block.names if name in self.hidden]
         if not names:
             return {}
         feeding = self.feeding
         if not isinstance(feeding, ScheduledSampling) or feeding.passes is None or not feeding.probability:
-            return self._run(block, self._fed, self.hidden)
-        known = {**self.known, **self._fed}
+            return self._run(block, self._replacements, self.hidden)
+        values = {**self.known, **self._replacements}
         for _ in range(feeding.passes):
             for name in names:
                 conditional = self.conditionals[name]
-                mean = conditional.mean(conditional(known, self.batch, self.length, self.lengths))
-                known[name] = self._hide(self.hidden[name].fill(self.values[name], mean))
-        return {name: known[name] for name in names}
+                mean = conditional.mean(conditional(values, self.batch, self.length, self.lengths))
+                values[name] = self._hide(self.hidden[name].fill(self.values[name], mean))
+        return {name: values[name] for name in names}
 
     def _run(
-        self, block: Block, fed: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
+        self, block: Block, replacements: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
     ) -> dict[str, Tensor]:
         """Return the unknown variables of a block; with `hidden`, its data with the model's means at those entries."""
-        known_here = self.values.keys() | self.states.keys()
-        live = [name for name in block.names if (name not in known_here if hidden is None else name in hidden)]
-        told = {**self.known, **(fed or {})}
-        given = {name: value for name, value in told.items() if name not in live}
+        known = self.values.keys() | self.states.keys()
+        live = [name for name in block.names if (name not in known if hidden is None else name in hidden)]
+        values = {**self.known, **(replacements or {})}
+        given = {name: value for name, value in values.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
             name: self.conditionals[name].head.noise(
@@ -424,22 +427,22 @@ class Rollout:
             if (hidden is None or self.drawing) and name not in self.mean_emission
         }
         if loop:
-            return self._loop(block, live, given, noise, hidden, self.prefix if hidden is None else told)
-        drawn = {}
+            return self._loop(block, live, given, noise, hidden, self.prefix if hidden is None else values)
+        draws = {}
         for name in live:
             conditional = self.conditionals[name]
             parameters = conditional(given, self.batch, self.length, self.lengths)
             drawing = name in noise
             value = conditional.draw(parameters, noise[name]) if drawing else conditional.mean(parameters)
             if hidden is not None:
-                value = hidden[name].fill(told[name], value)
+                value = hidden[name].fill(values[name], value)
             elif name in self.prefix:
-                seen = self.prefix[name].shape[1]
-                value = torch.cat([self._continue(name, slice(seen), value[:, :seen]), value[:, seen:]], dim=1)
-            drawn[name] = self._hide(value)
+                n_known = self.prefix[name].shape[1]
+                value = torch.cat([self._continue(name, slice(n_known), value[:, :n_known]), value[:, n_known:]], dim=1)
+            draws[name] = self._hide(value)
             if hidden is None:
-                self._evaluated[name] = (drawn[name], parameters)
-        return drawn
+                self._evaluated[name] = (draws[name], parameters)
+        return draws
 
     @memoizing()
     def _loop(
@@ -449,7 +452,7 @@ class Rollout:
         given: Mapping[str, Tensor],
         noise: Mapping[str, Tensor],
         hidden: Mapping[str, Hidden] | None,
-        told: Mapping[str, Tensor],
+        targets: Mapping[str, Tensor],
     ) -> dict[str, Tensor]:
         draw = {name: self.conditionals[name].drawing for name in live}
         states = {name: self.conditionals[name].start(given, self.batch, self.length, self.lengths) for name in live}
@@ -461,67 +464,67 @@ class Rollout:
                 value = self._hide(chain[0])
                 self._evaluated[name] = (value, chain[1])
                 return {name: value}
-        drawn: dict[str, list[Tensor]] = {name: [None] * self.length for name in live}  # type: ignore[list-item]
+        draws: dict[str, list[Tensor]] = {name: [None] * self.length for name in live}  # type: ignore[list-item]
         evaluated: dict[str, list[Parameters]] = {name: [] for name in live}
         steps = {name: values.unbind(1) for name, values in noise.items()}
-        known = self._told_whole(live, hidden, told)
+        is_known = self._known_steps(live, hidden, targets)
         # keep parameters only for scoring: neither for a future nor for replacements of the data
-        kept = not self.prefix if hidden is None else self._fed_with_gradient
-        for first, count in _runs(known, block.direction):
+        keep = not self.prefix if hidden is None else self._has_gradient
+        for first, count in _runs(is_known, block.direction):
             t = first + count - 1
-            end = t + known[t]
+            end = t + is_known[t]
             for name in live if end > first else ():
-                whole = told[name] if end - first == told[name].shape[1] else told[name][:, first:end]
-                drawn[name][first:end] = steps_of(whole)
+                chunk = targets[name] if end - first == targets[name].shape[1] else targets[name][:, first:end]
+                draws[name][first:end] = steps_of(chunk)
             for name in live:
                 conditional = self.conditionals[name]
-                if count > 1 and kept:
-                    at_all, states[name] = conditional.forward_chunk(states[name], first, count, drawn)
+                if count > 1 and keep:
+                    at_all, states[name] = conditional.forward_chunk(states[name], first, count, draws)
                     parameters = tuple(p[:, -1] for p in at_all)
                 else:
-                    parameters, states[name] = conditional.step(states[name], t, drawn, count)
+                    parameters, states[name] = conditional.step(states[name], t, draws, count)
                     at_all = tuple(p[:, None] for p in parameters)
-                evaluated[name] += [at_all] if kept else []
-                if known[t]:
+                evaluated[name] += [at_all] if keep else []
+                if is_known[t]:
                     continue
                 drawing = name in steps
                 value = draw[name](parameters, steps[name][t]) if drawing else conditional.mean(parameters)
                 if hidden is not None:
-                    value = hidden[name].fill(told[name][:, t], value, t)
+                    value = hidden[name].fill(targets[name][:, t], value, t)
                 elif name in self.prefix and t < self.prefix[name].shape[1]:
                     value = self._continue(name, t, value)
                 if padded:
                     value = value * self._valid[:, t]  # type: ignore[index]
-                drawn[name][t] = value
-        values = {name: self._hide(torch.stack(drawn[name], dim=1)) for name in live}
-        if kept:
+                draws[name][t] = value
+        values = {name: self._hide(torch.stack(draws[name], dim=1)) for name in live}
+        if keep:
             for name in live:
                 in_time = evaluated[name] if block.direction >= 0 else evaluated[name][::-1]
                 stacked = tuple(torch.cat(p, dim=1) for p in zip(*in_time, strict=True))
                 self._evaluated[name] = (values[name] if hidden is None else self.values[name], stacked)
         return values
 
-    def _told_whole(
-        self, live: list[str], hidden: Mapping[str, Hidden] | None, told: Mapping[str, Tensor]
+    def _known_steps(
+        self, live: list[str], hidden: Mapping[str, Hidden] | None, values: Mapping[str, Tensor]
     ) -> list[bool]:
         """Return for each step whether all values of a loop are known for every sequence."""
-        if any(name not in told for name in live):
+        if any(name not in values for name in live):
             return [False] * self.length
-        end = min(told[name].shape[1] for name in live)
-        known, seen = [True] * end, []
+        end = min(values[name].shape[1] for name in live)
+        is_known, masks = [True] * end, []
         for name in live:
-            if hidden is not None and (told_at := hidden[name].fixed_frames) is not None:
-                known = [before and now for before, now in zip(known, told_at, strict=False)]
+            if hidden is not None and (fixed := hidden[name].fixed_frames) is not None:
+                is_known = [a and b for a, b in zip(is_known, fixed, strict=False)]
             elif (mask := self.observed.get(name) if hidden is None else ~hidden[name].entries) is not None:
-                seen.append(mask[:, :end].all(-1).all(0))
-        if seen:
-            known = [before and now for before, now in zip(known, torch.stack(seen).all(0).tolist(), strict=True)]
-        return known + [False] * (self.length - end)
+                masks.append(mask[:, :end].all(-1).all(0))
+        if masks:
+            is_known = [a and b for a, b in zip(is_known, torch.stack(masks).all(0).tolist(), strict=True)]
+        return is_known + [False] * (self.length - end)
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
         """Return the known first values of a variable, with `value` at missing entries."""
-        known = self.prefix[name][:, steps]
-        return torch.where(self.observed[name][:, steps], known, value) if name in self.observed else known
+        values = self.prefix[name][:, steps]
+        return torch.where(self.observed[name][:, steps], values, value) if name in self.observed else values
 
     def _hide(self, value: Tensor) -> Tensor:
         return value if self._valid is None or value.dim() == 2 else value * self._valid
@@ -556,7 +559,7 @@ class Sequence(TorchDistribution):
         """Draw (B, T, D), together with the variables in the same loop over time."""
         if sample_shape:
             raise NotImplementedError(
-                f"a Sequence draws one batch at a time, but shape {tuple(sample_shape)} was asked for; repeat the "
+                f"a Sequence draws one batch at a time, got sample_shape {tuple(sample_shape)}; repeat the "
                 "batch, as forecast(samples=...) and iwae_bound(particles=...) do"
             )
         return self.rollout.draw(self.name)
@@ -647,19 +650,19 @@ class Marginal(Sequence):
         return self.by_step(value).flatten(1).sum(-1) if len(self._event_shape) == 2 else self.by_step(value)
 
 
-def _runs(known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
+def _runs(is_known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
     """Yield first step and number of steps of each joint evaluation in a loop.
 
     Forward in time, these are stretches of steps with all values known, together with the next step. Its parameters
     read only known values and earlier draws at the same step.
     """
     if direction < 0:
-        yield from ((t, 1) for t in reversed(range(len(known))))
+        yield from ((t, 1) for t in reversed(range(len(is_known))))
         return
     t = 0
-    while t < len(known):
-        end = next((s for s in range(t, len(known)) if not known[s]), len(known))
-        count = max(min(end + 1, len(known)) - t, 1)
+    while t < len(is_known):
+        end = next((s for s in range(t, len(is_known)) if not is_known[s]), len(is_known))
+        count = max(min(end + 1, len(is_known)) - t, 1)
         yield t, count
         t += count
 
@@ -672,8 +675,8 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
             for parent in factorization.factor(name).parents:
                 if parent.name not in block.names or parent.relation is None or parent.relation.intervals is not None:
                     continue
-                drawn = np.tri(length, k=0 if parent.name in block.names[:i] else -1, dtype=bool)
-                ahead = parent.relation.mask(length) & ~(drawn if block.direction > 0 else drawn.T)
+                available = np.tri(length, k=0 if parent.name in block.names[:i] else -1, dtype=bool)
+                ahead = parent.relation.mask(length) & ~(available if block.direction > 0 else available.T)
                 if ahead.any():
                     t, s = np.argwhere(ahead)[0] + 1
                     raise ValueError(

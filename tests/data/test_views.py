@@ -449,7 +449,7 @@ def test_views_in_a_row_add_their_volumes():
     )
     assert not view.keeps_volume
     assert Views(parts, History("h")).keeps_volume
-    with pytest.raises(ValueError, match="changes the volume of frames without a score"):
+    with pytest.raises(ValueError, match="changes the volume of frames that are not scored"):
         Views(Scaled(), Past("s"))
     assert Views(Past("s"), Scaled()).log_det(Batch({"x": x})).shape == (B,)
 

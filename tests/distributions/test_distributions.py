@@ -141,7 +141,7 @@ def model(**own):
 
 @pytest.mark.parametrize(("place", "factor"), [("qz", r"q\(z_t \|"), ("pz", r"p\(z_t \|")])
 def test_discrete_latents_are_refused(place, factor):
-    with pytest.raises(ValueError, match=rf"the latent z are discrete by the distribution of {factor}.*no gradient"):
+    with pytest.raises(ValueError, match=rf"the latent z from the distribution of {factor} are discrete.*no gradient"):
         model(**{place: Bernoulli})
 
 

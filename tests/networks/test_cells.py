@@ -62,5 +62,5 @@ def test_recurrent_networks_run_under_autocast_on_any_processor(grad):
 
 @pytest.mark.parametrize(("kind", "base"), KINDS)
 def test_dropout_is_refused(kind, base):
-    with pytest.raises(ValueError, match="dropout must be 0, got 0.5"):
+    with pytest.raises(ValueError, match="dropout must be 0"):
         kind(2, 3, 2, dropout=0.5)
