@@ -70,8 +70,8 @@ class Method(Trainable):
     def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:
         """Return the arguments of `DynamicalVAE` for data of these sizes."""
         generative, inference = self.equations()
-        given = {"generative": generative, "inference": inference, "sizes": {**self.sizes(), **sizes}}
-        return {**given, "network": self.networks(), "distributions": dict(self.distributions())}
+        arguments = {"generative": generative, "inference": inference, "sizes": {**self.sizes(), **sizes}}
+        return {**arguments, "network": self.networks(), "distributions": dict(self.distributions())}
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class LikelihoodMethod(Method):
             "normal" (scale read from the parents) or "student" (Student t). By default the distributions of a table's
             columns, or "fixed".
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
-            an offset: one-step forecasts are sharp, but free runs can drift without bound. A smaller share limits the
+            an offset: one-step forecasts are sharp, but free runs can drift without limit. A smaller share limits the
             drift.
         scheduled_sampling: final probability that a frame of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
@@ -161,8 +161,7 @@ class LikelihoodMethod(Method):
         if self.residual:
             raise ValueError(
                 f"residual is {self.residual}, but the table's columns define the distribution of x, which adds no "
-                "previous "
-                'value; leave residual at 0, or give all columns one distribution with emission="normal"'
+                'previous value; leave residual at 0, or give all columns one distribution with emission="normal"'
             )
         return distribution
 
@@ -266,8 +265,8 @@ def rising(level: float, steps: int) -> Ramp:
 
 def fit_units(model: DynamicalVAE, train: Any) -> None:
     """Fit the units of x to 1024 windows of the training data, as the model sees them."""
-    seen = model.read(train.sample(1024, torch.default_generator), precise=True)
-    model.units[WHOLE].fit(interpolate_missing(seen[WHOLE], seen.mask()))
+    data = model.read(train.sample(1024, torch.default_generator), precise=True)
+    model.units[WHOLE].fit(interpolate_missing(data[WHOLE], data.mask()))
 
 
 def start_priors(model: DynamicalVAE, train: Any) -> None:

@@ -70,7 +70,7 @@ class Registry(UserDict[str, Any]):
     """
 
     def __init__(self, own: Mapping[str, str], group: str) -> None:
-        super().__init__({name: EntryPoint(name, place, group) for name, place in own.items()})
+        super().__init__({name: EntryPoint(name, value, group) for name, value in own.items()})
         for entry in entry_points(group=group):
             if entry.name in own:
                 raise ValueError(f"the name of entry point {entry.value} is already taken in {group}: {entry.name}")
@@ -81,7 +81,7 @@ class Registry(UserDict[str, Any]):
         return self.data[name].load()  # type: ignore[no-any-return]
 
     def texts(self, name: str, *attributes: str) -> list[str | None]:
-        """Return attributes of a class, read from its file if they are literals, because importing torch takes seconds.
+        """Return attributes of a class; literals are read from its file, because importing torch takes seconds.
 
         Args:
             name: name of a method or metric model.
@@ -90,12 +90,14 @@ class Registry(UserDict[str, Any]):
         Returns:
             Their texts; None for an option of the method, which is a field of the dataclass.
         """
-        found = _literals(*self.data[name].value.split(":"))
-        if not found.keys() >= {*attributes}:
+        literals = _literals(*self.data[name].value.split(":"))
+        if not literals.keys() >= {*attributes}:
             kind = self[name]
             options = {field.name for field in fields(kind)}
-            found = {each: None if each in options else getattr(kind, each) for each in attributes}
-        return [found[each] for each in attributes]
+            literals = {
+                attribute: None if attribute in options else getattr(kind, attribute) for attribute in attributes
+            }
+        return [literals[attribute] for attribute in attributes]
 
 
 @cache
@@ -107,32 +109,32 @@ def _literals(module: str, name: str) -> dict[str, str | None]:
     if not file.is_file():
         return {}
     tree = ast.parse(file.read_bytes())
-    classes = {each.name: each for each in tree.body if isinstance(each, ast.ClassDef)}
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     imported = {
         alias.asname or alias.name: (
-            resolve_name("." * each.level + (each.module or ""), module.rpartition(".")[0]),
+            resolve_name("." * node.level + (node.module or ""), module.rpartition(".")[0]),
             alias.name,
         )
-        for each in tree.body
-        if isinstance(each, ast.ImportFrom)
-        for alias in each.names
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
     }
     if name not in classes:
         return _literals(*imported[name]) if name in imported else {}
-    found: dict[str, str | None] = {}
+    texts: dict[str, str | None] = {}
     for base in reversed(classes[name].bases):
         if isinstance(base, ast.Name):
-            found |= _literals(module, base.id)
+            texts |= _literals(module, base.id)
     for line in classes[name].body:
         if isinstance(line, ast.Assign | ast.AnnAssign):
             target = line.target if isinstance(line, ast.AnnAssign) else line.targets[0]
-            assigned = ast.unparse(target)
-            found.pop(assigned, None)
+            attribute = ast.unparse(target)
+            texts.pop(attribute, None)
             if isinstance(line, ast.AnnAssign) and "ClassVar" not in ast.unparse(line.annotation):
-                found[assigned] = None
+                texts[attribute] = None
             elif isinstance(line.value, ast.Constant) and isinstance(line.value.value, str):
-                found[assigned] = line.value.value
-    return found
+                texts[attribute] = line.value.value
+    return texts
 
 
 @cache
@@ -162,23 +164,24 @@ def method(name: str, **options: Any) -> Method:
         >>> dvae.method("srnn", latent=8).build({"x": 48}).sizes["z"]
         8
     """
-    return _chosen(methods(), "method", name, options)  # type: ignore[no-any-return]
+    return _create(methods(), "method", name, options)  # type: ignore[no-any-return]
 
 
 def metric_model(name: str, **options: Any) -> Trainable:
     """Return a metric model by its name, with options in place of its defaults."""
-    return _chosen(metric_models(), "metric model", name, options)  # type: ignore[no-any-return]
+    return _create(metric_models(), "metric model", name, options)  # type: ignore[no-any-return]
 
 
-def _chosen(table: Mapping[str, type[Any]], what: str, name: str, options: Mapping[str, Any]) -> Any:
+def _create(table: Mapping[str, type[Any]], category: str, name: str, options: Mapping[str, Any]) -> Any:
     if name not in table:
-        raise ValueError(f"unknown {what} {name!r}{nearest(name, table)}; known: {', '.join(table)}")
+        raise ValueError(f"unknown {category} {name!r}{nearest(name, table)}; known: {', '.join(table)}")
     kind = table[name]
-    known = {field.name for field in fields(kind)}
+    option_names = {field.name for field in fields(kind)}
     for option in options:
-        if option not in known:
+        if option not in option_names:
             raise ValueError(
-                f"{name} has no option {option!r}{nearest(option, known)}; it has {', '.join(sorted(known))}"
+                f"{name} has no option {option!r}{nearest(option, option_names)}; its options are "
+                f"{', '.join(sorted(option_names))}"
             )
     return kind(**options)
 

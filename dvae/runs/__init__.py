@@ -1,4 +1,4 @@
-"""Runs: directories that contain a fit and everything needed to resume it, single runs and sweeps."""
+"""Runs: directories that contain a fit and everything needed to resume it; sweeps, ablations and reports."""
 
 from typing import TYPE_CHECKING
 

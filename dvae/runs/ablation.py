@@ -1,9 +1,9 @@
-"""Ablations: leave out every edge of a model and of its guide in turn, and measure the cost of each.
+"""Ablations: remove every edge of a model and of its guide in turn, and measure the cost of each.
 
 There are two costs. On linear-Gaussian surrogates (`dvae.program.oracle`) the cost is computed: the evidence that a
 model loses without an edge, or the increase of the gap of a guide. It shows which edges can matter. On data the cost is
-measured. The whole and every reduced pair of equations are fitted with the same seeds (`sweep`) and compared on the
-test windows (`compare`), with errors over clips and seeds, and p-values adjusted for all edges (Holm, 1979).
+measured. The full pair of equations and every reduced pair are fitted with the same seeds (`sweep`). They are compared
+on the test windows (`compare`), with errors over clips and seeds, and p-values adjusted for all edges (Holm, 1979).
 
 The cost of a model's edge is a loss of evidence. On data it is measured by the IWAE bound, which is near the evidence
 even if the guide is not. The cost of a guide's edge is a loss of the ELBO, because an IWAE bound hides the distance of
@@ -53,9 +53,9 @@ METRIC = {"p": "IWAE bound", "q": "ELBO"}
 WHOLE = "whole"
 """Name of the run with all edges."""
 FAMILY = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "autoregressive")
-"""Methods defined by their equations alone, which can therefore have networks of one kind."""
+"""Methods that their equations define completely, so their factors can have networks of one kind."""
 LEVEL = 0.05
-"""Smallest p-value of an edge that is drawn pale."""
+"""Edges with this p-value or a larger one are drawn pale."""
 MOST = 1000
 """Maximum number of surrogates of an ablation read from a file."""
 WORDS = {"<=": "upto-", ">=": "from-", "<": "before-", ">": "after-", ":": ".."}
@@ -101,13 +101,14 @@ class Ablation(Result):
         sizes: sizes of the variables of the surrogates.
         steps: number T of time steps of the surrogates.
         costs: {`AblatedEdge.run`: cost on each of the surrogates, in nats per sequence}.
-        notes: {`AblatedEdge.run`: reason why the reduced equations were not fitted, or data that no longer depend on a
-            latent}.
+        notes: {`AblatedEdge.run`: reason why the reduced equations were not fitted, or latents on which no data depend
+            without the edge}.
         comparison: comparison of the fitted models, `WHOLE` and one for each `AblatedEdge.run`; None without fits.
 
     Example:
-        >>> found = dvae.ablate(("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"), steps=3, surrogates=2)
-        >>> [edge.name for edge in found.edges if max(found.costs[edge.run]) < 1e-6]
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+        >>> ablation = dvae.ablate(pair, steps=3, surrogates=2)
+        >>> [edge.name for edge in ablation.edges if max(ablation.costs[edge.run]) < 1e-6]
         ['x_{<t} to z_t']
     """
 
@@ -135,16 +136,16 @@ class Ablation(Result):
     @property
     def edges(self) -> tuple[AblatedEdge, ...]:
         """Edges of the model, then of the guide, in decreasing order of cost on the surrogates."""
-        found = edges_of(self.generative, self.inference)
-        return tuple(sorted(found, key=lambda edge: (edge.kind, -float(np.mean(self.costs[edge.run])))))
+        edges = edges_of(self.generative, self.inference)
+        return tuple(sorted(edges, key=lambda edge: (edge.kind, -float(np.mean(self.costs[edge.run])))))
 
     @cached_property
     def differences(self) -> dict[str, Estimate]:
-        """{`AblatedEdge.run`: `METRIC` of the whole minus `METRIC` without the edge, in nats per frame}."""
+        """{`AblatedEdge.run`: `METRIC` with all edges minus `METRIC` without the edge, in nats per frame}."""
         if self.comparison is None:
             return {}
-        fitted = [edge for edge in self.edges if edge.run in self.comparison.rows]
-        return {edge.run: self.comparison.difference(WHOLE, edge.run, METRIC[edge.kind]) for edge in fitted}
+        fitted_edges = [edge for edge in self.edges if edge.run in self.comparison.rows]
+        return {edge.run: self.comparison.difference(WHOLE, edge.run, METRIC[edge.kind]) for edge in fitted_edges}
 
     @property
     def p_values(self) -> dict[str, float]:
@@ -174,23 +175,23 @@ class Ablation(Result):
         for edge in self.edges:
             costs = np.array(self.costs[edge.run])
             cells = [f"{number(costs.mean())} ({number(costs.min())} to {number(costs.max())})"]
-            if columns and (found := self.differences.get(edge.run)) is not None:
-                low, high = map(number, found.interval())
-                cells += [str(found), low if low == "–" else f"{low} to {high}", number(self.p_values[edge.run])]
+            if columns and (difference := self.differences.get(edge.run)) is not None:
+                low, high = map(number, difference.interval())
+                cells += [str(difference), low if low == "–" else f"{low} to {high}", number(self.p_values[edge.run])]
             elif columns:
                 cells += ["–"] * 3
             table.add_row(edge.name, edge.of, *cells, *([self.notes.get(edge.run, "")] if self.notes else []))
         return table
 
     def plot(self) -> Figure:
-        """Draw model and guide of one step, with edges as wide as their cost, on surrogates and on data (if fitted)."""
+        """Draw model and guide of one step, with edges as wide as their cost, on surrogates and, if fitted, on data."""
         parts = [part for part in (self.generative, self.inference) if part.factors]
         on_surrogates = {run: float(np.mean(costs)) for run, costs in self.costs.items()}
         rows: list[tuple[str, dict[str, float], set[str]]] = [("nats a sequence, on surrogates", on_surrogates, set())]
         if self.comparison is not None:
-            fitted = {run: estimate.mean for run, estimate in self.differences.items()}
-            unsure = {run for run, p in self.p_values.items() if not p < LEVEL}
-            rows.append((f"nats a {self._frame}, on data\n(pale: p ≥ {LEVEL})", fitted, unsure))
+            measured = {run: estimate.mean for run, estimate in self.differences.items()}
+            insignificant = {run for run, p in self.p_values.items() if not p < LEVEL}
+            rows.append((f"nats a {self._frame}, on data\n(pale: p ≥ {LEVEL})", measured, insignificant))
         figure = new_figure(5 * len(parts), 3.6 * len(rows))
         panels = figure.subplots(len(rows), len(parts), squeeze=False)
         for (unit, costs, pale), row in zip(rows, panels, strict=True):
@@ -221,8 +222,8 @@ class Ablation(Result):
     @override
     def check(self) -> None:
         runs = {edge.run for edge in edges_of(self.generative, self.inference)}
-        fitted = set() if self.comparison is None else self.comparison.rows.keys() - {WHOLE}
-        if self.costs.keys() != runs or not runs >= self.notes.keys() | fitted:
+        fitted_runs = set() if self.comparison is None else self.comparison.rows.keys() - {WHOLE}
+        if self.costs.keys() != runs or not runs >= self.notes.keys() | fitted_runs:
             raise ValueError("costs, notes or fits name edges that are not in the equations; give one cost per edge")
         counts = {len(costs) for costs in self.costs.values()}
         if len(counts) > 1 or not all(0 < count <= MOST for count in counts):
@@ -234,7 +235,7 @@ class Ablation(Result):
             raise ValueError("costs must be finite")
         if self.comparison is not None:
             self.comparison.check()
-        self.table()  # fails if the comparison does not contain the whole and all values of the table
+        self.table()  # fails if the comparison misses a run or a value
 
 
 def edges_of(generative: Factorization, inference: Factorization) -> tuple[AblatedEdge, ...]:
@@ -275,8 +276,8 @@ def as_equations(method: Method | tuple[str, str], schema: Schema | None = None)
         )
     covariates = ((), ()) if schema is None else schema.covariates
     pair = [part.given(*covariates, getattr(method, "without_covariates", ())) for part in method.equations()]
-    known = {option.name for option in fields(Equations)} - {"generative", "inference", "latents"}
-    options = {name: value for name, value in vars(method).items() if name in known and value is not None}
+    option_names = {option.name for option in fields(Equations)} - {"generative", "inference", "latents"}
+    options = {name: value for name, value in vars(method).items() if name in option_names and value is not None}
     sizes = {name: size for name, size in method.sizes().items() if size != options.get("latent")}
     return Equations(generative=pair[0].text, inference=pair[1].text, latents=sizes, **options)
 
@@ -299,9 +300,9 @@ def ablate(
 ) -> Ablation:
     """Return the cost of every edge of a model and of its guide, on linear-Gaussian surrogates and on data.
 
-    Without data, costs are computed on the surrogates only. With data, the whole and the equations without each edge
-    are fitted with each seed, and compared on the test windows. The same call continues interrupted runs and keeps
-    finished ones. The guide stays the same if a model loses an edge; only a "faithful" guide is derived again.
+    Without data, costs are computed on the surrogates only. With data, the full equations and the equations without
+    each edge are fitted with each seed, and compared on the test windows. The same call continues interrupted runs and
+    keeps finished ones. The guide stays the same if a model loses an edge; only a "faithful" guide is derived anew.
 
     Args:
         method: one of vae, dkf, storn, vrnn, srnn, rvae-causal, rvae-noncausal, dsae and autoregressive, whose
@@ -328,69 +329,70 @@ def ablate(
         SweepInterrupted: after Ctrl-C or SIGTERM.
 
     Example:
-        >>> found = dvae.ablate(("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"), steps=3, surrogates=1)
-        >>> len(found.edges), found.edges[-1].of, found.edges[-1].name
+        >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"
+        >>> ablation = dvae.ablate(pair, steps=3, surrogates=1)
+        >>> len(ablation.edges), ablation.edges[-1].of, ablation.edges[-1].name
         (6, 'guide', 'x_{<t} to z_t')
     """
     if (data is None) != (out is None):
         raise ValueError("fits need data and a directory for their runs; give both `data` and `out`, or neither")
-    whole = as_equations(method, None if data is None else data.schema)
-    model, read = whole.equations()
+    full = as_equations(method, None if data is None else data.schema)
+    model, guide = full.equations()
     if data is None:
-        check_pair(model, read, observed)
-    observed = tuple(name for name in model.variables if name not in read.variables)
-    known = dict(sizes or {**ones(model, read), **dict.fromkeys(observed, 2)})
-    edges = edges_of(model, read)
-    parts = {"p": model, "q": read}
-    less = {edge: parts[edge.kind].without(edge.child, edge.parent) for edge in edges}
+        check_pair(model, guide, observed)
+    observed = tuple(name for name in model.variables if name not in guide.variables)
+    surrogate_sizes = dict(sizes or {**ones(model, guide), **dict.fromkeys(observed, 2)})
+    edges = edges_of(model, guide)
+    parts = {"p": model, "q": guide}
+    without = {edge: parts[edge.kind].without(edge.child, edge.parent) for edge in edges}
 
-    of_surrogates = known, steps, surrogates, observed
+    surrogate_arguments = surrogate_sizes, steps, surrogates, observed
     costs: dict[str, np.ndarray] = {}
     with progress_bar(progress) as bar:
-        gaps = kl_gap(model, read, *of_surrogates)
+        gaps = kl_gap(model, guide, *surrogate_arguments)
         for edge in bar.track(edges, description="costs on surrogates"):
             if edge.kind == "p":
-                cost = model_kl_gap(model, less[edge], *of_surrogates)
+                cost = model_kl_gap(model, without[edge], *surrogate_arguments)
             else:
-                cost = kl_gap(model, less[edge], *of_surrogates) - gaps
+                cost = kl_gap(model, without[edge], *surrogate_arguments) - gaps
             costs[edge.run] = cost.numpy()
 
     notes = {
         edge.run: f"without it, no data depend on {', '.join(sorted(idle))}"
         for edge in edges
-        if edge.kind == "p" and (idle := _idle(less[edge], observed) - _idle(model, observed))
+        if edge.kind == "p" and (idle := _idle(without[edge], observed) - _idle(model, observed))
     }
-    found = Ablation({"generative": model.text, "inference": read.text}, known, steps, costs, notes)
+    ablation = Ablation({"generative": model.text, "inference": guide.text}, surrogate_sizes, steps, costs, notes)
     if data is None or out is None:
-        return found
-    named: dict[str, Method] = {WHOLE: whole}
-    whole.build(data.schema)
+        return ablation
+    methods: dict[str, Method] = {WHOLE: full}
+    full.build(data.schema)
     for edge in edges:
         try:
-            changed: dict[str, Any] = {"generative" if edge.kind == "p" else "inference": less[edge].text}
-            reduced = replace(whole, **changed)
+            changes: dict[str, Any] = {"generative" if edge.kind == "p" else "inference": without[edge].text}
+            reduced = replace(full, **changes)
             reduced.build(data.schema)
         except ValueError as error:
             notes[edge.run] = f"not fitted: {error}"
         else:
-            named[edge.run] = reduced
-    told = training if isinstance(training, Training) else {"progress": progress, **(training or {})}
-    results = sweep(named, data, out, seeds, training_of(whole, data, told), jobs)
+            methods[edge.run] = reduced
+    options = training if isinstance(training, Training) else {"progress": progress, **(training or {})}
+    results = sweep(methods, data, out, seeds, training_of(full, data, options), jobs)
     if failed := [str(result) for result in results if result.status not in ENDED]:
         raise RuntimeError(
             "\n".join([f"{len(failed)} of {len(results)} runs failed; the same call retries them", *failed])
         )
     comparison = compare(
-        {name: [load(Path(out) / f"{name}-seed{each}").model for each in seeds] for name in named},
+        {name: [load(Path(out) / f"{name}-seed{run_seed}").model for run_seed in seeds] for name in methods},
         data.windows("test"),
         particles=bound_particles,
         contrasts=0,
         samples=0,
         seed=seed,
-        configs={name: each.config() for name, each in named.items()},
+        configs={name: variant.config() for name, variant in methods.items()},
         progress=progress,
     )
-    return replace(found, comparison=comparison)
+    return replace(ablation, comparison=comparison)
 
 
 def _idle(model: Factorization, observed: tuple[str, ...]) -> set[str]:

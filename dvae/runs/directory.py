@@ -106,30 +106,30 @@ class Loaded:
 
     def alike(self, other: Loaded) -> bool:
         """Return whether another run was fitted on the same windows of the same data, regardless of its view."""
-        data, others = self.config.data.fingerprint, other.config.data.fingerprint
-        return bool(data == others and self.schema.windows == other.schema.windows)
+        fingerprint, other_fingerprint = self.config.data.fingerprint, other.config.data.fingerprint
+        return bool(fingerprint == other_fingerprint and self.schema.windows == other.schema.windows)
 
-    def with_data(self, path: str | os.PathLike[str], **read: Any) -> Any:
+    def with_data(self, path: str | os.PathLike[str], **changes: Any) -> Any:
         """Open other data of the same kind under the run's schema.
 
         Args:
             path: path of the other data.
-            **read: fields of the run's source to replace, such as missing=True.
+            **changes: fields of the run's source to replace, such as missing=True.
 
         Raises:
             ValueError: the data have another schema, such as other joints.
         """
-        other = DATA[self.config.kind].reopened(replace(self.config.data, **read), self.schema, path)
-        here, there = (dict(flat(schema.config())) for schema in (self.schema, other.schema))
-        if differing := [name for name in here | there if here.get(name) != there.get(name)]:
-            values = (f"{name} is {brief(there.get(name))}, not {brief(here.get(name))}" for name in differing)
+        other = DATA[self.config.kind].reopened(replace(self.config.data, **changes), self.schema, path)
+        stored, other_config = (dict(flat(schema.config())) for schema in (self.schema, other.schema))
+        if differing := [name for name in stored | other_config if stored.get(name) != other_config.get(name)]:
+            values = (f"{name} is {brief(other_config.get(name))}, not {brief(stored.get(name))}" for name in differing)
             more = f"; and {len(differing) - 3} more" if len(differing) > 3 else ""
             raise ValueError(f"{os.fspath(path)} does not fit {self.path}: {'; '.join(islice(values, 3))}{more}")
         return other
 
 
 def advice(path: str | os.PathLike[str]) -> str:
-    """Return how to continue a run: after a failure at a lower learning rate, as the same steps would fail."""
+    """Return advice to continue a run; after a failure at a lower learning rate, because the same steps would fail."""
     run = Run(path)
     if run.state["status"] != "failed":
         return f"continue it with: dvae resume {path}"
@@ -139,7 +139,7 @@ def advice(path: str | os.PathLike[str]) -> str:
 
 
 def training_of(method: Trainable, data: Dataset, training: Training | Mapping[str, Any] | None) -> Training:
-    """Return the training options of a method for data: `training`, or the method's own with those in `training`."""
+    """Return the training options of a method for data: its defaults, with those in `training` replaced."""
     return training if isinstance(training, Training) else replace(method.training(data.schema), **(training or {}))
 
 
@@ -157,7 +157,7 @@ def resume(
 
     Args:
         path: run directory.
-        data: where the data are now, if the path in the run is no longer valid.
+        data: current path of the data, if the path in the run is no longer valid.
         trackers: further receivers of the log's rows.
         callbacks: hooks of the training loop.
         **options: options of `Training` to change, such as steps=4000 for a longer run.
@@ -169,8 +169,8 @@ def resume(
     training = replace(run.config.training, scheduled_sampling=0.0, **options)
     train, validation = run.data.windows("train"), run.data.windows("validation")
     recipe = run.config.method.train(train, validation, training.steps)
-    told: dict[str, Any] = {"out": path, "config": run.config.written(), "trackers": trackers, "callbacks": callbacks}
-    return fit(run.model, recipe, resume=True, **told, **vars(training))
+    hooks: dict[str, Any] = {"trackers": trackers, "callbacks": callbacks}
+    return fit(run.model, recipe, resume=True, out=path, config=run.config.written(), **hooks, **vars(training))
 
 
 def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> Loaded:
@@ -180,7 +180,7 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
 
     Args:
         path: run directory, as `dvae fit` writes it.
-        data: where the data are now, if the path in the run is no longer valid.
+        data: current path of the data, if the path in the run is no longer valid.
 
     Raises:
         CheckpointError: the run is missing or damaged.
@@ -195,10 +195,10 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
         ...     dvae.load(folder + "/a").method.name
         'vae'
     """
-    loaded = _load(path, data)
-    if loaded.failed:
-        warnings.warn(loaded.unfinished, stacklevel=3)  # `serialized` is between
-    return loaded
+    run = _load(path, data)
+    if run.failed:
+        warnings.warn(run.unfinished, stacklevel=3)  # `serialized` is between
+    return run
 
 
 def _load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None) -> Loaded:
@@ -227,12 +227,14 @@ def read_config(path: str | os.PathLike[str]) -> Config:
                 "again, or install the version that wrote it"
             )
         schema, source, training = dict(config["schema"]), dict(config["data"]), config["training"]
-        kind, described = source.pop("kind"), schema.pop("kind")
-        if described != DATA[kind].schema_kind:
-            raise ValueError(f"data of the kind {kind!r} are {DATA[kind].schema_kind}, not {described!r}")
+        kind, schema_kind = source.pop("kind"), schema.pop("kind")
+        if schema_kind != DATA[kind].schema_kind:
+            raise ValueError(
+                f"data of the kind {kind!r} have a schema of the kind {DATA[kind].schema_kind!r}, got {schema_kind!r}"
+            )
         return Config(
             configured(config["method"]),
-            SCHEMAS[described].from_config(schema),
+            SCHEMAS[schema_kind].from_config(schema),
             kind,
             DATA[kind].source(**source),
             Training(**{name: option_from_config(value) for name, value in training.items()}),
@@ -247,9 +249,9 @@ def reading_config(path: str | os.PathLike[str]) -> Iterator[None]:
     except (CheckpointError, OSError):
         raise
     except Exception as error:  # a third-party method may raise any error for unknown options
-        what = f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
         raise CheckpointError(
             f"{Path(path) / CONFIG} does not describe method, schema, data and training of a run "
-            f"({what[:400]}{'…' * (len(what) > 400)}); it is damaged, or was not written by `dvae fit` with these "
+            f"({reason[:400]}{'…' * (len(reason) > 400)}); it is damaged, or was not written by `dvae fit` with these "
             "methods; fit again"
         ) from error

@@ -41,7 +41,7 @@ from ..options import nearest, tuples
 LARGEST = 2**20
 """Maximum size of a grid in bytes."""
 MOST = 1000
-"""Maximum number of methods in a grid, counted with all combinations of their options, and of seeds."""
+"""Maximum number of methods in a grid, including all combinations of options, and of seeds."""
 NAME = r"\w[\w.=+-]{0,199}"
 """Pattern of the name of a run directory without its seed."""
 SEEDS, TRAINING, METHOD, EACH = "seeds", "training", "method", "each"
@@ -77,10 +77,10 @@ class Grid:
         """
         text = files.read(path, LARGEST, links=True)
         try:
-            told = tomllib.loads(text.decode("utf-8"))
-        except (ValueError, RecursionError) as error:  # bad TOML or UTF-8, too long numbers, too deep nesting
+            document = tomllib.loads(text.decode("utf-8"))
+        except (ValueError, RecursionError) as error:  # invalid TOML or UTF-8, long numbers, deep nesting
             raise ValueError(f"{path} is not TOML in UTF-8: {error}") from error
-        seeds, training = told.pop(SEEDS, None), told.pop(TRAINING, {})
+        seeds, training = document.pop(SEEDS, None), document.pop(TRAINING, {})
         if seeds is not None and not _are_seeds(seeds):
             raise ValueError(
                 f"{path}: seeds is {reprlib.repr(seeds)}; it must list distinct whole numbers, such as [0, 1, 2]"
@@ -89,66 +89,69 @@ class Grid:
             training = tuples(_training(training))
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}, [{TRAINING}]: {error}") from error
-        if not told:
+        if not document:
             raise ValueError(f"{path} names nothing to fit; give a table for each, such as [srnn] with method = 'srnn'")
         methods: dict[str, Method] = {}
-        for name, table in told.items():
+        for name, table in document.items():
             if not isinstance(table, dict):
                 raise ValueError(
                     f"{path}: {name} = {table!r} is in no table; only seeds and [training] apply to all runs"
                 )
             try:
-                found = _methods(name, table, options or {}, MOST - len(methods))
-                if twice := found.keys() & methods.keys():
-                    raise ValueError(f"{min(twice)} is the name of another table's run; give one of them another name")
+                table_methods = _methods(name, table, options or {}, MOST - len(methods))
+                if duplicates := table_methods.keys() & methods.keys():
+                    raise ValueError(
+                        f"{min(duplicates)} is the name of another table's run; give one of them another name"
+                    )
             except (TypeError, ValueError) as error:
                 raise ValueError(f"{path}, [{name}]: {error}") from error
-            methods |= found
+            methods |= table_methods
         return cls(methods, None if seeds is None else tuple(seeds), training)
 
 
-def _are_seeds(told: Any) -> bool:
-    whole = isinstance(told, list) and 0 < len(told) <= MOST and all(type(each) is int and each >= 0 for each in told)
-    return whole and len({*told}) == len(told)
+def _are_seeds(value: Any) -> bool:
+    if not isinstance(value, list) or not 0 < len(value) <= MOST:
+        return False
+    return all(type(seed) is int and seed >= 0 for seed in value) and len({*value}) == len(value)
 
 
-def _training(told: Any) -> dict[str, Any]:
+def _training(options: Any) -> dict[str, Any]:
     """Return the checked training options of all runs.
 
     Raises:
         TypeError, ValueError: `told` is not a table, or an option is unknown, wrong, or not available in a sweep.
     """
-    if not isinstance(told, dict):
-        raise ValueError(f"it must be a table of options such as steps, got {reprlib.repr(told)}")
-    known = {option.name for option in fields(Training)} - {"seed", "devices"}
-    for name in told:
-        if name not in known:
-            said = "; give seeds = [...] instead" if name == "seed" else nearest(name, known)
-            raise ValueError(f"unknown training option {name!r} of a sweep{said}")
-    Training(**told)
-    return told
+    if not isinstance(options, dict):
+        raise ValueError(f"it must be a table of options such as steps, got {reprlib.repr(options)}")
+    option_names = {option.name for option in fields(Training)} - {"seed", "devices"}
+    for name in options:
+        if name not in option_names:
+            hint = "; give seeds = [...] instead" if name == "seed" else nearest(name, option_names)
+            raise ValueError(f"unknown training option {name!r} of a sweep{hint}")
+    Training(**options)
+    return options
 
 
-def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], room: int) -> dict[str, Method]:
-    """Return the methods of a table by name."""
-    own = {**options, **table}
-    kind, each = own.pop(METHOD, EQUATIONS), own.pop(EACH, {})
-    if not isinstance(kind, str) or not isinstance(each, dict):
+def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], limit: int) -> dict[str, Method]:
+    """Return the methods of a table by name; at most `limit`."""
+    settings = {**options, **table}
+    kind, variations = settings.pop(METHOD, EQUATIONS), settings.pop(EACH, {})
+    if not isinstance(kind, str) or not isinstance(variations, dict):
         raise ValueError("`method` must be a name, and `each` a table of options with lists of values")
     count = 1
-    for option, values in each.items():
+    for option, values in variations.items():
         if not isinstance(values, list) or not values:
             raise ValueError(f"each.{option} is {values!r}; it must be a list of values, such as [8, 16]")
         if any(values.count(value) > 1 for value in values):
             raise ValueError(f"each.{option} has a value twice: {reprlib.repr(values)}")
         count *= len(values)
-    if count > room:
+    if count > limit:
         raise ValueError(f"{count} more methods exceed the maximum of {MOST} in a grid; leave some values out")
-    found = {}
-    for values in product(*each.values()):
-        varied = dict(zip(each, values, strict=True))
+    methods = {}
+    for values in product(*variations.values()):
+        varied = dict(zip(variations, values, strict=True))
         labels = [f"{option.replace('_', '-')}={value}" for option, value in varied.items()]
-        method = registry.method(kind, **tuples({**own, **varied}))
+        method = registry.method(kind, **tuples({**settings, **varied}))
         method.check()
         label = "-".join([name, *labels])
         if not re.fullmatch(NAME, label):
@@ -156,5 +159,5 @@ def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], ro
                 f"{reprlib.repr(label)} cannot name run directories; names have at most 200 letters, digits and "
                 "-_.=+; give each text value its own table"
             )
-        found[label] = method
-    return found
+        methods[label] = method
+    return methods

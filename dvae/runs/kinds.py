@@ -1,4 +1,4 @@
-"""Kinds of data that runs are fitted on, and of their schemas: registered by name, and imported at first use."""
+"""Registries of the kinds of data that runs are fitted on, and of their schemas; classes are imported on first use."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Dataset(Protocol):
 
     @classmethod
     def reopened(cls, source: Any, schema: Any, path: str | os.PathLike[str] | None = None) -> Self:
-        """Open recorded data from their own or another path, without a check of their content."""
+        """Open recorded data from their own or another path, without checking their content."""
 
 
 def open_data(
@@ -75,22 +75,22 @@ def open_data(
         kind: kind of the data.
         source: source of the data, as returned by `Dataset.recorded`.
         schema: schema of the data.
-        where: path of the data now; by default the path in `source`.
+        where: current path of the data; by default the path in `source`.
 
     Raises:
         CheckpointError: the data are missing or have changed.
     """
     where = os.fspath(where or source.path)
     try:
-        found = DATA[kind].reopened(source, schema, where)
+        data = DATA[kind].reopened(source, schema, where)
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{run} was fitted on {source.path}, but {where} does not exist; relative paths start from the working "
             "directory, so change to the directory of the fit, or give the path of these or other data (--data)"
         ) from error
-    if found.fingerprint != source.fingerprint:
+    if data.fingerprint != source.fingerprint:
         raise CheckpointError(
-            f"{where} has changed since {run} was fitted on it: its fingerprint is {found.fingerprint[:12]}…, the "
+            f"{where} has changed since {run} was fitted on it: its fingerprint is {data.fingerprint[:12]}…, the "
             f"run's {source.fingerprint[:12]}…; restore the file, or fit again"
         )
-    return found
+    return data

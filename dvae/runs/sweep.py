@@ -71,8 +71,8 @@ class Outcome:
     def __str__(self) -> str:
         if self.status == "failed":
             return f"{self.path.name} failed: {self.error}"
-        how = f"in {_clock(self.seconds)}" if self.seconds else "by an earlier sweep"
-        return ", ".join(filter(None, [f"{self.path.name} {self.status} at step {self.step} {how}", self.best]))
+        duration = f"in {_clock(self.seconds)}" if self.seconds else "by an earlier sweep"
+        return ", ".join(filter(None, [f"{self.path.name} {self.status} at step {self.step} {duration}", self.best]))
 
 
 class SweepInterrupted(KeyboardInterrupt):
@@ -101,8 +101,8 @@ def sweep(
 ) -> list[Outcome]:
     """Fit each method with each seed, several runs in parallel.
 
-    The name of a run directory contains the method, the options in which methods of that name differ, and the seed,
-    such as srnn-z8-seed0. Runs use processes of this machine, or the backend of the caller's `joblib.parallel_config`.
+    A run directory is named after the method, the options that differ among methods of this name, and the seed, such
+    as srnn-z8-seed0. Runs use processes of this machine, or the backend of the caller's `joblib.parallel_config`.
     Workers on other machines need access to the file system of `out`. Ctrl-C stops all runs; the same sweep continues
     them from their last checkpoints.
 
@@ -141,7 +141,7 @@ def sweep(
             replace(training_of(method, data, training), seed=seed),
         )
         for seed in seeds
-        for name, method in _named(methods).items()
+        for name, method in _by_name(methods).items()
     ]
     if not runs or len({run.path for run in runs}) < len(runs):
         raise ValueError(f"a sweep needs at least one method and one seed, each once, got seeds {list(seeds)}")
@@ -150,36 +150,36 @@ def sweep(
         raise ValueError("jobs is 0; it must be the number of runs at a time, or -1 for one per core")
     if devices := [run.training.devices for run in runs if run.training.devices != 1]:
         raise ValueError(f"devices is {devices[0]}; a run of a sweep has one device; for more, use dvae.fit")
-    results = {run.path: result for run in runs if (result := _earlier(run)) is not None}
-    waiting = [run for run in runs if run.path not in results]
+    results = {run.path: result for run in runs if (result := _earlier_outcome(run)) is not None}
+    pending = [run for run in runs if run.path not in results]
     notes: list[str] = []
     stopped: KeyboardInterrupt | None = None
     out.mkdir(parents=True, exist_ok=True)
     files.remove_leftovers(out)
-    with _Progress(waiting, runs[0].training.progress) as progress:
+    with _Progress(pending, runs[0].training.progress) as progress:
         for result in results.values():
             progress.end(result)
         try:
-            with _terminable():
-                for result, said in _parallel(waiting, jobs):
+            with _interrupt_on_sigterm():
+                for result, messages in _parallel(pending, jobs):
                     results[result.path] = result
-                    notes += said
+                    notes += messages
                     progress.end(result)
         except KeyboardInterrupt as interrupt:
             stopped = interrupt
     for note in dict.fromkeys(notes):
         warnings.warn(note)
-    given = [replace(results[run.path], path=out / run.path.name) for run in runs if run.path in results]
+    outcomes = [replace(results[run.path], path=out / run.path.name) for run in runs if run.path in results]
     if stopped is not None:
-        raise SweepInterrupted(given, len(runs), getattr(stopped, "signal", signal.SIGINT))
-    if blind := [result.path for result in given if result.status in ENDED and not Run(result.path).exists]:
-        raise RuntimeError(f"a worker wrote {blind[0]} elsewhere; give a directory that all workers can access")
-    return given
+        raise SweepInterrupted(outcomes, len(runs), getattr(stopped, "signal", signal.SIGINT))
+    if misplaced := [result.path for result in outcomes if result.status in ENDED and not Run(result.path).exists]:
+        raise RuntimeError(f"a worker wrote {misplaced[0]} elsewhere; give a directory that all workers can access")
+    return outcomes
 
 
 @dataclass(frozen=True)
 class _Run:
-    """Arguments of a worker. Paths are absolute, because a worker may have another working directory."""
+    """Arguments of a worker; paths are absolute, because a worker may have another working directory."""
 
     path: Path
     method: Method
@@ -190,56 +190,58 @@ class _Run:
 
 def _parallel(runs: Sequence[_Run], jobs: int) -> Iterator[tuple[Outcome, list[str]]]:
     """Yield results with their warnings as runs end, from the joblib backend that the caller has chosen."""
-    with _ignored_signals():  # for the workers, which joblib ends
-        found: Iterator[Any] = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
+    with _ignore_signals():  # for the workers, which joblib ends
+        outcomes: Iterator[Any] = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")(
             delayed(_fit)(run) for run in runs
         )
-    yield from found
+    yield from outcomes
 
 
-_ONE_AT_A_TIME = threading.Lock()
+_RUN_LOCK = threading.Lock()
 """Lock held during a run: threads of one process share the caught warnings and torch's number of threads."""
 
 
 def _fit(run: _Run) -> tuple[Outcome, list[str]]:
     """Fit or resume a run in a worker; return its result and the warnings."""
-    with _ONE_AT_A_TIME, _one_thread(), warnings.catch_warnings(record=True) as caught:
+    with _RUN_LOCK, _one_thread(), warnings.catch_warnings(record=True) as recorded:
         begin, error = time.monotonic(), ""
         try:
             if Run(run.path).exists:
-                where = run.training.accelerator
-                ended = resume(run.path, run.source, callbacks=[_EndsWithParent()], progress=False, accelerator=where)
+                accelerator = run.training.accelerator
+                result = resume(
+                    run.path, run.source, callbacks=[_EndsWithParent()], progress=False, accelerator=accelerator
+                )
             else:
                 training = replace(run.training, progress=False)
-                ended = fit(run.method, run.data, out=run.path, callbacks=[_EndsWithParent()], **vars(training))
-        except Exception as failure:  # of any type, which may not be picklable for the sweep's process
-            ended = Fit([], 0, None, None, "failed", run.path)
+                result = fit(run.method, run.data, out=run.path, callbacks=[_EndsWithParent()], **vars(training))
+        except Exception as failure:  # of any type, perhaps one that cannot be pickled
+            result = Fit([], 0, None, None, "failed", run.path)
             error = f"{type(failure).__name__}: {error_message(failure)}"
         seconds = time.monotonic() - begin
-    return _outcome(run, ended, seconds=seconds, error=error), [str(warning.message) for warning in caught]
+    return _outcome(run, result, seconds=seconds, error=error), [str(warning.message) for warning in recorded]
 
 
 def _outcome(run: _Run, fit: Fit, **more: Any) -> Outcome:
-    found = fit.status, fit.step, fit.best_bound, fit.best
-    return Outcome(run.path, run.method, run.training.seed, *found, **more)
+    values = fit.status, fit.step, fit.best_bound, fit.best
+    return Outcome(run.path, run.method, run.training.seed, *values, **more)
 
 
 class _EndsWithParent(Callback):
     """Callback that ends a worker if its sweep was killed."""
 
     def __init__(self) -> None:
-        self.own, self.parent, self.next = multiprocessing.parent_process() is None, os.getppid(), 0.0
+        self.is_main, self.parent, self.next = multiprocessing.parent_process() is None, os.getppid(), 0.0
 
     @override
     def on_step(self, state: State) -> None:
-        if not self.own and time.monotonic() > self.next:
+        if not self.is_main and time.monotonic() > self.next:
             self.next = time.monotonic() + 0.5
             if os.getppid() != self.parent:
                 os._exit(1)  # a worker that returns would wait for more work
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
+def _interrupt_on_sigterm() -> Iterator[None]:
     """Make SIGTERM raise KeyboardInterrupt in the block, as Ctrl-C does."""
 
     def stop(number: int, _: Any) -> None:
@@ -258,7 +260,7 @@ def _terminable() -> Iterator[None]:
 
 
 @contextmanager
-def _ignored_signals() -> Iterator[None]:
+def _ignore_signals() -> Iterator[None]:
     """Make processes started in the block ignore Ctrl-C, because an interrupted idle worker would break the pool."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -282,27 +284,27 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _named(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Method]:
+def _by_name(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Method]:
     """Return methods by the names of their run directories, without the seed."""
     if isinstance(methods, Mapping):
-        named = dict(methods)
+        by_name = dict(methods)
     else:
-        named = {}
+        by_name = {}
         for method in methods:
-            alike = [other for other in methods if other.name == method.name]
-            varied = {n: v for n, v in vars(method).items() if len({repr(vars(other)[n]) for other in alike}) > 1}
+            same_name = [other for other in methods if other.name == method.name]
+            varied = {n: v for n, v in vars(method).items() if len({repr(vars(other)[n]) for other in same_name}) > 1}
             labels = (f"z{v}" if n == "latent" else f"{n.replace('_', '-')}={v}" for n, v in varied.items())
             name = "-".join([method.name, *labels])
-            if name in named:
+            if name in by_name:
                 raise ValueError(f"{name} is given twice; the methods of a sweep differ in their options")
-            named[name] = method
-    for name in named:
+            by_name[name] = method
+    for name in by_name:
         if not re.fullmatch(r"[\w.=+-]+", name):
             raise ValueError(f"{name!r} cannot name a directory; name the methods: sweep({{'a': …, 'b': …}}, …)")
-    return named
+    return by_name
 
 
-def _earlier(run: _Run) -> Outcome | None:
+def _earlier_outcome(run: _Run) -> Outcome | None:
     """Return the result of a run that an earlier sweep has finished; None for other runs.
 
     Raises:
@@ -316,39 +318,39 @@ def _earlier(run: _Run) -> Outcome | None:
             raise ValueError(f"{run.path} is a file, not a run directory; choose another directory for the sweep")
         return None
     config, state = read_config(run.path), earlier.state
-    there = _options(config.method, config.schema, config.training, config.data.fingerprint)
+    stored = _options(config.method, config.schema, config.training, config.data.fingerprint)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run itself warns about shortened schedules
         training = clamp(run.training, run.training.steps)
-    here = _options(
+    expected = _options(
         run.method.resolve_defaults(run.data.windows("train")), run.data.schema, training, run.data.fingerprint
     )
-    if changed := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
-        name = changed[0]
-        others = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+    if differing := [name for name in {**stored, **expected} if stored.get(name) != expected.get(name)]:
+        name = differing[0]
+        others = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
         raise ValueError(
-            f"{run.path} contains a run with other options: its {name} is {there.get(name)!r}, the sweep's "
-            f"{here.get(name)!r}{others}; use the same options, or another directory"
+            f"{run.path} contains a run with other options: its {name} is {stored.get(name)!r}, the sweep's "
+            f"{expected.get(name)!r}{others}; use the same options, or another directory"
         )
-    return _outcome(run, _left(run)) if state["status"] in ENDED else None
+    return _outcome(run, _stored_fit(run)) if state["status"] in ENDED else None
 
 
-def _left(run: _Run) -> Fit:
+def _stored_fit(run: _Run) -> Fit:
     """Return the result stored in a run's directory."""
     if not (earlier := Run(run.path)).exists:
         return Fit([], 0, None, None, "failed", run.path)
     state = earlier.state
-    found = {name: state[name] for name in ("status", "step", "best_step", "best_bound")}
-    found |= {"per": state.get("per", Fit.per), "processor_seconds": state.get("processor_seconds", 0.0)}
-    found["last_value"] = state.get("last_value")
-    return Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **found)
+    values = {name: state[name] for name in ("status", "step", "best_step", "best_bound")}
+    values |= {"per": state.get("per", Fit.per), "processor_seconds": state.get("processor_seconds", 0.0)}
+    values["last_value"] = state.get("last_value")
+    return Fit(JSONLines(run.path / "log.jsonl").read(), run=run.path, **values)
 
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:
-    """Return the options that define a run on any machine; the method determines scheduled sampling."""
-    apart = ("scheduled_sampling", "progress", "accelerator")
-    told = {name: value for name, value in vars(training).items() if name not in apart}
-    return {**method.config(), **told, **dict(flat(schema.config(), "data's ")), "data's fingerprint": fingerprint}
+    """Return the options that define a run on any machine; scheduled sampling follows from the method."""
+    excluded = ("scheduled_sampling", "progress", "accelerator")
+    options = {name: value for name, value in vars(training).items() if name not in excluded}
+    return {**method.config(), **options, **dict(flat(schema.config(), "data's ")), "data's fingerprint": fingerprint}
 
 
 class _Log:
@@ -365,20 +367,20 @@ class _Log:
 
     def look(self) -> bool:
         """Read the new rows; return whether the run has just started."""
-        began = self.begin is None and self._stamp() != self._before  # both fit and resume start a new file
-        if began:
+        has_started = self.begin is None and self._stamp() != self._before  # both fit and resume start a new file
+        if has_started:
             self.begin = time.monotonic()
         if self.begin is not None:
             with suppress(OSError, files.FileRefused), files.open_plain(self.path) as file:
                 file.seek(self._read)
-                whole, end, _ = file.read(LARGEST_LOG).rpartition(b"\n")
-                self._read += len(whole + end)
-                for row in map(row_of, whole.split(b"\n")):
+                lines, separator, _ = file.read(LARGEST_LOG).rpartition(b"\n")
+                self._read += len(lines + separator)
+                for row in map(row_of, lines.split(b"\n")):
                     if row is None:  # a damaged row, which `JSONLines.read` reports
                         continue
                     self.step = row["step"]
                     self.bound = row.get("validation/self_fed/bound", row.get("validation/bound", self.bound))
-        return began
+        return has_started
 
     def _stamp(self) -> tuple[int, int] | None:
         with suppress(OSError):
@@ -390,8 +392,8 @@ class _Log:
 class _Progress:
     """Progress of a sweep: a line when each run ends, and a live table, or without a terminal a line at each start."""
 
-    def __init__(self, runs: Sequence[_Run], shown: bool) -> None:
-        self.console = PlainConsole(stderr=True, quiet=not shown, force_jupyter=False)
+    def __init__(self, runs: Sequence[_Run], visible: bool) -> None:
+        self.console = PlainConsole(stderr=True, quiet=not visible, force_jupyter=False)
         self.total = len(runs)
         self.bound = f"bound (nats a {runs[0].data.schema.per if runs else Fit.per})"
         self.logs = {run.path: _Log(run.path, run.training.steps) for run in runs}

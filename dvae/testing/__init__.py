@@ -1,4 +1,4 @@
-"""Tests for your own models, with pytest. `strategies` draws random factorizations, with hypothesis."""
+"""Pytest test cases for your own models, and random factorizations for hypothesis (`strategies`)."""
 
 from .contract import FactorizationContract
 from .regression import ElboRegression

@@ -44,7 +44,7 @@ class FactorizationContract:
         steps: number T of time steps in a test.
         tolerance: maximum difference of log densities between two ways of running the program, in nats.
         still: names of parameters that need not have a gradient from every batch.
-        missing: dependencies of the posterior that the published guide ignores, {} for none; not checked if None.
+        missing: dependencies of the posterior that the published guide ignores, {} if it is exact; not checked if None.
         training_steps: number of optimiser steps in the test that trains.
         waits: maximum number of synchronisations of a bound and its gradient with a GPU; 1 if only the check of the
             batch synchronises. Not checked if None.
@@ -92,53 +92,57 @@ class FactorizationContract:
         values = self._data(model, 1, names=model.sizes)
         for conditional in (*model.generator.values(), *model.encoder.values()):
             for name in conditional.parents:
-                shown = torch.as_tensor(conditional.factor.mask(name, self.steps))
-                read = self._reads(conditional, values, name)
-                shown = shown.expand_as(read)
-                assert not (read & ~shown).any(), f"{conditional.factor} reads {name} where its mask hides it:\n{read}"
-                assert (read | ~shown).all(), f"{conditional.factor} does not read {name} where it may:\n{read}"
+                mask = torch.as_tensor(conditional.factor.mask(name, self.steps))
+                dependence = self._reads(conditional, values, name)
+                mask = mask.expand_as(dependence)
+                assert not (dependence & ~mask).any(), (
+                    f"{conditional.factor} reads {name} where its mask is False:\n{dependence}"
+                )
+                assert (dependence | ~mask).all(), (
+                    f"{conditional.factor} does not read {name} where its mask is True:\n{dependence}"
+                )
 
     def test_scoring_agrees_with_drawing(self) -> None:
         """Free-running and teacher-forced log densities of the same values are equal, for model and guide."""
         model = self._model()
         data = self._data(model)
         context = {name: data[name] for name in model.context}
-        free, drawn = _run(model.model, context, length=self.steps, size=self.batch)
-        scored = {**context, **{name: free[name] for name in model.observed}}
-        self._close(drawn, model.log_joint(scored, {name: free[name] for name in model.latents}))
-        latents, drawn = _run(model.guide, data)
-        self._close(drawn, _run(poutine.condition(model.guide, data=latents), data)[1])
+        values, draw_logs = _run(model.model, context, length=self.steps, size=self.batch)
+        observations = {**context, **{name: values[name] for name in model.observed}}
+        self._close(draw_logs, model.log_joint(observations, {name: values[name] for name in model.latents}))
+        latents, draw_logs = _run(model.guide, data)
+        self._close(draw_logs, _run(poutine.condition(model.guide, data=latents), data)[1])
 
     def test_the_log_joint_is_that_of_the_per_step_program(self) -> None:
         """One site per variable has the log density of a loop over time with one site per step."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)
-        courses = {} if model.sums is None else model.sums.state_sequences(self.steps)
-        found = []
-        for place in range(max(map(len, courses.values()), default=1)):  # every state sequence of discrete latents
-            told = {name: value[place].expand(self.batch, *value[place].shape) for name, value in courses.items()}
+        sequences = {} if model.sums is None else model.sums.state_sequences(self.steps)
+        joints = []
+        for index in range(max(map(len, sequences.values()), default=1)):  # every state sequence of discrete latents
+            states = {name: value[index].expand(self.batch, *value[index].shape) for name, value in sequences.items()}
             sites: dict[str, Tensor] = {}
-            for name, value in (latents | told).items():
-                at = (
+            for name, value in (latents | states).items():
+                per_step = (
                     {name: value} if value.dim() == 2 else {f"{name}_{t + 1}": v for t, v in enumerate(value.unbind(1))}
                 )
-                sites |= at
+                sites |= per_step
             _, logs = _run(poutine.condition(partial(reference, model), data=sites), data)
-            found.append(torch.stack(list(logs.values())).sum(0))
+            joints.append(torch.stack(list(logs.values())).sum(0))
         vectorised = torch.stack(list(model.log_joint(data, latents).values())).sum(0)
-        self._close({"joint": torch.stack(found).logsumexp(0)}, {"joint": vectorised})
+        self._close({"joint": torch.stack(joints).logsumexp(0)}, {"joint": vectorised})
 
     def test_a_sequence_scores_the_same_whatever_is_beside_it(self) -> None:
-        """The other sequences of a batch do not matter, in training mode too, and scoring changes no buffer or mode."""
+        """Other sequences of a batch have no effect, in training mode too, and scoring changes no buffer or mode."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)
         model.train()
         buffers = {name: value.clone() for name, value in model.named_buffers()}
-        both = model.log_joint(data, latents)
-        first = ({name: value[:1] for name, value in each.items()} for each in (data, latents))
-        self._close(model.log_joint(*first), {name: value[:1] for name, value in both.items()})
+        batch_logs = model.log_joint(data, latents)
+        first = ({name: value[:1] for name, value in values.items()} for values in (data, latents))
+        self._close(model.log_joint(*first), {name: value[:1] for name, value in batch_logs.items()})
         assert model.training
         assert all(torch.equal(value, buffers[name]) for name, value in model.named_buffers())
 
@@ -164,12 +168,14 @@ class FactorizationContract:
         latents, guide_logs = _run(model.guide, ragged)
         logs = model.log_joint(ragged, latents)
         for i, n in enumerate(lengths.tolist()):
-            alone, drawn = (
+            sequence, sequence_latents = (
                 {name: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for name, v in values.items()}
                 for values in (data, latents)
             )
-            self._close({name: log[i : i + 1] for name, log in logs.items()}, model.log_joint(alone, drawn))
-            guided = _run(poutine.condition(model.guide, data=drawn), alone)[1]
+            self._close(
+                {name: log[i : i + 1] for name, log in logs.items()}, model.log_joint(sequence, sequence_latents)
+            )
+            guided = _run(poutine.condition(model.guide, data=sequence_latents), sequence)[1]
             self._close({name: log[i : i + 1] for name, log in guide_logs.items()}, guided)
 
     def test_missing_entries_leave_the_likelihood(self) -> None:
@@ -178,12 +184,12 @@ class FactorizationContract:
         data = self._data(model)
         latents, guided = _run(model.guide, data)
         names = [name for name in model.observed if self._local(model, name)]
-        seen: Any = {**data, "mask": {name: torch.ones_like(data[name], dtype=torch.bool) for name in names}}
-        self._close(model.log_joint(seen, latents), model.log_joint(data, latents))
-        self._close(_run(poutine.condition(model.guide, data=latents), seen)[1], guided)
-        unseen: Any = {**data, **{name: torch.full_like(data[name], torch.nan) for name in names}}
-        unseen["mask"] = {name: ~mask for name, mask in seen["mask"].items()}
-        terms = SequenceELBO().terms(model, unseen)
+        complete: Any = {**data, "mask": {name: torch.ones_like(data[name], dtype=torch.bool) for name in names}}
+        self._close(model.log_joint(complete, latents), model.log_joint(data, latents))
+        self._close(_run(poutine.condition(model.guide, data=latents), complete)[1], guided)
+        hidden: Any = {**data, **{name: torch.full_like(data[name], torch.nan) for name in names}}
+        hidden["mask"] = {name: ~mask for name, mask in complete["mask"].items()}
+        terms = SequenceELBO().terms(model, hidden)
         assert torch.isfinite(terms.bound).all()
         assert all((terms.log_likelihood[name] == 0).all() for name in names)
 
@@ -196,18 +202,20 @@ class FactorizationContract:
         values = [parameter.detach().clone() for parameter in model.parameters()]
         directions = [torch.randn_like(value) for value in values]
 
-        def bound(away: float) -> Tensor:
+        def bound(step: float) -> Tensor:
             with torch.no_grad():
                 for parameter, value, direction in zip(model.parameters(), values, directions, strict=True):
-                    parameter.copy_(value + away * direction)
+                    parameter.copy_(value + step * direction)
             torch.manual_seed(1)
             return SequenceELBO().terms(model, data).bound.sum()
 
-        away = 1e-6
-        moved = float((bound(away) - bound(-away)).detach()) / (2 * away)
+        step = 1e-6
+        difference = float((bound(step) - bound(-step)).detach()) / (2 * step)
         gradient = torch.autograd.grad(bound(0.0), list(model.parameters()), allow_unused=True, materialize_grads=True)
         slope = sum(float((g * d).sum()) for g, d in zip(gradient, directions, strict=True))
-        assert abs(slope - moved) <= 1e-5 * max(abs(moved), 1.0), f"the gradient says {slope}, the bound moves {moved}"
+        assert abs(slope - difference) <= 1e-5 * max(abs(difference), 1.0), (
+            f"the gradient gives a slope of {slope}, finite differences give {difference}"
+        )
 
     def test_every_parameter_learns(self) -> None:
         """The loss has a gradient in every parameter of model and guide."""
@@ -236,49 +244,53 @@ class FactorizationContract:
         expected = SequenceELBO().terms(model, data).bound
         with on_device() as traffic:
             move(model)
-            there = {name: value.to("cuda") for name, value in data.items()}
+            device_data = {name: value.to("cuda") for name, value in data.items()}
             for _ in range(2):  # the first pass copies constants to the device
                 traffic.clear()
                 torch.manual_seed(1)
-                bound = SequenceELBO().terms(model, there).bound
+                bound = SequenceELBO().terms(model, device_data).bound
                 bound.sum().backward()
-            assert not traffic.uploads, f"a bound brings tensors to the device: {', '.join(traffic.uploads)}"
-            waited = f"a bound waits {len(traffic.reads)} times for the device: {', '.join(traffic.reads)}"
-            assert self.waits is None or len(traffic.reads) <= self.waits, waited
-            past = {name: v[:, :-1] if name in model.observed and v.dim() == 3 else v for name, v in there.items()}
+            assert not traffic.uploads, f"a bound copies tensors to the device: {', '.join(traffic.uploads)}"
+            message = f"a bound synchronises {len(traffic.reads)} times with the device: {', '.join(traffic.reads)}"
+            assert self.waits is None or len(traffic.reads) <= self.waits, message
+            past = {
+                name: v[:, :-1] if name in model.observed and v.dim() == 3 else v for name, v in device_data.items()
+            }
             model.forecast(past, 1)
             self._close({"bound": bound.detach().cpu()}, {"bound": expected})
 
-    @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU is here")
+    @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
     def test_a_bound_on_a_gpu_is_the_processors(self) -> None:
         """With the same noise, a bound and its gradient are equal on GPU and CPU."""
         model = self._model()
         data = self._data(model)
-        found: list[dict[str, Tensor]] = []
-        for each, device in ((model, "cpu"), (copy.deepcopy(model).to("cuda"), "cuda")):
-            there = {name: value.to(device) for name, value in data.items()}
+        results: list[dict[str, Tensor]] = []
+        for copied, device in ((model, "cpu"), (copy.deepcopy(model).to("cuda"), "cuda")):
+            device_data = {name: value.to(device) for name, value in data.items()}
             with SameNoise():
                 torch.manual_seed(1)
-                bound = SequenceELBO().terms(each, there).bound.sum()
-                slopes = torch.autograd.grad(bound, list(each.parameters()), allow_unused=True, materialize_grads=True)
-            slope = torch.cat([each.flatten().cpu() for each in slopes])
-            found.append({"bound": bound.detach().cpu(), "its gradient": slope})
-        self._close(found[1], found[0])
+                bound = SequenceELBO().terms(copied, device_data).bound.sum()
+                slopes = torch.autograd.grad(
+                    bound, list(copied.parameters()), allow_unused=True, materialize_grads=True
+                )
+            slope = torch.cat([gradient.flatten().cpu() for gradient in slopes])
+            results.append({"bound": bound.detach().cpu(), "its gradient": slope})
+        self._close(results[1], results[0])
 
     def test_the_audit_says_what_is_published(self) -> None:
         """The guide ignores exactly the dependencies of the exact posterior in `missing`."""
         if self.missing is None:
-            pytest.skip("nothing is published on the guide (missing = None)")
+            pytest.skip("missing is None: no published dependencies to compare with")
         model = self.build(1)
-        found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing
-        assert found == dict(self.missing), f"the guide misses {found}, published is {dict(self.missing)}"
+        ignored = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing
+        assert ignored == dict(self.missing), f"the guide ignores {ignored}, expected {dict(self.missing)} (`missing`)"
 
     def test_its_linear_gaussian_surrogate_is_bounded_by_the_evidence_and_tight_where_the_audit_says_so(self) -> None:
         """On a surrogate with known evidence, the best guide's gap is zero if and only if the guide is exact."""
         model = self._model()
         if model.context:
-            pytest.skip("the evidence given context is not known")
-        # size 1, for which a diagonal covariance is no restriction
+            pytest.skip("the evidence given a context is unknown")
+        # size 1, because a diagonal covariance is then no restriction
         sizes = {name: size if name in model.summed else 1 for name, size in model.sizes.items()}
         pair = linear_gaussian_surrogate(model.generative, model.inference, sizes, self.steps, observed=model.observed)
         oracle = Oracle(pair, self.steps)
@@ -289,7 +301,7 @@ class FactorizationContract:
         assert (oracle.bound(data) <= oracle.evidence(data) + 1e-9).all()
         gap = oracle.fit_guide()
         exact = audit(model.generative, model.inference, self.steps, model.observed).exact
-        assert (gap < 1e-6) == exact, f"the audit says exact: {exact}, but the best guide's gap is {gap:.2g} nats"
+        assert (gap < 1e-6) == exact, f"the audit returns exact={exact}, but the best guide's gap is {gap:.2g} nats"
 
     def test_the_evidence_lies_between_its_annealed_bounds(self) -> None:
         """On draws of the model, the average bound from the guide is below the bound from the true latents."""
@@ -297,12 +309,12 @@ class FactorizationContract:
         if not model.latents or not model.likelihood:
             pytest.skip("no latents are drawn, or the data are functions of them")
         context = {name: value for name, value in self._data(model, count).items() if name in model.context}
-        drawn, _ = _run(model.model, context, length=self.steps, size=count)
-        scored = {**context, **{name: drawn[name] for name in model.observed}}
+        values, _ = _run(model.model, context, length=self.steps, size=count)
+        observations = {**context, **{name: values[name] for name in model.observed}}
         annealing: dict[str, Any] = {"temperatures": 2, "chains": 2, "leaps": 1}
-        below = annealed_bound(model, scored, **annealing).bound
-        latents = {name: drawn[name] for name in model.latents}
-        gap = annealed_bound(model, scored, latents=latents, **annealing).bound - below
+        lower = annealed_bound(model, observations, **annealing).bound
+        latents = {name: values[name] for name in model.latents}
+        gap = annealed_bound(model, observations, latents=latents, **annealing).bound - lower
         assert gap.mean() > -4 * gap.std() / math.sqrt(count) - self.tolerance
 
     def test_training_stays_finite(self) -> None:
@@ -310,8 +322,8 @@ class FactorizationContract:
         size = 4
         model, data = self.build(size), self.data(size)
         if not isinstance(data, Mapping):
-            first, drawn = model.observed[0], self._data(model, *data.shape[:2])
-            data = {**drawn, first: data} if model.generator[first].support is None else drawn
+            first, random_data = model.observed[0], self._data(model, *data.shape[:2])
+            data = {**random_data, first: data} if model.generator[first].support is None else random_data
         fit(model, data, steps=self.training_steps, batch_size=8, accelerator="cpu", progress=False)
         assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
         past = {
@@ -329,7 +341,7 @@ class FactorizationContract:
         """With states summed out, importance weights from a widened posterior average to the evidence."""
         mean, covariance = oracle.posterior(data)
         distribution = torch.distributions.MultivariateNormal(mean, 1.5 * covariance) if pair.latents else None
-        drawn = (
+        samples = (
             torch.zeros(draws, self.batch, 0, dtype=torch.float64)
             if distribution is None
             else distribution.sample((draws,))
@@ -337,13 +349,15 @@ class FactorizationContract:
         widths = [pair.sizes[name] * (self.steps if self._local(pair, name) else 1) for name in pair.latents]
         latents = {
             name: value.flatten(0, 1).unflatten(1, (self.steps, -1)) if self._local(pair, name) else value.flatten(0, 1)
-            for name, value in zip(pair.latents, drawn.split(widths, -1) if widths else (), strict=True)
+            for name, value in zip(pair.latents, samples.split(widths, -1) if widths else (), strict=True)
         }
         joint = torch.stack(list(pair.log_joint(repeat(data, draws), latents).values())).sum(0)
-        weights = joint.unflatten(0, (draws, -1)) - (0 if distribution is None else distribution.log_prob(drawn))
+        weights = joint.unflatten(0, (draws, -1)) - (0 if distribution is None else distribution.log_prob(samples))
         ratio = (weights - oracle.evidence(data)).exp()
         error = ratio.std(0) / math.sqrt(draws)
-        assert ((ratio.mean(0) - 1).abs() <= 5 * error + 1e-9).all(), f"the sum is {ratio.mean(0)} of the evidence"
+        assert ((ratio.mean(0) - 1).abs() <= 5 * error + 1e-9).all(), (
+            f"the weights average to {ratio.mean(0)} of the evidence"
+        )
 
     def _model(self, size: int = 2) -> DynamicalVAE:
         return self.build(size).double().eval()
@@ -351,22 +365,22 @@ class FactorizationContract:
     def _data(self, model: DynamicalVAE, batch: int = 0, steps: int = 0, names: Any = ()) -> dict[str, Tensor]:
         """Return random values of data and context, or of `names`; data with a support are drawn from the model."""
         batch, steps = batch or self.batch, steps or self.steps
-        found = {
+        values = {
             name: torch.randn(batch, *([steps] * self._local(model, name)), model.sizes[name], dtype=torch.float64)
             for name in names or (*model.observed, *model.context)
         }
-        if bounded := [name for name in model.observed if name in found and model.generator[name].support is not None]:
+        if bounded := [name for name in model.observed if name in values and model.generator[name].support is not None]:
             context = self._data(model, batch, steps, model.context) if model.context else {}
-            drawn = model.sample(batch, steps, context or None)
-            found |= {name: drawn[name] for name in bounded}
-        return found
+            samples = model.sample(batch, steps, context or None)
+            values |= {name: samples[name] for name in bounded}
+        return values
 
     def _mask(self, model: DynamicalVAE, name: str, values: Tensor) -> Tensor:
         """Return a random mask of the data, with all or none of the coordinates of one event."""
-        seen = torch.rand_like(values) < 0.6
+        mask = torch.rand_like(values) < 0.6
         for event in map(list, model.generator[name].events):
-            seen[..., event] = seen[..., event[:1]]
-        return seen
+            mask[..., event] = mask[..., event[:1]]
+        return mask
 
     def _local(self, model: DynamicalVAE, name: str) -> bool:
         generative = name in model.generative.variables or name in model.generative.context
@@ -377,16 +391,16 @@ class FactorizationContract:
 
         def parameters(value: Tensor) -> Tensor:
             out = torch.cat(conditional({**values, name: value}, 1, self.steps), dim=-1)
-            mixed = out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)  # one number per step suffices
-            return mixed.flatten()
+            combined = out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)  # one number per step suffices
+            return combined.flatten()
 
         jacobian = torch.autograd.functional.jacobian(parameters, values[name])  # (T, 1, S, D) or (T, 1, D)
         return (jacobian != 0).any(-1).reshape(len(jacobian), -1)
 
-    def _close(self, got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-        assert got.keys() == expected.keys()
+    def _close(self, actual: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+        assert actual.keys() == expected.keys()
         for name, value in expected.items():
-            difference = (got[name] - value).abs().max().item()
+            difference = (actual[name] - value).abs().max().item()
             assert difference <= self.tolerance, f"{name} differs by {difference:.3g} nats between two ways of scoring"
 
 

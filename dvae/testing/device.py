@@ -1,7 +1,7 @@
-"""A simulated GPU, which lists the transfers and synchronisations of a program on a machine without a GPU.
+"""A simulated GPU that lists the transfers and synchronisations of a program, on a machine without a GPU.
 
-Torch's own fakes (`FakeTensorMode`) have no values, so a program that reads a value fails. Without a CUDA build they
-also have no gradients. Here a tensor on the device wraps a tensor on the CPU, and its operations run there. An
+The tensors of torch's `FakeTensorMode` have no values, so a program that reads a value fails. Without a CUDA build
+they also have no gradients. Here a tensor on the device wraps a tensor on the CPU, and its operations run there. An
 operation that mixes the two devices raises an error, as in CUDA. Each copy between the devices is listed, and so is
 each value on which the program synchronises.
 
@@ -46,7 +46,7 @@ BENEATH = {"torch", "pyro", "zuko", "roma"}
 class OnDevice(Tensor):
     """A CPU tensor that reports that it is on the device."""
 
-    # a device number that no machine has, so no cache of a real device is used by mistake
+    # a device number that no machine has: caches of real devices cannot be used by mistake
     device: ClassVar[torch.device] = torch.device("cuda", 127)  # type: ignore[misc]
     own: Tensor
 
@@ -54,11 +54,11 @@ class OnDevice(Tensor):
 
     @staticmethod
     def __new__(cls, own: Tensor, requires_grad: bool = False) -> Self:  # noqa: D102
-        made: Any = Tensor._make_wrapper_subclass(
+        tensor: Any = Tensor._make_wrapper_subclass(
             cls, own.shape, own.stride(), own.storage_offset(), dtype=own.dtype, requires_grad=requires_grad
         )
-        made.own = own
-        return made  # type: ignore[no-any-return]
+        tensor.own = own
+        return tensor  # type: ignore[no-any-return]
 
     @override
     def __repr__(self) -> str:  # type: ignore[override]
@@ -93,45 +93,47 @@ class Traffic(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         tensors = list(_tensors((*args, *kwargs.values())))
-        there = {id(value.own): value for value in tensors if isinstance(value, OnDevice)}
-        here = [value for value in tensors if not isinstance(value, OnDevice) and value.dim()]
+        device_tensors = {id(value.own): value for value in tensors if isinstance(value, OnDevice)}
+        cpu_tensors = [value for value in tensors if not isinstance(value, OnDevice) and value.dim()]
         device, packet = kwargs.get("device"), func.overloadpacket
-        asked = device is not None and device.type == "cuda"
-        if asked:
+        is_requested = device is not None and device.type == "cuda"
+        if is_requested:
             kwargs["device"] = torch.device("cpu")
-            if tensors and not there:
-                self.uploads.append(_place(packet))
-                here = []
-        elif there and packet is aten.copy_:
+            if tensors and not device_tensors:
+                self.uploads.append(_origin(packet))
+                cpu_tensors = []
+        elif device_tensors and packet is aten.copy_:
             target, source = (isinstance(value, OnDevice) for value in args[:2])
             if target != source:
-                (self.uploads if target else self.reads).append(_place(packet))
-            here = []
-        elif there and packet in INDEXED:
-            places = [place for place in args[1] if place is not None]
+                (self.uploads if target else self.reads).append(_origin(packet))
+            cpu_tensors = []
+        elif device_tensors and packet in INDEXED:
+            indices = [index for index in args[1] if index is not None]
             fill = len(args) > 2 and args[2].numel() == 1  # filling under a mask needs no indices
-            if any(place.dtype == torch.bool for place in places) and not fill:
-                self.reads.append(_place(packet))
-            if brought := [place for place in places if not isinstance(place, OnDevice)]:
-                self.uploads.append(_place(packet))
-                here = [value for value in here if all(value is not place for place in brought)]
-        elif there and packet in READS:
-            self.reads.append(_place(packet))
+            if any(index.dtype == torch.bool for index in indices) and not fill:
+                self.reads.append(_origin(packet))
+            if cpu_indices := [index for index in indices if not isinstance(index, OnDevice)]:
+                self.uploads.append(_origin(packet))
+                cpu_tensors = [value for value in cpu_tensors if all(value is not index for index in cpu_indices)]
+        elif device_tensors and packet in READS:
+            self.reads.append(_origin(packet))
         # tensors that torch creates in a function of device tensors are on the device too
-        within = self.within and not tensors and device is not None
-        if not (there or asked or within):
+        is_within = self.within and not tensors and device is not None
+        if not (device_tensors or is_requested or is_within):
             return func(*args, **kwargs)
-        if here:
-            shapes = ", ".join(str(tuple(value.shape)) for value in here)
+        if cpu_tensors:
+            shapes = ", ".join(str(tuple(value.shape)) for value in cpu_tensors)
             raise RuntimeError(
                 f"{packet} of tensors on {OnDevice.device} and on the CPU {shapes}; move them to one device"
             )
-        own = [_mapped(value, OnDevice, lambda v: v.own) for value in (*args, *kwargs.values())]
-        found = func(*own[: len(args)], **dict(zip(kwargs, own[len(args) :], strict=True)))
+        cpu_args = [_map_tensors(value, OnDevice, lambda v: v.own) for value in (*args, *kwargs.values())]
+        result = func(*cpu_args[: len(args)], **dict(zip(kwargs, cpu_args[len(args) :], strict=True)))
         if torch.Tag.inplace_view in func.tags:  # the wrapper stores its own shape
             with no_dispatch():
                 func(*args, **kwargs)
-        return _mapped(found, Tensor, lambda value: there[id(value)] if id(value) in there else OnDevice(value))
+        return _map_tensors(
+            result, Tensor, lambda value: device_tensors[id(value)] if id(value) in device_tensors else OnDevice(value)
+        )
 
 
 class _Moves(TorchFunctionMode):
@@ -145,34 +147,34 @@ class _Moves(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         if func in (Tensor.to, Tensor.cpu, Tensor.cuda, Tensor.type_as):
-            return self._moved(func, args[0], [*args[1:], *kwargs.values()])
+            return self._move(func, args[0], [*args[1:], *kwargs.values()])
         if func in (Tensor.numpy, Tensor.__array__, Tensor.tolist) and isinstance(args[0], OnDevice):
             if func is not Tensor.tolist:
                 raise TypeError(f"a tensor on {OnDevice.device} has no array; move it to the CPU first")
-            self.traffic.reads.append(_place("tolist"))
+            self.traffic.reads.append(_origin("tolist"))
             return args[0].own.tolist()
         before, self.traffic.within = self.traffic.within, any(isinstance(value, OnDevice) for value in _tensors(args))
         try:
-            made = func(*args, **kwargs)
+            result = func(*args, **kwargs)
         finally:
             self.traffic.within = before
-        if func is Tensor.new_tensor and isinstance(args[0], OnDevice) and not isinstance(made, OnDevice):
-            self.traffic.uploads.append(_place("new_tensor"))
-            return OnDevice(made.detach(), made.requires_grad)
-        return made
+        if func is Tensor.new_tensor and isinstance(args[0], OnDevice) and not isinstance(result, OnDevice):
+            self.traffic.uploads.append(_origin("new_tensor"))
+            return OnDevice(result.detach(), result.requires_grad)
+        return result
 
-    def _moved(self, func: Any, value: Tensor, given: list[Any]) -> Tensor:
-        given = given + [each for v in given if isinstance(v, Tensor) for each in (v.device, v.dtype)]
+    def _move(self, func: Any, value: Tensor, args: list[Any]) -> Tensor:
+        args = args + [arg for v in args if isinstance(v, Tensor) for arg in (v.device, v.dtype)]
         ends = {Tensor.cpu: "cpu", Tensor.cuda: "cuda"}
-        device = next((each for each in given if isinstance(each, str | torch.device)), ends.get(func, value.device))
-        cast = Tensor.to(value, next((each for each in given if isinstance(each, torch.dtype)), value.dtype))
-        there = torch.device(device).type == "cuda"
-        if there == isinstance(value, OnDevice):
+        device = next((arg for arg in args if isinstance(arg, str | torch.device)), ends.get(func, value.device))
+        cast = Tensor.to(value, next((arg for arg in args if isinstance(arg, torch.dtype)), value.dtype))
+        is_on_device = torch.device(device).type == "cuda"
+        if is_on_device == isinstance(value, OnDevice):
             return cast
-        if there:
-            self.traffic.uploads.append(_place("to"))
+        if is_on_device:
+            self.traffic.uploads.append(_origin("to"))
             return OnDevice(cast.detach(), value.requires_grad)
-        self.traffic.reads.append(_place("to"))
+        self.traffic.reads.append(_origin("to"))
         return cast.own  # type: ignore[attr-defined, no-any-return]
 
 
@@ -184,21 +186,21 @@ def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
             yield from _tensors(value)
 
 
-def _mapped(value: Any, kind: type[Tensor], to: Callable[[Any], Tensor]) -> Any:
-    """Return the value with its tensors of a kind replaced; torch's own tree map would take most of a step's time."""
+def _map_tensors(value: Any, kind: type[Tensor], to: Callable[[Any], Tensor]) -> Any:
+    """Return the value with its tensors of a kind replaced; torch's tree map would take most of the time of a step."""
     if isinstance(value, kind):
         return to(value)
-    return type(value)([_mapped(each, kind, to) for each in value]) if isinstance(value, list | tuple) else value
+    return type(value)([_map_tensors(each, kind, to) for each in value]) if isinstance(value, list | tuple) else value
 
 
-def _place(what: Any) -> str:
+def _origin(operation: Any) -> str:
     """Return the origin of an operation: the innermost line outside this file and the libraries in `BENEATH`."""
     frame: Any = sys._getframe(1)
     while frame.f_back and (
         (name := frame.f_globals.get("__name__", "")) == __name__ or name.partition(".")[0] in BENEATH
     ):
         frame = frame.f_back
-    return f"{'/'.join(Path(frame.f_code.co_filename).parts[-2:])}:{frame.f_lineno} {what}"
+    return f"{'/'.join(Path(frame.f_code.co_filename).parts[-2:])}:{frame.f_lineno} {operation}"
 
 
 @contextmanager
@@ -237,27 +239,27 @@ class SameNoise(TorchDispatchMode):
         device = next((value.device for value in _tensors((*args, *kwargs.values()))), None)
         device = torch.device(kwargs.get("device") or device or "cpu")
         # cuDNN networks and fused attention have this tag because of dropout, but no CPU kernel
-        here = torch._C._dispatch_has_computed_kernel_for_dispatch_key(func.name(), "CPU")
-        if torch.Tag.nondeterministic_seeded not in func.tags or device.type == "cpu" or not here:
+        has_cpu_kernel = torch._C._dispatch_has_computed_kernel_for_dispatch_key(func.name(), "CPU")
+        if torch.Tag.nondeterministic_seeded not in func.tags or device.type == "cpu" or not has_cpu_kernel:
             return func(*args, **kwargs)
         if "device" in kwargs:
             kwargs["device"] = torch.device("cpu")
-        own = [_mapped(value, Tensor, Tensor.cpu) for value in (*args, *kwargs.values())]
-        drawn = func(*own[: len(args)], **dict(zip(kwargs, own[len(args) :], strict=True)))
+        cpu_args = [_map_tensors(value, Tensor, Tensor.cpu) for value in (*args, *kwargs.values())]
+        draws = func(*cpu_args[: len(args)], **dict(zip(kwargs, cpu_args[len(args) :], strict=True)))
         if func.overloadpacket.__name__.endswith("_"):
-            return args[0].copy_(drawn)
-        return _mapped(drawn, Tensor, lambda value: value.to(device))
+            return args[0].copy_(draws)
+        return _map_tensors(draws, Tensor, lambda value: value.to(device))
 
 
 def move(module: nn.Module) -> nn.Module:
     """Move the parameters and buffers of a module to the device, as `to` does, and nothing else."""
-    moved: dict[int, Any] = {}
+    copies: dict[int, Any] = {}
     for part in module.modules():
         for name, value in part._parameters.items():
             if value is not None:
-                there = moved.setdefault(id(value), nn.Parameter(OnDevice(value.detach()), value.requires_grad))
-                setattr(part, name, there)
+                parameter = copies.setdefault(id(value), nn.Parameter(OnDevice(value.detach()), value.requires_grad))
+                setattr(part, name, parameter)
         for name, buffer in part._buffers.items():
             if buffer is not None:
-                part._buffers[name] = moved.setdefault(id(buffer), OnDevice(buffer))
+                part._buffers[name] = copies.setdefault(id(buffer), OnDevice(buffer))
     return module

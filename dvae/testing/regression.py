@@ -1,7 +1,7 @@
-"""Regression tests of evidence bounds: has a change of the code made a model worse, beyond Monte Carlo error?
+"""Regression tests of evidence bounds: detect a change of the code that makes a model worse, beyond Monte Carlo error.
 
 The data are fixed, and the test compares the mean bound of these sequences before and after a change. The draws of the
-guide are therefore the only source of error; the spread between sequences is not one. The record keeps the mean over
+guide are therefore the only source of error; the variation between sequences is not. The record keeps the mean over
 sequences of each of its K draws, b_k. New draws b'_k use the same seeds, one for each k. The differences
 d_k = b'_k - b_k are K independent numbers with mean
 
@@ -20,7 +20,7 @@ is the smallest one, up to 1.5, at which a sample skewness as low as the skewnes
 thus assumes that d is not more skewed than these log-normal draws. Simulated rates of false alarms at alpha = .001 are
 at most .003 from 20 draws on; with Student's t alone, the rate is .12.
 
-A loss of delta nats is found with probability 1 - beta if delta = (t_{1-alpha} + t_{1-beta}) sd(d) / sqrt(K). Four
+A loss of delta nats is detected with probability 1 - beta if delta = (t_{1-alpha} + t_{1-beta}) sd(d) / sqrt(K). Four
 times as many draws halve delta. With 20 draws the skewness of d is uncertain, and delta is twice as large.
 """
 
@@ -52,7 +52,7 @@ Floats = NDArray[np.float64]
 
 # Relative rounding error of a bound in float32, on another machine or with another order of summation.
 ROUNDING = 1e-6
-# Relative difference up to which data are equal: generated on another machine, they may differ in their last digits.
+# Largest relative difference of equal data; data generated on another machine may differ in the last digits.
 SAME_DATA = 1e-5
 
 
@@ -92,13 +92,13 @@ class Record:
 
     def dumps(self) -> str:
         """Return the record as JSON, with a line for each sequence."""
-        rows = [[_rounded(b, 8), _rounded(e, 3)] for b, e in zip(self.bound, self.error, strict=True)]
+        rows = [[_round(b, 8), _round(e, 3)] for b, e in zip(self.bound, self.error, strict=True)]
         table = ",\n".join(f"    {json.dumps(row)}" for row in rows)
         head = {
             "particles": len(self.draws),
-            "mean bound and its error": [_rounded(self.mean, 8), _rounded(self.mean_error, 3)],
+            "mean bound and its error": [_round(self.mean, 8), _round(self.mean_error, 3)],
             "data": self.data,
-            "draws": [_rounded(b, 8) for b in self.draws],
+            "draws": [_round(b, 8) for b in self.draws],
         }
         lines = [f"  {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}," for key, value in head.items()]
         return "\n".join(["{", *lines, '  "sequences": [', table, "  ]", "}", ""])
@@ -165,10 +165,10 @@ class Change:
         slack = ROUNDING * float(np.abs(self.old.bound).mean())
         t = (sign * self.difference + slack) / max(self.error, 1e-100)  # an exact bound has no error
         p = float(stats.t.cdf(t, len(self.new.draws) - 1))
-        _, skewness = _studentized(sign * (self.new.draws - self.old.draws))
+        _, skewness = _t_and_skewness(sign * (self.new.draws - self.old.draws))
         if p >= self.alpha or skewness <= 0:
             return p
-        least, reference = _skewed(len(self.new.draws))
+        least, reference = _log_normal_reference(len(self.new.draws))
         scale = min(int(np.searchsorted(least, skewness)), len(least) - 1)
         return max(p, float(np.searchsorted(reference[scale], t, side="right")) / reference.shape[1])
 
@@ -208,7 +208,7 @@ class ElboRegression:
     strict: bool
     note: Callable[[str], None]
     owners: dict[Path, str]
-    _mine: set[Path] = field(default_factory=set, init=False)
+    _claimed: set[Path] = field(default_factory=set, init=False)
 
     def check(
         self,
@@ -251,26 +251,26 @@ class ElboRegression:
         stem = re.sub(r"[^\w.=-]+", "_", self.test if name is None else name).strip("_")
         path = self._claim(self.folder / f"{stem}.json")
         if self.strict and not self.update and not path.exists():
-            raise AssertionError(f"record {_shown(path)} is missing; run without --elbo-strict, and commit it")
+            raise AssertionError(f"record {_relative(path)} is missing; run without --elbo-strict, and commit it")
         bounds = measure(model, guide, data, particles, zlib.crc32(stem.encode()), bound)
         new = Record.of(bounds, checksums(data, bounds.shape[1]))
         if not path.exists():
             _write(path, new.dumps())
             quantiles = stats.t.ppf([1 - alpha, 0.9], particles - 1)
             loss = quantiles.sum() * math.sqrt(2) * new.mean_error
-            power = f"a loss of {loss:.2g} would be found with probability {'below ' * (particles < 100)}0.9"
-            self.note(f"new, to be committed: {_shown(path)}: {new}; {power}")
+            power = f"a loss of {loss:.2g} would be detected with probability {'below ' * (particles < 100)}0.9"
+            self.note(f"new, to be committed: {_relative(path)}: {new}; {power}")
         elif self.update:
             if new.dumps() != path.read_text(encoding="utf-8"):
                 _write(path, new.dumps())
-                self.note(f"renewed, to be committed: {_shown(path)}: {new}")
+                self.note(f"renewed, to be committed: {_relative(path)}: {new}")
         else:
             self._compare(path, new, alpha)
 
     def _claim(self, path: Path) -> Path:
-        if path in self._mine or self.owners.setdefault(path, self.test) != self.test:
-            raise ValueError(f"{_shown(path)} is already the record of {self.owners[path]}; pass another name=")
-        self._mine.add(path)
+        if path in self._claimed or self.owners.setdefault(path, self.test) != self.test:
+            raise ValueError(f"{_relative(path)} is already the record of {self.owners[path]}; pass another name=")
+        self._claimed.add(path)
         return path
 
     def _compare(self, path: Path, new: Record, alpha: float) -> None:
@@ -279,24 +279,24 @@ class ElboRegression:
             old = Record.loads(path.read_text(encoding="utf-8"))
         except ValueError as problem:
             raise ValueError(
-                f"{_shown(path)} is damaged ({problem}); restore it, or run with --update-elbo"
+                f"{_relative(path)} is damaged ({problem}); restore it, or run with --update-elbo"
             ) from problem
         if len(old.draws) != len(new.draws):
             raise ValueError(
-                f"{_shown(path)} is of {len(old.draws)} particles, not of {len(new.draws)}: bounds cannot be paired; "
-                f"pass particles={len(old.draws)}, or run with --update-elbo"
+                f"{_relative(path)} is of {len(old.draws)} particles, not of {len(new.draws)}: bounds cannot be "
+                f"paired; pass particles={len(old.draws)}, or run with --update-elbo"
             )
-        if other := _other_data(old.data, new.data):
-            raise ValueError(f"{_shown(path)} is of other data: {other}; give the same, or run with --update-elbo")
+        if other := _data_difference(old.data, new.data):
+            raise ValueError(f"{_relative(path)} is of other data: {other}; give the same, or run with --update-elbo")
         change = Change(old, new, alpha)
         if change.worse:
             raise AssertionError(
                 f"the evidence bound fell significantly\n{change}\n"
-                f"if that is meant, run with --update-elbo and commit {_shown(path)}"
+                f"if this is intended, run with --update-elbo and commit {_relative(path)}"
             )
         if change.better:
             rise = f"by {change.difference:.3g} ± {change.error:.2g} to {new}"
-            self.note(f"better {rise}; run with --update-elbo to keep it: {_shown(path)}")
+            self.note(f"better {rise}; run with --update-elbo to keep it: {_relative(path)}")
 
 
 def measure(
@@ -322,13 +322,13 @@ def measure(
             module = getattr(program, "__self__", program)
             if isinstance(module, nn.Module):
                 stack.enter_context(evaluating(module))
-        found = []
-        for each in np.random.SeedSequence(seed).generate_state(particles).tolist():
-            torch.manual_seed(each)
-            found.append(_one_each(bound(data, each) if bound else _bound(model, guide, data), data))
-        bounds = np.stack(found)
-    if bad := np.flatnonzero(~np.isfinite(bounds).all(0)).tolist():
-        raise ValueError(f"the bound of sequence {_listed(bad)} is not finite")
+        rows = []
+        for draw_seed in np.random.SeedSequence(seed).generate_state(particles).tolist():
+            torch.manual_seed(draw_seed)
+            rows.append(_check_bound(bound(data, draw_seed) if bound else _bound(model, guide, data), data))
+        bounds = np.stack(rows)
+    if invalid := np.flatnonzero(~np.isfinite(bounds).all(0)).tolist():
+        raise ValueError(f"the bound of sequence {_join_numbers(invalid)} is not finite")
     return bounds
 
 
@@ -337,7 +337,7 @@ def _bound(model: Callable[..., Any], guide: Callable[..., Any], data: Any) -> A
     return sum(terms.log_likelihood.values()) - sum(terms.kl.values())
 
 
-def _one_each(bound: Any, data: Any) -> Floats:
+def _check_bound(bound: Any, data: Any) -> Floats:
     sizes = {len(value) for _, value in _leaves(data) if value.ndim}
     if not isinstance(bound, Tensor) or bound.dim() != 1 or len(bound) not in sizes:
         shape = tuple(bound.shape) if isinstance(bound, Tensor) else "without an observed site"
@@ -358,12 +358,12 @@ def checksums(data: Any, sequences: int) -> dict[str, Any]:
     """
 
     def table(values: Floats) -> dict[str, Any]:
-        finite = np.where(np.isfinite(values), values, 0)  # padding and missing entries may be anything
+        finite = np.where(np.isfinite(values), values, 0)  # padding and missing entries may have any value
         rows = finite.reshape(sequences if values.shape[:1] == (sequences,) else 1, -1)
         sums = rows @ np.cos(np.arange(rows.shape[1])) / math.sqrt(rows.shape[1])
         rms = np.sqrt((rows**2).mean(1))
         numbers = {"rms": rms, "checksums": sums}
-        rounded = {key: [_rounded(n, 6) for n in column] for key, column in numbers.items()}
+        rounded = {key: [_round(n, 6) for n in column] for key, column in numbers.items()}
         return {"shape": list(values.shape), **rounded}
 
     return {name: table(values) for name, values in _leaves(data)}
@@ -385,20 +385,20 @@ def _leaves(data: Any, prefix: str = "") -> Iterator[tuple[str, Floats]]:
         )
 
 
-def _other_data(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Return the first difference of the data in words, or ""."""
+def _data_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """Return a description of the first difference of the data; "" if they are equal."""
     if old.keys() != new.keys():
-        return f"it holds {', '.join(old)}, now there are {', '.join(new)}"
+        return f"it has {', '.join(old)}, the test has {', '.join(new)}"
     for name, now in new.items():
         if old[name]["shape"] != now["shape"]:
             return f"the shape of {name} was {tuple(old[name]['shape'])}, now {tuple(now['shape'])}"
         difference = np.array([np.subtract(now[key], old[name][key]) for key in ("rms", "checksums")])
-        if bad := np.flatnonzero((np.abs(difference) > SAME_DATA * np.array(now["rms"])).any(0)).tolist():
-            return f"{name} differs in sequence {_listed(bad)}"
+        if differing := np.flatnonzero((np.abs(difference) > SAME_DATA * np.array(now["rms"])).any(0)).tolist():
+            return f"{name} differs in sequence {_join_numbers(differing)}"
     return ""
 
 
-def _studentized(draws: Floats) -> tuple[Floats, Floats]:
+def _t_and_skewness(draws: Floats) -> tuple[Floats, Floats]:
     """Return the t statistic and the skewness of draws (..., K)."""
     mean = draws.mean(-1, keepdims=True)
     variance = np.maximum(((draws - mean) ** 2).mean(-1), 1e-200)
@@ -406,11 +406,11 @@ def _studentized(draws: Floats) -> tuple[Floats, Floats]:
 
 
 @cache
-def _skewed(count: int, sets: int = 10_000) -> tuple[Floats, Floats]:
+def _log_normal_reference(count: int, sets: int = 10_000) -> tuple[Floats, Floats]:
     """Return the .05 quantile of skewness (S,) and the sorted t statistics (S, sets) of log-normal draws, by scale."""
     noise = np.random.default_rng(0).normal(size=(sets, count))
     scales = np.linspace(0.1, 1.5, 8)
-    t, skewness = zip(*(_studentized(np.exp(s * noise) - math.exp(s**2 / 2)) for s in scales), strict=True)
+    t, skewness = zip(*(_t_and_skewness(np.exp(s * noise) - math.exp(s**2 / 2)) for s in scales), strict=True)
     return np.quantile(skewness, 0.05, axis=1), np.sort(t, axis=1)
 
 
@@ -418,15 +418,15 @@ def _standard_error(draws: Floats) -> float:
     return float(draws.std(ddof=1)) / math.sqrt(len(draws))
 
 
-def _rounded(value: float, digits: int) -> float:
+def _round(value: float, digits: int) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def _listed(numbers: list[int]) -> str:
+def _join_numbers(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers[:8])) + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
 
 
-def _shown(path: Path) -> Path:
+def _relative(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 

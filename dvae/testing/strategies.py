@@ -59,9 +59,9 @@ def factorizations(draw: st.DrawFn) -> tuple[str, str]:
         visible = [name for name in shared if static_first and draw(st.booleans())]
         inference.append(_factor("q", child, reads, visible))
     if shared:
-        whole = ["x"] if static_first else ["x", *latents]
-        given = [f"{name}_{{1:T}}" for name in whole if draw(st.booleans())]
-        inference.append(f"q(w | {', '.join(given)})" if given else "q(w)")
+        sources = ["x"] if static_first else ["x", *latents]
+        parents = [f"{name}_{{1:T}}" for name in sources if draw(st.booleans())]
+        inference.append(f"q(w | {', '.join(parents)})" if parents else "q(w)")
     return " ".join(draw(st.permutations(generative))), " ".join(draw(st.permutations(inference)))
 
 

@@ -4,8 +4,8 @@
 
 The parts of the body are predicted one after the other, as in GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422, eq.
 14), and can be controlled in the same way. Training minimises the squared error of the best of ten futures after the
-observed frames (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). There is no energy of the observed frames,
-diversity, further futures or bodies. It is the row "BoM with Eq. 14" of GSPS's table of control.
+observed frames (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). The other energies of GSPS are
+omitted. It is the row "BoM with Eq. 14" of GSPS's table of control.
 
 The paper on GSPS does not describe its implementation. Our choices: the guide is the prior, since GSPS has no other
 guide, and each of the ten futures has its own latent of each part.
@@ -24,7 +24,7 @@ from ...options import Amount
 from ..motion.gsps import GSPS
 
 SAMPLES = 10
-"""Number of futures of a window in training, as in BoM's code."""
+"""Number of futures per window in training, as in the code of BoM."""
 
 
 @dataclass(frozen=True)

@@ -90,8 +90,8 @@ class SummaryEncoderNetwork(Network):
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """Return the features; padding at the end is not read."""
-        made: Tensor = self.join(torch.cat([self.past(parents[HISTORY]), self.future(parents[WHOLE], lengths)], -1))
-        return made
+        features: Tensor = self.join(torch.cat([self.past(parents[HISTORY]), self.future(parents[WHOLE], lengths)], -1))
+        return features
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,10 @@ class SummaryDecoderNetwork(FedBackNetwork):
 
     def __init__(self, spec: SummaryDecoder, inputs: Sequence[Input], size: int) -> None:
         (latent,) = (parent for parent in inputs if parent.name not in (WHOLE, HISTORY))
-        own = (latent.name, latent.size) if latent.relation else None
-        super().__init__(inputs, spec.width + (0 if own else latent.size), size, spec.width, spec.hidden, own)
+        local_latent = (latent.name, latent.size) if latent.relation else None
+        super().__init__(
+            inputs, spec.width + (0 if local_latent else latent.size), size, spec.width, spec.hidden, local_latent
+        )
         self.latent = latent.name
         self.past = LastState(size, spec.width)
         self.first = perceptron((spec.width, *spec.hidden, spec.width), "tanh")

@@ -82,8 +82,8 @@ class CVAERNN(LatentTrajectoryMethod):
         return {"q(w)": Summaries(self.summary, self.hidden), "p(x)": Decoder(self.summary, self.hidden, self.width)}
 
     @override
-    def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
-        model = super()._built(kind, size, *arguments)
+    def _build_model(self, kind: Any, size: int, *arguments: Any) -> Any:
+        model = super()._build_model(kind, size, *arguments)
         share_modules([model.encoder["w"].network.summaries, model.generator["x"].network.summaries], GIVEN)
         model.feeding = ScheduledSampling(1.0, gradient=True)
         return model
@@ -124,7 +124,9 @@ class SummariesNetwork(Network):
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """Return the features; sequences must not be padded."""
         self.refuse_ragged(lengths)
-        return self.join(torch.cat([each(parents[FIRST], parents[n]) for n, each in self.summaries.items()], dim=-1))
+        return self.join(
+            torch.cat([summary(parents[FIRST], parents[n]) for n, summary in self.summaries.items()], dim=-1)
+        )
 
 
 class Summary(nn.Module):
@@ -166,8 +168,8 @@ class DecoderNetwork(FedBackNetwork):
     def __init__(self, spec: Decoder, inputs: Sequence[Input], size: int):
         sizes = {parent.name: parent.size for parent in inputs}
         (latent,) = sizes.keys() - {WHOLE, GIVEN, FIRST}
-        known = spec.hidden[-1] + sizes[latent] + sizes[GIVEN]
-        super().__init__(inputs, known, size, spec.width, spec.hidden[:-1])
+        input_size = spec.hidden[-1] + sizes[latent] + sizes[GIVEN]
+        super().__init__(inputs, input_size, size, spec.width, spec.hidden[:-1])
         self.latent = latent
         self.summaries = nn.ModuleDict({GIVEN: Summary(sizes[GIVEN], spec.summary)})
         self.before = perceptron((2 * spec.summary, *spec.hidden), "tanh")
@@ -175,8 +177,8 @@ class DecoderNetwork(FedBackNetwork):
 
     @override
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
-        given = parents[GIVEN]
-        summary = self.summaries[GIVEN](parents[FIRST], given)
+        trajectories = parents[GIVEN]
+        summary = self.summaries[GIVEN](parents[FIRST], trajectories)
         static = torch.cat([self.before(summary), parents[self.latent]], -1)
-        steps = torch.cat([static[:, None].expand(-1, given.shape[1], -1), given], -1)
+        steps = torch.cat([static[:, None].expand(-1, trajectories.shape[1], -1), trajectories], -1)
         return steps, parents[FIRST], self.first(summary)

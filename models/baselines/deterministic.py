@@ -1,8 +1,8 @@
-"""Base of the deterministic predictors: LSTMs of the past, squared errors, and one future.
+"""Base of the deterministic predictors: LSTMs of the past, squared errors and a single future.
 
     p(x_t | x_{<t})        no guide, because there are no latents
 
-A forecast continues from its own means, so that all K futures are equal and their diversity is 0.
+A forecast continues from its own means. All K futures are therefore equal, and their diversity is 0.
 
 Our additions: networks read and predict standardised poses, by the mean pose and one scale. Windows may be rotated so
 that the last observed pose faces one way, which helps on small data sets. For skeletons that the papers do not use,
@@ -78,8 +78,8 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
         """Return the preset, without headings if left and right of the skeleton are unknown."""
-        found = super().preset(skeleton)
-        return found if skeleton.left and skeleton.right else {**found, "heading": False}
+        preset = super().preset(skeleton)
+        return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
     @override
     def resolve_defaults(self, data: Any) -> Self:

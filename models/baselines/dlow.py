@@ -115,8 +115,10 @@ class DLowModel(ModesModel):
         super().__init__(method, frames, skeleton, **options)
         if method.held and skeleton is None:
             raise SchemaError(f"held names {', '.join(method.held)}, but the data have no skeleton; pass poses to dlow")
-        held = set(places_of(skeleton, method.held)) if skeleton else set()
-        parts = [[c for c in range(self.sizes[WHOLE]) if (c // 3 in held) == holds] for holds in (True, False)]
+        held_joints = set(places_of(skeleton, method.held)) if skeleton else set()
+        parts = [
+            [c for c in range(self.sizes[WHOLE]) if (c // 3 in held_joints) == is_held] for is_held in (True, False)
+        ]
         self.held, self.free = parts
         if not self.free:
             raise ValueError(f"held names {', '.join(method.held)}, which are all joints; leave some joints free")
@@ -126,16 +128,16 @@ class DLowModel(ModesModel):
         """Return the energies of the futures of each window in all modes."""
         if WHOLE_SETS not in data:
             return super().penalties(rollout, data, draws)
-        found = super().penalties(rollout, data, {MODE: self.modes})
+        penalties = super().penalties(rollout, data, {MODE: self.modes})
         shapes = self.sampler(rollout.values[HISTORY]).to(like(self).dtype)  # half precision under autocast
         scale, location = shapes.chunk(2, -1)
         variance = scale.square()
-        found["kl"] = (variance + location.square() - 1 - variance.log()).sum(2).mean(1) / 2
-        made = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
-        free = made.index_select(-1, indices(self.free, made))
-        found["diversity"] = energies.gaussian_diversity(free, self.method.diversity_scale or 1.0)
+        penalties["kl"] = (variance + location.square() - 1 - variance.log()).sum(2).mean(1) / 2
+        futures = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
+        free_motion = futures.index_select(-1, indices(self.free, futures))
+        penalties["diversity"] = energies.gaussian_diversity(free_motion, self.method.diversity_scale or 1.0)
         if self.held:
-            held = made.index_select(-1, indices(self.held, made))
-            apart = (held - held[:1]).square().sum((2, 3))
-            found["held"] = apart.sum(0) / max(self.modes - 1, 1)
-        return found
+            held_motion = futures.index_select(-1, indices(self.held, futures))
+            distances = (held_motion - held_motion[:1]).square().sum((2, 3))
+            penalties["held"] = distances.sum(0) / max(self.modes - 1, 1)
+        return penalties

@@ -85,15 +85,15 @@ class DSFModel(ModesModel):
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """Return the energies of the futures of each window in all modes."""
-        found = super().penalties(rollout, data, {})
+        penalties = super().penalties(rollout, data, {})
         if WHOLE_SETS not in data:
-            return found
+            return penalties
         method, codes = self.method, self.sampler(rollout.values[HISTORY])
         squares = codes.square().sum(2).T
         excess = (squares - float(scipy.special.chdtri(codes.shape[2], 1 - method.radius))).clamp_min(0)
-        made = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
+        futures = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
         quality, scale = method.quality * (-excess).exp(), method.diversity_scale or 1.0
-        found["cardinality"] = energies.determinantal_diversity(made, quality, scale)
+        penalties["cardinality"] = energies.determinantal_diversity(futures, quality, scale)
         if method.beta:
-            found["norm"] = squares.mean(0) / 2
-        return found
+            penalties["norm"] = squares.mean(0) / 2
+        return penalties

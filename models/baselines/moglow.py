@@ -6,16 +6,16 @@
 
 Each f_k is a step of Glow: a normalisation, a mixing by triangular matrices, and an affine coupling that reads half of
 its input and h_t (`dvae.distributions.glow`). In training the density of all frames is computed at once; only draws
-loop over time. With `frame_dropout`, the network reads random whole frames of the past as 0 in training, so that it
-does not merely repeat them.
+loop over time. With `frame_dropout`, the network reads random frames of the past as 0 in training, which keeps
+it from merely repeating them.
 
 Henter, Alexanderson and Beskow, 2020, arXiv 1905.06598. `PAPER` has its sizes. Our differences, where the paper's
 choices were not applicable or worked less well:
 
 * One recurrent network serves all couplings, which are perceptrons. In the paper each coupling has its own LSTM, and
   also reads the last ten frames. Its states depend on the coupling's input at every frame, even a dropped one; in our
-  network a dropped frame is lost. Dropout rates of .95 (the paper's locomotion) and .7 (with paths, as a baseline of
-  TrajeVAE: Kania et al., 2021) would therefore leave little of the past. The default is no dropout.
+  network a dropped frame is lost. Dropout rates of .95 (locomotion in the paper) and .7 (the baseline in
+  TrajeVAE's tables: Kania et al., 2021) would therefore leave little of the past. The default is no dropout.
 * There is no control signal; covariates of a table are read as by other methods.
 * Location and scale before the flow also read h_t, and the location keeps a share of x_{t-1} (`residual`). In the paper
   only couplings read the past, and a frame is a pose. The baseline of TrajeVAE adds its draw to the last pose.
@@ -111,7 +111,7 @@ class MoGlow(LikelihoodMethod):
             ValueError: if no column has the family "real".
         """
         parts = distribution.parts if isinstance(distribution, Product) else [((), distribution)]
-        if all(own != FAMILIES["real"] for _, own in parts):
+        if all(part != FAMILIES["real"] for _, part in parts):
             raise ValueError(
                 'moglow is a flow of columns of the family "real", but no target has this family; fit '
                 "autoregressive, which has the same factor, or give columns another family"
@@ -119,7 +119,7 @@ class MoGlow(LikelihoodMethod):
         flow = self.distributions()["p(x)"]
         if not isinstance(distribution, Product):
             return flow
-        return Product(tuple((places, flow if own == FAMILIES["real"] else own) for places, own in parts))
+        return Product(tuple((columns, flow if part == FAMILIES["real"] else part) for columns, part in parts))
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
@@ -156,11 +156,11 @@ def start_flow(model: DynamicalVAE, windows: Any) -> None:
         if isinstance(distribution, ProductModule)
         else [(distribution, list(range(x.shape[-1])), parameters)]
     )
-    for part, places, own in parts:
+    for part, columns, part_parameters in parts:
         if isinstance(part, ConditionalFlowModule):
-            seen = torch.ones(x.shape[:2], dtype=torch.bool) if mask is None else mask
-            rows = seen[..., places].all(-1) if seen.dim() == 3 else seen
-            part.start_at(tuple(p[rows] for p in own), centred[..., places][rows])
+            observed = torch.ones(x.shape[:2], dtype=torch.bool) if mask is None else mask
+            rows = observed[..., columns].all(-1) if observed.dim() == 3 else observed
+            part.start_at(tuple(p[rows] for p in part_parameters), centred[..., columns][rows])
 
 
 @dataclass(frozen=True)

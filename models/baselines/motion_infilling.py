@@ -1,4 +1,4 @@
-"""Motion Infilling: one motion from its first pose and known parts of joints' paths, by convolutions of an image.
+"""Motion Infilling: complete a motion from its first pose and parts of its joints' paths, by 2D convolutions.
 
     p(x_t | y_{1:T}, s)        no guide: there are no latents, and the likelihood is exact
 
@@ -65,7 +65,7 @@ NARROWEST, SPREAD = 1 / 12, 1 / 6
 IN_TIME, JOINTS = 0.7, 3
 """Share of windows with a gap in time, and the largest number of joints removed from the others."""
 NEVER = 2.0
-"""A value that no curriculum reaches, because curricula end at 1."""
+"""Value that no curriculum reaches, because curricula end at 1."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class MotionInfilling(TrajectoryMethod):
         maps: numbers of feature maps at each image size, starting with the full size.
         keep: probability that a joint is given, in training, where no gap hides it.
         gap: final mean width of the gaps in training, as a share of the window; 0 for neither gaps nor removed joints,
-            as in the training of other methods (with a `keep` below 1).
+            as in the training of other methods, which have a `keep` below 1.
         curriculum: share of training over which gaps widen, after its first twentieth; 0 for wide gaps from the start.
     """
 
@@ -136,8 +136,8 @@ class MotionInfilling(TrajectoryMethod):
 
 def start(model: InfillingModel, train: Windows) -> None:
     """Set the network's mean and scale from 1024 windows, as the model sees them."""
-    seen = model.read(train.sample(1024, torch.default_generator))
-    model.generator[WHOLE].network.units.fit(interpolate_missing(seen[WHOLE], seen.mask()))
+    data = model.read(train.sample(1024, torch.default_generator))
+    model.generator[WHOLE].network.units.fit(interpolate_missing(data[WHOLE], data.mask()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,31 +158,35 @@ class RandomGaps:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return random windows with their hidden entries."""
-        return self._hiding(self.source.sample(batch_size, generator), generator)
+        return self._hide_entries(self.source.sample(batch_size, generator), generator)
 
     def all(self) -> Batch:
         """Return all windows, with the same gaps every time."""
-        return self._hiding(self.source.all(), torch.Generator().manual_seed(0))
+        return self._hide_entries(self.source.all(), torch.Generator().manual_seed(0))
 
     @property
     def fingerprint(self) -> str:
         """The fingerprint of the source."""
-        found: str = self.source.fingerprint
-        return found
+        fingerprint: str = self.source.fingerprint
+        return fingerprint
 
-    def _hiding(self, batch: Mapping[str, Any], generator: torch.Generator) -> Batch:
+    def _hide_entries(self, batch: Mapping[str, Any], generator: torch.Generator) -> Batch:
         count, length, _ = batch[GIVEN].shape
-        kind, place = torch.rand(2, count, 1, generator=generator).clamp(min=1e-6)
+        kind, position = torch.rand(2, count, 1, generator=generator).clamp(min=1e-6)
         noise = torch.randn(count, 1, generator=generator)
         frames = (torch.arange(length) + 0.5) / length
-        needed = torch.maximum(1 - frames / place, (frames - place) / (1 - place))  # gap width that hides it
-        first = self.width * (NARROWEST + SPREAD * noise)
-        in_time = (needed - first) / (self.width * (1 - NARROWEST))
+        widths = torch.maximum(
+            1 - frames / position, (frames - position) / (1 - position)
+        )  # gap width that hides the frame
+        initial_width = self.width * (NARROWEST + SPREAD * noise)
+        gap_values = (widths - initial_width) / (self.width * (1 - NARROWEST))
         order = torch.rand(count, len(self.source.joints), generator=generator)
         order[:, self.source.skeleton.root] = 1.0  # the last one
         rank = order.argsort(1).argsort(1)
-        of_joints = torch.where(rank < JOINTS, rank / JOINTS, NEVER).repeat_interleave(3, 1)
-        return Batch(batch) | {HIDDEN: torch.where((kind < IN_TIME)[..., None], in_time[..., None], of_joints[:, None])}
+        joint_values = torch.where(rank < JOINTS, rank / JOINTS, NEVER).repeat_interleave(3, 1)
+        return Batch(batch) | {
+            HIDDEN: torch.where((kind < IN_TIME)[..., None], gap_values[..., None], joint_values[:, None])
+        }
 
 
 class InfillingModel(TrajectoryModel):
@@ -198,13 +202,15 @@ class InfillingModel(TrajectoryModel):
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
         """Return the batch without the trajectories that are hidden at this value of the curriculum."""
         if isinstance(batch, Mapping) and HIDDEN in batch:
-            whole = batch
+            full_batch = batch
 
-            def shown() -> Batch:
-                given = torch.where(whole[HIDDEN] <= curriculum, 0.0, whole[GIVEN])
-                return Batch({name: value for name, value in whole.items() if name != HIDDEN}) | {GIVEN: given}
+            def hide() -> Batch:
+                trajectories = torch.where(full_batch[HIDDEN] <= curriculum, 0.0, full_batch[GIVEN])
+                return Batch({name: value for name, value in full_batch.items() if name != HIDDEN}) | {
+                    GIVEN: trajectories
+                }
 
-            batch = memoize(self, [whole, curriculum], shown)  # guide and model both call it
+            batch = memoize(self, [full_batch, curriculum], hide)  # guide and model both call it
         return super().read(batch, size=size, curriculum=curriculum, precise=precise)
 
 
@@ -236,12 +242,12 @@ class InfillerNetwork(FixedLengthNetwork):
         self.up: Any = nn.ModuleList()
         self.pools: list[tuple[int, int]] = []
         rows = size
-        for before, maps in pairwise((1, *spec.maps)):
+        for in_maps, maps in pairwise((1, *spec.maps)):
             pool = (2 if rows > 2 else 1, 2)
             self.pools.append(pool)
-            self.down.append(nn.Sequential(*_convolved(before, maps), *_convolved(maps, maps)))
-            wider = nn.ConvTranspose2d(maps, maps, 3, pool, padding=1)
-            self.up.append(nn.ModuleList([wider, nn.Conv2d(maps, before, 3, padding=1)]))
+            self.down.append(nn.Sequential(*_convolution(in_maps, maps), *_convolution(maps, maps)))
+            upsample = nn.ConvTranspose2d(maps, maps, 3, pool, padding=1)
+            self.up.append(nn.ModuleList([upsample, nn.Conv2d(maps, in_maps, 3, padding=1)]))
             rows = -(-rows // pool[0])
         for layer in self.modules():
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
@@ -259,11 +265,11 @@ class InfillerNetwork(FixedLengthNetwork):
             image = layers(image)
             shapes.append(image.shape[-2:])
             image = functional.max_pool2d(image, pool, ceil_mode=True)
-        for place, (wider, last) in reversed(list(enumerate(self.up))):
-            image = last(functional.leaky_relu(wider(image, output_size=shapes[place])))
-            image = functional.leaky_relu(image) if place else image
+        for level, (upsample, convolution) in reversed(list(enumerate(self.up))):
+            image = convolution(functional.leaky_relu(upsample(image, output_size=shapes[level])))
+            image = functional.leaky_relu(image) if level else image
         return torch.addcmul(self.units.mean, image[:, 0, :, 1:].mT, self.units.scale)
 
 
-def _convolved(before: int, maps: int) -> list[nn.Module]:
-    return [nn.Conv2d(before, maps, 3, padding=1), nn.LeakyReLU()]
+def _convolution(in_maps: int, maps: int) -> list[nn.Module]:
+    return [nn.Conv2d(in_maps, maps, 3, padding=1), nn.LeakyReLU()]

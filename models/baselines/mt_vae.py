@@ -1,4 +1,4 @@
-"""MT-VAE: futures of a moving body by a latent that encodes the change of the motion's style.
+"""MT-VAE: futures of a moving body by a latent that encodes how the style of the motion changes.
 
     p(w) p(x_t | h, w)        q(w | x_{1:T}, h)
 
@@ -149,23 +149,23 @@ class MTVAEModel(FutureModel):
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
         """Return errors of the first velocities, for draws of guide and prior, and the cycle error of the latter."""
-        found, method = super().penalties(rollout, data, draws), self.method
+        penalties, method = super().penalties(rollout, data, draws), self.method
         assert isinstance(method, MTVAE)
         if WHOLE not in data or not (method.velocity or method.cycle):
-            return found
+            return penalties
         values, rows = rollout.values, rollout.batch
         other = torch.randn_like(values["w"])
         energies: dict[str, Tensor] = {}
         if method.velocity:
             length = min(FIRST, rollout.length)
-            made = rollout.parameters(WHOLE, values[WHOLE])[0][:, :length]
-            (free,) = self.generator[WHOLE]({**rollout.known, "w": other}, rows, length)
-            last, truth = values[HISTORY][:, None, -made.shape[-1] :], values[WHOLE][:, :length]
-            moves = [torch.cat([last, poses], 1).diff(dim=1) for poses in (made, free, truth)]
-            errors = (moves[0] - moves[2]).abs() + (moves[1] - moves[2]).abs()
-            if (seen := rollout.mask(WHOLE)) is not None:
-                both = torch.cat([seen[:, :1], seen[:, 1:length] & seen[:, : length - 1]], 1)
-                errors = torch.where(both, errors, 0.0)
+            predicted = rollout.parameters(WHOLE, values[WHOLE])[0][:, :length]
+            (from_prior,) = self.generator[WHOLE]({**rollout.known, "w": other}, rows, length)
+            last, truth = values[HISTORY][:, None, -predicted.shape[-1] :], values[WHOLE][:, :length]
+            velocities = [torch.cat([last, poses], 1).diff(dim=1) for poses in (predicted, from_prior, truth)]
+            errors = (velocities[0] - velocities[2]).abs() + (velocities[1] - velocities[2]).abs()
+            if (mask := rollout.mask(WHOLE)) is not None:
+                both_observed = torch.cat([mask[:, :1], mask[:, 1:length] & mask[:, : length - 1]], 1)
+                errors = torch.where(both_observed, errors, 0.0)
             energies["velocity"] = errors.sum((1, 2))
         if method.cycle:
             guide, network = self.encoder["w"], self.generator[WHOLE].network
@@ -173,7 +173,7 @@ class MTVAEModel(FutureModel):
             loc, scale = guide.head(guide.network.coded(network.changed(style, other) - style))
             energies["cycle"] = (other - torch.addcmul(loc, scale, torch.randn_like(loc))).abs().sum(-1)
         size = rows // rollout.draws
-        return found | {name: energy.unflatten(0, (-1, size)).mean(0) for name, energy in energies.items()}
+        return penalties | {name: energy.unflatten(0, (-1, size)).mean(0) for name, energy in energies.items()}
 
 
 @dataclass(frozen=True)
@@ -241,14 +241,16 @@ class StyleDecoderNetwork(FixedLengthNetwork):
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         content, style = self.past(parents[HISTORY])
-        new = self.changed(style, parents["w"])
-        joined = normed(self.join(torch.cat([content, new], -1)))
-        return self.network([self.network.share(new)] * length, torch.tanh(self.hidden(joined)), self.cell(joined))
+        new_style = self.changed(style, parents["w"])
+        embedding = normed(self.join(torch.cat([content, new_style], -1)))
+        return self.network(
+            [self.network.share(new_style)] * length, torch.tanh(self.hidden(embedding)), self.cell(embedding)
+        )
 
     def changed(self, style: Tensor, w: Tensor) -> Tensor:
         """Return the new style (B, S)."""
-        both = torch.cat([normed(self.read(w)), style], -1)
-        return normed(normed(self.out(normed(self.block(both)))) + style)
+        inputs = torch.cat([normed(self.read(w)), style], -1)
+        return normed(normed(self.out(normed(self.block(inputs)))) + style)
 
 
 class Embedding(nn.Module):
@@ -303,9 +305,9 @@ class NormedLSTM(nn.Module):
         for share in shares:
             gates = torch.addmm(share, hidden, weight).unflatten(-1, (4, -1))
             gates = torch.addcmul(self.shift, self.gain, functional.layer_norm(gates, gates.shape[-1:], eps=EPSILON))
-            entry, kept, output = torch.sigmoid(gates[:, :3]).unbind(1)
-            cell = kept * cell + entry * torch.tanh(gates[:, 3])
-            hidden = output * torch.tanh(self.norm(cell))
+            input_gate, forget_gate, output_gate = torch.sigmoid(gates[:, :3]).unbind(1)
+            cell = forget_gate * cell + input_gate * torch.tanh(gates[:, 3])
+            hidden = output_gate * torch.tanh(self.norm(cell))
             states.append(hidden)
         return torch.stack(states, 1)
 

@@ -54,21 +54,21 @@ class GatedTransition(Network):
 
     def __init__(self, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, 2 * size)
-        own, *beside = inputs
-        self.name, self.size, self.beside = own.name, size, [parent.name for parent in beside]
-        read = size + sum(parent.size for parent in beside)
+        previous, *others = inputs
+        self.name, self.size, self.beside = previous.name, size, [parent.name for parent in others]
+        width = size + sum(parent.size for parent in others)
         self.gate, self.proposal = (
-            nn.Sequential(nn.Linear(read, size), nn.ReLU(), nn.Linear(size, size)) for _ in range(2)
+            nn.Sequential(nn.Linear(width, size), nn.ReLU(), nn.Linear(size, size)) for _ in range(2)
         )
         self.linear = nn.Linear(size, size)
 
-    def _features(self, previous: Tensor, beside: Tensor) -> Tensor:
-        read = torch.cat([previous, beside], -1)
-        proposal = self.proposal(read)
-        mean = torch.lerp(self.linear(previous), proposal, torch.sigmoid(self.gate(read)))
+    def _features(self, previous: Tensor, others: Tensor) -> Tensor:
+        inputs = torch.cat([previous, others], -1)
+        proposal = self.proposal(inputs)
+        mean = torch.lerp(self.linear(previous), proposal, torch.sigmoid(self.gate(inputs)))
         return torch.cat([mean, functional.relu(proposal)], dim=-1)
 
-    def _given(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
+    def _other_parents(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
         """Return the parents other than z_{t-1}, (B, T, E)."""
         empty = self.linear.weight.new_empty(batch, length, 0)
         return torch.cat(aligned([empty, *(parents[name] for name in self.beside)]), -1)
@@ -76,11 +76,11 @@ class GatedTransition(Network):
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         previous = shift(parents[self.name], -1)
-        return self._features(previous, self._given(parents, len(previous), length))
+        return self._features(previous, self._other_parents(parents, len(previous), length))
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        return self(given, length).unbind(1) if self.name in given else self._given(given, batch, length)
+        return self(given, length).unbind(1) if self.name in given else self._other_parents(given, batch, length)
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:

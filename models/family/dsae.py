@@ -97,12 +97,12 @@ class Recurrence(torch.autograd.Function):
         """Return the gradients of base and weight."""
         states, weight = ctx.saved_tensors
         to_base = torch.empty_like(states)
-        targets, slopes, own = to_base.unbind(0), (1 - states * states).unbind(0), to_states.unbind(0)
-        carried = own[-1]
+        targets, slopes, state_gradients = to_base.unbind(0), (1 - states * states).unbind(0), to_states.unbind(0)
+        carried = state_gradients[-1]
         for t in range(len(states) - 1, -1, -1):
             gradient = torch.mul(carried, slopes[t], out=targets[t])
             if t:
-                carried = torch.addmm(own[t - 1], gradient, weight)
+                carried = torch.addmm(state_gradients[t - 1], gradient, weight)
         return to_base, to_base[1:].flatten(0, 1).t() @ states[:-1].flatten(0, 1)
 
 

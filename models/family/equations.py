@@ -61,7 +61,7 @@ class Equations(LatentMethod):
 
     @override
     def sizes(self) -> dict[str, int]:
-        """Return the sizes of all variables; the sizes of the data replace theirs."""
+        """Return the sizes of all variables; the data override the sizes of observed ones."""
         sizes = {name: self.latents.get(name, self.latent) for name in self.equations()[0].variables}
         return {**sizes, **{name: Discrete(states) for name, states in self.states.items()}}
 
@@ -93,7 +93,7 @@ class Equations(LatentMethod):
             SchemaError: if the data have no context that the equations read.
         """
         schema = Schema.of(data)
-        if missing := [name for name in self._given() if name not in schema.sizes]:
+        if missing := [name for name in self._context() if name not in schema.sizes]:
             raise SchemaError(
                 f"the equations read {', '.join(missing)}, which has no factor and must be in the data, but they have "
                 f"{', '.join(schema.sizes)}; a table has covariates as c, attributes as s, and uneven steps as d"
@@ -102,10 +102,10 @@ class Equations(LatentMethod):
 
     @override
     def check(self) -> None:
-        """Refuse options that do not fit together, whatever the sizes of the context."""
-        self.build(Schema({"x": 1, **dict.fromkeys(self._given(), 1)}))
+        """Raise an error if the options do not fit together, for any size of the context."""
+        self.build(Schema({"x": 1, **dict.fromkeys(self._context(), 1)}))
 
-    def _given(self) -> list[str]:
+    def _context(self) -> list[str]:
         """Return the names of the context of both equations."""
         generative, inference = self.equations()
         return [

@@ -132,8 +132,9 @@ class KalmanVAE(DynamicalVAE):
         run = super().rollout(batch, length, size, guide=guide)
         if WHOLE not in run.observed:
             return run
-        seen = run.observed[WHOLE].any(-1)
-        present = functional.pad(seen, (0, run.length - seen.shape[1]), value=True)  # forecast frames are present
+        observed = run.observed[WHOLE].any(-1)
+        # forecast frames are present
+        present = functional.pad(observed, (0, run.length - observed.shape[1]), value=True)
         valid = None if run.lengths is None else valid_steps(run.lengths, run.length)
         present = present if valid is None else present | ~valid
         if not present.all():
@@ -157,10 +158,10 @@ class Encoding(Rollout):
 
     @override
     def draw(self, name: str) -> Tensor:
-        drawn = super().draw(name)
+        draws = super().draw(name)
         if torch.is_grad_enabled():
-            return drawn
-        value: Tensor = self.network.completed(drawn, self.present[name], self.lengths)
+            return draws
+        value: Tensor = self.network.completed(draws, self.present[name], self.lengths)
         self._evaluated[name] = (value, self._evaluated[name][1])  # the guide's conditionals read no a
         return value
 
@@ -183,13 +184,13 @@ class Kalman:
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> KalmanNetwork:
         """Return the network of a factor p(a_t | a_{<t}), for a of dimension `size`."""
-        lone = inputs[0] if len(inputs) == 1 and local else None
-        if lone is None or lone.relation is None or lone.relation.intervals != ((-math.inf, -1),) or lone.size != size:
+        past = inputs[0] if len(inputs) == 1 and local else None
+        if past is None or past.relation is None or past.relation.intervals != ((-math.inf, -1),) or past.size != size:
             raise ValueError(
                 "a Kalman network predicts a variable from all of its own past, p(a_t | a_{<t}), but the parents are "
                 f"{', '.join(f'{p.name} at {p.relation and p.relation.name}' for p in inputs)}"
             )
-        return KalmanNetwork(self, lone)
+        return KalmanNetwork(self, past)
 
 
 class KalmanNetwork(Network):
@@ -241,9 +242,9 @@ class KalmanNetwork(Network):
         mean, covariance, noise = self.start_of(a.shape[1])
         transition, control = transition[1:], control[1:]
         information, potential = self.seen(emission, a)
-        for told in (present, valid):
-            if told is not None:
-                information, potential = information * told[..., None, None], potential * told[..., None]
+        for mask in (present, valid):
+            if mask is not None:
+                information, potential = information * mask[..., None, None], potential * mask[..., None]
         if present is not None:
             transition, noise = self.past(transition, control, emission[:-1], present[:-1])
             a = a * present[..., None]
@@ -262,9 +263,11 @@ class KalmanNetwork(Network):
         name = self.inputs[0].name
         state = self.start({name: a.transpose(0, 1), presence(name): present.t()}, a.shape[1], len(a))
         rows = []
-        for t, there in enumerate(present):
+        for t, row_present in enumerate(present):
             state = self.ahead(state, t, {})
-            rows.append(torch.where(there[:, None], a[t], (state.emission @ state.mean[..., None])[..., 0].to(a.dtype)))
+            rows.append(
+                torch.where(row_present[:, None], a[t], (state.emission @ state.mean[..., None])[..., 0].to(a.dtype))
+            )
         return torch.stack(rows)
 
     def past(self, transition: Tensor, control: Tensor, emission: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
@@ -283,8 +286,8 @@ class KalmanNetwork(Network):
         """Return a (B, T, D), with draws of p(a_t | all present a) at frames where `present` (B, T) is False."""
         valid = None if lengths is None else valid_steps(lengths, a.shape[1]).t()
         chain, _, alpha = self.chain_of(a.transpose(0, 1), present.t(), valid)
-        drawn = self.emitted(chain.draw(torch.randn_like(chain.potential)), alpha).transpose(0, 1)
-        return torch.where(present[..., None], a, drawn.to(a.dtype))
+        draws = self.emitted(chain.draw(torch.randn_like(chain.potential)), alpha).transpose(0, 1)
+        return torch.where(present[..., None], a, draws.to(a.dtype))
 
     def emitted(self, z: Tensor, alpha: Tensor) -> Tensor:
         """Return draws of a (T, B, D) given z_{1:T} (T, B, N), for missing frames.
@@ -293,15 +296,15 @@ class KalmanNetwork(Network):
         residual of z_{t+1}.
         """
         transition, control, emission = self.mixed(alpha)
-        noise, spread = self.log_noise.exp(), self.log_emission.exp()
+        noise, emission_noise = self.log_noise.exp(), self.log_emission.exp()
         a = (emission @ z[..., None])[..., 0]
-        a = a + spread.sqrt() * torch.randn_like(a)
+        a = a + emission_noise.sqrt() * torch.randn_like(a)
         transition, control = transition[1:], control[1:]
-        moved = (transition @ z[:-1, ..., None] + control @ a[:-1, ..., None])[..., 0]
-        missed = z[1:] - moved - noise.sqrt() * torch.randn_like(moved)
-        whole = (control * spread) @ control.mT + noise.diag()
-        back = spread * (control.mT @ torch.linalg.solve(whole, missed[..., None]))[..., 0]
-        return torch.cat([a[:-1] + back, a[-1:]])
+        predicted = (transition @ z[:-1, ..., None] + control @ a[:-1, ..., None])[..., 0]
+        residual = z[1:] - predicted - noise.sqrt() * torch.randn_like(predicted)
+        covariance = (control * emission_noise) @ control.mT + noise.diag()
+        correction = emission_noise * (control.mT @ torch.linalg.solve(covariance, residual[..., None]))[..., 0]
+        return torch.cat([a[:-1] + correction, a[-1:]])
 
     def start_of(self, batch: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean (B, N) and covariance (B, N, N) of z_1, and Q (N, N).
@@ -317,8 +320,8 @@ class KalmanNetwork(Network):
     def mixed(self, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return A (..., N, N), B (..., N, D) and C (..., D, N) for weights (..., K), in float64."""
         parts = (self.A, self.B, self.C)
-        mixed = (alpha @ torch.cat([part.flatten(1) for part in parts], dim=1)).double()
-        pieces = mixed.split([part[0].numel() for part in parts], dim=-1)
+        matrices = (alpha @ torch.cat([part.flatten(1) for part in parts], dim=1)).double()
+        pieces = matrices.split([part[0].numel() for part in parts], dim=-1)
         a, b, c = (piece.unflatten(-1, part.shape[1:]) for piece, part in zip(pieces, parts, strict=True))
         return a, b, c
 
@@ -336,8 +339,8 @@ class KalmanNetwork(Network):
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         name, zero = self.inputs[0].name, self.first.new_zeros(batch, self.spec.width)
-        known, present = (given[key].unbind(1) if key in given else None for key in (name, presence(name)))
-        return Predicted(known, present, (zero, zero), *self.start_of(batch)[:2], None)
+        values, present = (given[key].unbind(1) if key in given else None for key in (name, presence(name)))
+        return Predicted(values, present, (zero, zero), *self.start_of(batch)[:2], None)
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
@@ -356,7 +359,7 @@ class KalmanNetwork(Network):
             before = torch.where(present[:, None], before, (emission @ mean[..., None])[..., 0].to(before.dtype))
         gates = functional.linear(before, self.memory.weight_ih_l0, self.memory.bias_ih_l0)
         hidden = lstm_cell(gates, state.hidden, self.memory)
-        transition, control, emitted = self.mixed(self.weights(hidden[0]).softmax(-1))
+        transition, control, next_emission = self.mixed(self.weights(hidden[0]).softmax(-1))
         if t:
             information, potential = self.seen(emission, before)
             noise = self.log_noise.exp().diag()
@@ -367,7 +370,7 @@ class KalmanNetwork(Network):
             if present is not None:
                 transition, noise = self.past(transition, control, emission, present)
             covariance = transition @ covariance @ transition.mT + noise
-        return Predicted(state.known, state.present, hidden, mean, covariance, emitted)
+        return Predicted(state.known, state.present, hidden, mean, covariance, next_emission)
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Diversity of a decoder's initial codes: how much a model's draws change the code of one past, during training.
+"""Diversity of a decoder's initial codes: how much the draws of a model change the code of one past.
 
 A conditional model that predicts a future from a code of its past and noise may learn to ignore the noise. If h_1, ...,
 h_K are the codes of K draws for one observation, their diversity is
@@ -57,13 +57,13 @@ def codes(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
             f"codes need a decoder with an `entrance`, the module through which noise enters; {type(network).__name__} "
             "has none"
         )
-    seen: list[Tensor] = []
-    hook = entrance.register_forward_hook(lambda module, given, made: seen.append(made))
+    outputs: list[Tensor] = []
+    hook = entrance.register_forward_hook(lambda module, inputs, output: outputs.append(output))
     try:
-        size = model.forecast(batch, 1, samples, chunk=2**62)[WHOLE].shape[1]  # at once
+        size = model.forecast(batch, 1, samples, chunk=2**62)[WHOLE].shape[1]  # in one chunk
     finally:
         hook.remove()
-    return seen[0].unflatten(0, (samples, size))
+    return outputs[0].unflatten(0, (samples, size))
 
 
 def code_diversity(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
@@ -74,16 +74,16 @@ def code_diversity(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
     """
     if samples < 2:
         raise ValueError(f"samples must be at least 2 to compare codes, got {samples}")
-    found: Tensor = average_pairwise_distance(codes(model, batch, samples).movedim(0, 1)[:, :, None])
-    return found
+    diversity: Tensor = average_pairwise_distance(codes(model, batch, samples).movedim(0, 1)[:, :, None])
+    return diversity
 
 
 class CodeDiversity(Callback):
     """Log the diversity of codes during a fit: "codes/diversity" and "codes/deviation", every few steps.
 
     They are the mean and the standard deviation over the observations of a batch, with the same draws each time. If
-    sequences share random variables of the model, "codes/latent" is the mean with these drawn once, that is, the effect
-    of the latents alone. The callback does not change the run.
+    sequences share random variables of the model, "codes/latent" is the mean when these are drawn once. It shows the
+    effect of the latents alone. The callback does not change the run.
 
     Args:
         batch: past of at least two held-out windows, as in `forecast`; 50 windows in the paper.
@@ -107,8 +107,8 @@ class CodeDiversity(Callback):
         model: Any = state.model
         batch = on_device_of(model, self.batch)
         with seeded_evaluation(model, self.seed):
-            found = code_diversity(model, batch, self.samples)
-        row = {"codes/diversity": float(found.mean()), "codes/deviation": float(found.std())}
+            diversity = code_diversity(model, batch, self.samples)
+        row = {"codes/diversity": float(diversity.mean()), "codes/deviation": float(diversity.std())}
         if getattr(model, "shared", None):
             with seeded_evaluation(model, self.seed):
                 row["codes/latent"] = float(code_diversity(model, model.read(batch), self.samples).mean())

@@ -1,16 +1,16 @@
-"""Methods that learn from energies of whole motions: their common options, and the model that scores its samples.
+"""Base of the methods that learn from energies of whole motions: their options, and a model that scores its samples.
 
 Several samples of a window are drawn together. The energies penalise
 
 * the error of the best sample, relative to the truth and to each pseudo ground truth;
-* samples of a body part that are alike;
+* similar samples of a body part;
 * limbs that change their lengths, and joint angles outside their limits;
 * poses that are unlikely under a pose prior.
 
 Source: GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422).
 
 Our additions: a model may see every window rotated so that the last observed pose faces one way, which helps on small
-data sets. It may also read and predict directions of bones, so that their lengths are constant. The energies always
+data sets. It may also read and predict directions of bones, which keeps their lengths constant. The energies always
 compare positions.
 """
 
@@ -55,8 +55,8 @@ class EnergyMethod(PoseMethod):
         pseudo_minimum: smallest distance of a pseudo ground truth from the true future, in metres, mean over joints.
         pseudo_most: largest number of pseudo ground truths of a window.
         pool_stride: frames between the windows that provide pseudo ground truths.
-        bones: whether to read and predict directions of bones, so that futures keep the bone lengths of the observed
-            frames. The model then has no density and no bound, and windows must be complete.
+        bones: whether to read and predict directions of bones: futures keep the bone lengths of the observed frames.
+            The model then has no density and no bound, and windows must be complete.
         heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures
             back. All earlier frames then depend on that pose. Bounds score rotated windows and ignore the heading:
             compare them only with bounds of models that rotate too.
@@ -124,9 +124,9 @@ class EnergyModel(DynamicalVAE):
     angle_high: Tensor
 
     def __init__(self, method: Any, skeleton: Skeleton, observed: int, views: Sequence[View] = (), **options: Any):
-        pieces = {name: places for view in views for name, places in (view.parts or {}).items()}
-        heading = Heading(skeleton, observed, turned=(WHOLE, *pieces)) if method.heading else None
-        bones = Bones(skeleton, observed, pieces) if method.bones else None
+        parts = {name: coordinates for view in views for name, coordinates in (view.parts or {}).items()}
+        heading = Heading(skeleton, observed, turned=(WHOLE, *parts)) if method.heading else None
+        bones = Bones(skeleton, observed, parts) if method.bones else None
         super().__init__(view=Views(*(view for view in (heading, bones) if view), *views), **options)
         self.method, self.skeleton, self.frames, self.heading, self.bones = method, skeleton, observed, heading, bones
         self.limits: tuple[str, ...] | None = None
@@ -145,15 +145,15 @@ class EnergyModel(DynamicalVAE):
             truth: (B, T, D), rotated likewise; NaN where it was not observed.
             batch: batch, with "pseudo" and "valid" if there are further futures, whose last T frames are scored.
         """
-        found: dict[str, Tensor] = {}
+        terms: dict[str, Tensor] = {}
         if self.method.reconstruction:
-            found["reconstruction"] = energies.best_of_many(samples, truth)
+            terms["reconstruction"] = energies.best_of_many(samples, truth)
         if self.method.multimodal:
-            found["multimodal"] = truth.new_zeros(len(truth))
+            terms["multimodal"] = truth.new_zeros(len(truth))
             if "pseudo" in batch:
-                others = self._turned(batch["pseudo"], batch)[:, :, -samples.shape[2] :]
-                found["multimodal"] = energies.multimodal_best_of_many(samples, others, batch["valid"])
-        return found
+                others = self._rotate_futures(batch["pseudo"], batch)[:, :, -samples.shape[2] :]
+                terms["multimodal"] = energies.multimodal_best_of_many(samples, others, batch["valid"])
+        return terms
 
     def realism(self, samples: Tensor, truth: Tensor, judged: Tensor) -> dict[str, Tensor]:
         """Return the energies of limb lengths, angles and pose prior that have a weight, (B,) each.
@@ -163,19 +163,19 @@ class EnergyModel(DynamicalVAE):
             truth: (B, T, D); the first of the frames with the most joints defines the true lengths.
             judged: (S, B, T, D), frames whose angles and poses are scored.
         """
-        found: dict[str, Tensor] = {}
+        terms: dict[str, Tensor] = {}
         if self.method.limb:
             fullest = truth.isfinite().sum(-1).argmax(-1)
             reference = truth.take_along_dim(fullest[:, None, None], 1).squeeze(1)
-            found["limb"] = energies.limb_length(samples, reference, self.skeleton)
+            terms["limb"] = energies.limb_length(samples, reference, self.skeleton)
         if self.limits is not None:
-            if self.angles is None or self.angles.low is not self.angle_low:  # once: checks synchronise
+            if self.angles is None or self.angles.low is not self.angle_low:  # only once, as the checks synchronise
                 self.angles = AngleLimits(self.limits, self.angle_low, self.angle_high)
-            found["angles"] = energies.joint_angles(judged, self.angles, self.skeleton)
+            terms["angles"] = energies.joint_angles(judged, self.angles, self.skeleton)
         if self.pose_prior is not None:
             offset = int(torch.randint(min(3, judged.shape[2]), ()))  # every third frame, randomly shifted at each step
-            found["pose_prior"] = energies.pose_prior_energy(judged[:, :, offset::3], self.pose_prior, self.skeleton)
-        return found
+            terms["pose_prior"] = energies.pose_prior_energy(judged[:, :, offset::3], self.pose_prior, self.skeleton)
+        return terms
 
     def turned(self, x: Tensor) -> Tensor:
         """Return windows (..., T, D) rotated as the networks see them."""
@@ -186,7 +186,7 @@ class EnergyModel(DynamicalVAE):
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
         return self.view.inverse(Batch(values) | lengths)
 
-    def _turned(self, others: Tensor, batch: Batch) -> Tensor:
+    def _rotate_futures(self, others: Tensor, batch: Batch) -> Tensor:
         """Return other futures (B, M, T, D) of the windows of a batch, rotated like the windows."""
         if self.heading is None:
             return others

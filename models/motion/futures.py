@@ -76,8 +76,8 @@ class FutureMethod(PoseMethod):
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
         """Return the preset, without headings if left and right of the skeleton are unknown."""
-        found = super().preset(skeleton)
-        return found if skeleton.left and skeleton.right else {**found, "heading": False}
+        preset = super().preset(skeleton)
+        return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
@@ -95,19 +95,19 @@ class FutureMethod(PoseMethod):
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            return self.with_presets(self.presets[HUMAN36M.name])._built(schema.size(WHOLE), 2)
+            return self.with_presets(self.presets[HUMAN36M.name])._build_model(schema.size(WHOLE), 2)
         schema = self.poses(schema)
         method, observed = self.resolve_defaults(schema), schema.protocol.observed
-        return method._built(schema.size(WHOLE), observed, schema.skeleton)
+        return method._build_model(schema.size(WHOLE), observed, schema.skeleton)
 
     def kind(self) -> type[FutureModel]:
         """Return the class of the model."""
         return FutureModel
 
-    def _built(self, size: int, frames: int, skeleton: Skeleton | None = None) -> FutureModel:
+    def _build_model(self, size: int, frames: int, skeleton: Skeleton | None = None) -> FutureModel:
         views = [Heading(skeleton, frames)] if skeleton and self.heading else []
-        given = self.model_arguments({WHOLE: size, HISTORY: frames * size})
-        model = self.kind()(self, frames, skeleton, view=Views(*views, Past(HISTORY, frames)), **given)
+        arguments = self.model_arguments({WHOLE: size, HISTORY: frames * size})
+        model = self.kind()(self, frames, skeleton, view=Views(*views, Past(HISTORY, frames)), **arguments)
         networks = [side[name].network for side in (model.encoder, model.generator) for name in side]
         share_modules([network for network in networks if hasattr(network, "past")], "past")
         model.feeding = ScheduledSampling(1.0, gradient=True)
@@ -147,10 +147,10 @@ class FutureModel(DynamicalVAE):
             and HISTORY not in batch
             and (mask := Batch(batch).mask()) is not None
         ):
-            x, (seen, later) = torch.as_tensor(batch[WHOLE]), mask.tensor_split([self.frames], 1)
-            past = without_gaps(self.skeleton, x[:, : self.frames], seen)
-            whole = torch.cat([past, x[:, self.frames :]], 1)
-            batch = Batch(batch) | {WHOLE: whole, "mask": torch.cat([torch.ones_like(seen), later], 1)}
+            x, (past_mask, future_mask) = torch.as_tensor(batch[WHOLE]), mask.tensor_split([self.frames], 1)
+            past = without_gaps(self.skeleton, x[:, : self.frames], past_mask)
+            complete = torch.cat([past, x[:, self.frames :]], 1)
+            batch = Batch(batch) | {WHOLE: complete, "mask": torch.cat([torch.ones_like(past_mask), future_mask], 1)}
         return super().read(batch, **options)
 
     @override
@@ -159,14 +159,15 @@ class FutureModel(DynamicalVAE):
         if WHOLE not in data or not (self.method.join or draws):
             return {}
         size = rollout.batch // rollout.draws
-        made, truth = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (-1, size)), data[WHOLE][:size]
+        futures = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (-1, size))
+        truth = data[WHOLE][:size]
         if (mask := data.mask()) is not None:
             truth = torch.where(mask[:size], truth, torch.nan)
-        found = {"reconstruction": energies.best_of_many(made, truth)} if draws else {}
+        penalties = {"reconstruction": energies.best_of_many(futures, truth)} if draws else {}
         if self.method.join:
-            steps = made[:, :, 0] - data[HISTORY][:size, -truth.shape[-1] :]
-            found["join"] = steps.square().sum(-1).mean(0)
-        return found
+            steps = futures[:, :, 0] - data[HISTORY][:size, -truth.shape[-1] :]
+            penalties["join"] = steps.square().sum(-1).mean(0)
+        return penalties
 
 
 class FedBackNetwork(Network):
@@ -205,30 +206,30 @@ class FedBackNetwork(Network):
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         """Return the features of all steps; padding at the end does not affect the steps before it."""
-        known, first, state = self.known(parents, length)
+        inputs, first, state = self.known(parents, length)
         before = torch.cat([first[:, None], parents[WHOLE][:, : length - 1]], 1)
-        states = self.cell(torch.cat([known.expand(-1, length, -1), before], -1), state[None].contiguous())[0]
-        made: Tensor = self.behind(torch.cat([states, parents[self.own]], -1) if self.own else states)
-        return made
+        states = self.cell(torch.cat([inputs.expand(-1, length, -1), before], -1), state[None].contiguous())[0]
+        features: Tensor = self.behind(torch.cat([states, parents[self.own]], -1) if self.own else states)
+        return features
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        known, first, state = self.known(given, length)
+        inputs, first, state = self.known(given, length)
         weight, bias = self.cell.weight_ih_l0[:, : self.share], self.cell.bias_ih_l0
         latents = given[self.own].unbind(1) if self.own in given else None
-        shares = functional.linear(known, weight, bias).expand(-1, length, -1)
+        shares = functional.linear(inputs, weight, bias).expand(-1, length, -1)
         return shares.unbind(1), first, given.get(WHOLE), latents, state
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        shares, first, given, latents, hidden = state
-        before = first if t == 0 else drawn[WHOLE][t - 1] if given is None else given[:, t - 1]
+        shares, first, observed, latents, hidden = state
+        before = first if t == 0 else drawn[WHOLE][t - 1] if observed is None else observed[:, t - 1]
         gates = torch.addmm(shares[t], before, self.cell.weight_ih_l0[:, self.share :].t())
         hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
-        read = hidden
+        inputs = hidden
         if self.own:
-            read = torch.cat([hidden, drawn[self.own][t] if latents is None else latents[t]], -1)
-        return self.behind(read), (shares, first, given, latents, hidden)
+            inputs = torch.cat([hidden, drawn[self.own][t] if latents is None else latents[t]], -1)
+        return self.behind(inputs), (shares, first, observed, latents, hidden)
 
 
 class LastState(nn.Module):
@@ -251,7 +252,7 @@ class LastState(nn.Module):
             states, final = self.network(poses.reshape(len(poses), -1, self.size))
             if lengths is None:
                 return final[0]
-            found: Tensor = states.take_along_dim((lengths - 1)[:, None, None], 1)[:, 0]
-            return found
+            state: Tensor = states.take_along_dim((lengths - 1)[:, None, None], 1)[:, 0]
+            return state
 
         return memoize(self, [poses] if lengths is None else [poses, lengths], last)

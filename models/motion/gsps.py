@@ -10,7 +10,7 @@ exactly zero. Training minimises the expected energy of futures that are drawn t
 of a, and for each of them several draws of b. The energies penalise
 
 * the error of the best future, relative to the true future and to each pseudo ground truth;
-* futures of a part that are alike;
+* similar futures of a part;
 * futures that differ from the past in the observed frames;
 * limbs that change their lengths, and joint angles outside their limits;
 * poses that are unlikely under a pose prior.
@@ -138,7 +138,7 @@ class GSPS(EnergyMethod):
     def _spread(self, name: str, value: Any) -> Any:
         """Return the preset of two parts adapted to these parts.
 
-        The number of futures does not increase unless that requires fewer than two draws per part.
+        The number of futures does not increase, unless each part would have fewer than two draws.
         """
         count = len(self.parts)
         if not isinstance(value, tuple) or count == len(value):
@@ -173,7 +173,7 @@ class GSPS(EnergyMethod):
         if self.diversity is None:
             raise ValueError("the weights depend on the skeleton; call method.resolve_defaults(windows) first")
         weights = {name: getattr(self, name) for name in WEIGHTS}
-        diversity = _each(self.diversity, self.parts)
+        diversity = _per_part(self.diversity, self.parts)
         weights |= {f"diversity_{name}": weight for name, weight in zip(self.names, diversity, strict=True)}
         return Evidence(energy_weights={name: weight for name, weight in weights.items() if weight}, select="loss")
 
@@ -199,9 +199,9 @@ class GSPSModel(EnergyModel):
     def __init__(self, method: Any, skeleton: Skeleton, observed: int, length: int):
         joints = body_parts(skeleton, method.parts)
         count = skeleton.joints - 1
-        parts = {name: [3 * joint + axis for joint in held for axis in range(3)] for name, held in joints.items()}
+        parts = {name: [3 * joint + axis for joint in members for axis in range(3)] for name, members in joints.items()}
         codes = _codes(list(parts))
-        everything, shape = {HISTORY: range(count), **joints}, (method.coefficients, method.width, method.blocks)
+        groups, shape = {HISTORY: range(count), **joints}, (method.coefficients, method.width, method.blocks)
         super().__init__(
             method,
             skeleton,
@@ -210,26 +210,26 @@ class GSPSModel(EnergyModel):
             generative=part_by_part(list(parts), lambda _: observed),
             inference=None,
             sizes={HISTORY: 3 * count, **dict.fromkeys(codes, method.latent), **{n: len(p) for n, p in parts.items()}},
-            network={f"p({name})": GraphConv(everything, name, length, *shape) for name in parts},
+            network={f"p({name})": GraphConv(groups, name, length, *shape) for name in parts},
             distributions={f"p({name})": Directions(project=False) if method.bones else Delta() for name in parts},
         )
         self.length = length
-        self.draws = dict(zip(codes, _each(method.draws, method.parts), strict=True))
+        self.draws = dict(zip(codes, _per_part(method.draws, method.parts), strict=True))
 
     @override
     def model(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
         """Run the generative program, with energies for whole windows. Values are rotated as the networks see them."""
-        return super().model(batch, **self._drawing(batch, options))
+        return super().model(batch, **self._with_draws(batch, options))
 
     @override
     def guide(self, batch: AnyBatch, **options: Any) -> dict[str, Tensor]:
-        return super().guide(batch, **self._drawing(batch, options))
+        return super().guide(batch, **self._with_draws(batch, options))
 
-    def _drawing(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
+    def _with_draws(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
         """Return the options, with several draws if the batch has whole windows, whose truth scores futures."""
-        given = batch.get(WHOLE) if isinstance(batch, Mapping) else None
-        whole = given is not None and given.shape[1] == self.length and options.get("length") is None
-        return {**({"draws": self.draws} if whole else {}), **options}
+        x = batch.get(WHOLE) if isinstance(batch, Mapping) else None
+        is_complete = x is not None and x.shape[1] == self.length and options.get("length") is None
+        return {**({"draws": self.draws} if is_complete else {}), **options}
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
@@ -251,23 +251,23 @@ class GSPSModel(EnergyModel):
         """
         method, past, size = self.method, self.frames, len(truth)
         samples = values[WHOLE].unflatten(0, (-1, size))  # (S, B, T, D)
-        ahead = samples[:, :, past:]  # once: each slice's gradient has the full size
-        found = self.best(ahead, truth[:, past:], batch)
+        ahead = samples[:, :, past:]  # sliced only once, as the gradient of each slice has the full size
+        terms = self.best(ahead, truth[:, past:], batch)
         if method.history:
-            found["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
-        found |= self.realism(samples, truth, ahead)
+            terms["history"] = energies.history_error(samples[:, :, :past], truth[:, :past])
+        terms |= self.realism(samples, truth, ahead)
         draws = list(self.draws.values())
         names = self.observed
-        weights, scales = (_each(given, method.parts) for given in (method.diversity, method.diversity_scale))
+        weights, scales = (_per_part(option, method.parts) for option in (method.diversity, method.diversity_scale))
         for i, rows in enumerate(accumulate(draws, mul)):
             if not weights[i]:
                 continue
             motions = values[names[i]][: rows * size, past:].unflatten(
                 0, (draws[i], -1)
             )  # futures that share earlier parts
-            likeness = energies.pairwise_diversity(motions, scales[i])
-            found[f"diversity_{names[i]}"] = likeness.unflatten(0, (-1, size)).mean(0)
-        return found
+            similarity = energies.pairwise_diversity(motions, scales[i])
+            terms[f"diversity_{names[i]}"] = similarity.unflatten(0, (-1, size)).mean(0)
+        return terms
 
     @override
     def read(self, batch: AnyBatch | None, **options: Any) -> Batch:
@@ -329,14 +329,14 @@ class GSPSModel(EnergyModel):
                 f"{self.method.name} fills gaps in windows of {self.length} frames, not {length}; cut the motion into "
                 "such windows, as `dvae impute` does without --clip"
             )
-        filled, count = [], prod(self.draws.values())
+        motions, count = [], prod(self.draws.values())
         for _ in range(samples):
-            made = self.reconstruct(batch, count, **options)[WHOLE]
-            given, seen = torch.as_tensor(batch[WHOLE]).to(made), torch.as_tensor(mask).to(made.device)
-            nearest = (made - given).square().masked_fill(~seen, 0.0).sum((2, 3)).argmin(0)
-            best = made.take_along_dim(nearest[None, :, None, None], 0)[0]
-            filled.append(torch.where(seen, given, best + interpolate_missing(given - best, seen)))
-        return {WHOLE: torch.stack(filled)}
+            draws = self.reconstruct(batch, count, **options)[WHOLE]
+            x, observed = torch.as_tensor(batch[WHOLE]).to(draws), torch.as_tensor(mask).to(draws.device)
+            nearest = (draws - x).square().masked_fill(~observed, 0.0).sum((2, 3)).argmin(0)
+            best = draws.take_along_dim(nearest[None, :, None, None], 0)[0]
+            motions.append(torch.where(observed, x, best + interpolate_missing(x - best, observed)))
+        return {WHOLE: torch.stack(motions)}
 
     @torch.no_grad()
     @override
@@ -356,10 +356,10 @@ def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factor
 
 def _codes(parts: Sequence[str]) -> list[str]:
     """Return the names of the parts' latents: a, b, ..., except names that are in use."""
-    free = (letter for letter in ascii_lowercase if letter not in {HISTORY, WHOLE, *parts})
-    return [code for code, _ in zip(free, parts, strict=False)]
+    letters = (letter for letter in ascii_lowercase if letter not in {HISTORY, WHOLE, *parts})
+    return [code for code, _ in zip(letters, parts, strict=False)]
 
 
-def _each(values: Sequence[Any], parts: Sequence[str]) -> Sequence[Any]:
+def _per_part(values: Sequence[Any], parts: Sequence[str]) -> Sequence[Any]:
     """Return one value for each part; a single value applies to all."""
     return tuple(values) * len(parts) if len(values) == 1 else values

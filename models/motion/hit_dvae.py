@@ -26,8 +26,8 @@ work:
   features that all poses share. There is no batch normalisation.
 * With best-of-many, the density of x has one scale per coordinate, which is only fitted to the errors: its gradient
   does not reach the poses. emission="unit" gives the paper's unit variance.
-* On other data than the paper's, a nat of z costs .03 instead of .5. With .5, z collapses in short runs and motions
-  lose their rhythm. A nat of w costs .03 instead of 7.5; with 7.5, w carries no information
+* On other data than the paper's, the weight of the KL of z is .03 instead of .5. With .5, z collapses in short runs and
+  motions lose their rhythm. The weight of the KL of w is .03 instead of 7.5; with 7.5, w carries no information
   (docs/results/hit_dvae.md).
 * Training never replaces the observed frames, since a forecast does not either, unless `feed_observed` is set. No
   gradient flows through means that are fed back, unless `feeding_gradient` is set. `feeding_passes` computes these
@@ -92,15 +92,15 @@ class HiTDVAE(EnergyMethod, LatentMethod):
     """A hierarchical transformer dynamical VAE. With loss="evidence" the energies do not apply.
 
     Args:
-        emission: distribution of x. loss="best-of-many" does not support "normal" and "student". With `bones` there is
-            none: x is a point mass.
+        emission: distribution of x. loss="best-of-many" does not support "normal" and "student". With `bones`, x is a
+            point mass.
         loss: "best-of-many" (the paper's) or "evidence" (the plain bound).
         samples: K, number of motions drawn for each window in training; 1 with loss="evidence".
         kl_local: weight of the KL of z.
         kl_static: weight of the KL of w, in the unit of the bound; the paper's .1, which multiplies means over T
             frames, is .1 T.
         static: size of w; 0 for a model without w.
-        attention: whether to use transformers; otherwise LSTMs, which ignore `heads_count` and `nearest`.
+        attention: whether to use transformers; otherwise LSTMs, for which `heads_count` and `nearest` have no effect.
         width: width of the attention of guide and prior.
         heads_count: number of attention heads.
         decoder: width of the attention of x.
@@ -170,9 +170,11 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             raise ValueError(
                 f"hide is {self.hide}, but the guide of hit-dvae reads whole poses without indicators; leave hide at 0"
             )
-        own = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
-        if self.loss == "evidence" and (given := [name for name in own if getattr(self, name)]):
-            raise ValueError(f"loss='evidence' has no {', '.join(given)}; use loss='best-of-many' or leave them out")
+        energy_options = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
+        if self.loss == "evidence" and (unsupported := [name for name in energy_options if getattr(self, name)]):
+            raise ValueError(
+                f"loss='evidence' has no {', '.join(unsupported)}; use loss='best-of-many' or leave them out"
+            )
         for name in ("diversity", "diversity_scale"):
             values = getattr(self, name)
             if values is not None and len(values) != len(PARTS):
@@ -199,19 +201,19 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         poses = {"x": NodeGraph(self.pose_width, coordinates=3)} if self.pose_width else {}
         decoder = self.decoder or PRESETS[""]["decoder"]
         shape: dict[str, Any] = {"heads": self.heads_count, "layers": self.layers, "extract": poses}
-        found: dict[str, NetworkSpec] = {}
+        networks: dict[str, NetworkSpec] = {}
         if self.attention:
-            found["p(z)"] = Attention(self.width, nearest=self.nearest, **shape)
-            found["p(x)"] = Attention(decoder, nearest=self.nearest, **shape)
-            found["q(z)"] = SelfAttention(self.width, nearest=self.nearest, **shape)
+            networks["p(z)"] = Attention(self.width, nearest=self.nearest, **shape)
+            networks["p(x)"] = Attention(decoder, nearest=self.nearest, **shape)
+            networks["q(z)"] = SelfAttention(self.width, nearest=self.nearest, **shape)
         else:
-            found["p(z)"] = found["q(z)"] = Recurrent(self.width, layers=self.layers, extract=poses)
-            found["p(x)"] = Recurrent(decoder, layers=self.layers, hidden=(decoder,), extract=poses)
+            networks["p(z)"] = networks["q(z)"] = Recurrent(self.width, layers=self.layers, extract=poses)
+            networks["p(x)"] = Recurrent(decoder, layers=self.layers, hidden=(decoder,), extract=poses)
         if self.static:
             pooled = Attention(self.width, **shape)
             graph = FrameGraph(self.frames or FRAMES, extract=poses)
-            found["q(w)"] = graph if self.summary == "graph" else pooled
-        return found
+            networks["q(w)"] = graph if self.summary == "graph" else pooled
+        return networks
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
@@ -229,9 +231,9 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         if isinstance(schema, Poses) and (method.loss == "best-of-many" or method.heading):
             self.poses(schema)
             if method.loss == "best-of-many":
-                fitted = replace(model_arguments["distributions"]["p(x)"], fitted="scale")
+                distribution = replace(model_arguments["distributions"]["p(x)"], fitted="scale")
                 model_arguments["distributions"]["p(x)"] = (
-                    Directions(residual=method.residual) if method.bones else fitted
+                    Directions(residual=method.residual) if method.bones else distribution
                 )
             model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **model_arguments)
         else:
@@ -241,8 +243,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
                 share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
         if self.standardise and not schema.units:
             model.standardise(WHOLE)
-        kept = 0 if self.feed_observed else observed
-        model.feeding = ScheduledSampling(0.0, self.feeding_passes or None, self.feeding_gradient, kept)
+        protected = 0 if self.feed_observed else observed
+        model.feeding = ScheduledSampling(0.0, self.feeding_passes or None, self.feeding_gradient, protected)
         return model
 
     @override
@@ -253,12 +255,12 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         bounds of other models.
         """
         schema = Poses.of(data, self.name)
-        suited = replace(self, frames=self.frames or schema.protocol.observed)
+        method = replace(self, frames=self.frames or schema.protocol.observed)
         if self.loss == "evidence":
             preset = self.preset(schema.skeleton)
-            open_ = {name: preset[name] for name in ("decoder", "pose_width") if getattr(self, name) is None}
-            return replace(suited, heading=bool(self.heading), **open_)
-        return super(HiTDVAE, suited).resolve_defaults(schema)
+            unset = {name: preset[name] for name in ("decoder", "pose_width") if getattr(self, name) is None}
+            return replace(method, heading=bool(self.heading), **unset)
+        return super(HiTDVAE, method).resolve_defaults(schema)
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
@@ -305,8 +307,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             )
         weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}
         ramp = SHAPES[self.warm_up_shape]
-        likeness = {f"diversity_{part}": weight for part, weight in zip(PARTS, self.diversity, strict=True)}
-        energy_weights = {name: getattr(self, name) for name in EnergyMethod.weights if name != "diversity"} | likeness
+        diversity = {f"diversity_{part}": weight for part, weight in zip(PARTS, self.diversity, strict=True)}
+        energy_weights = {name: getattr(self, name) for name in EnergyMethod.weights if name != "diversity"} | diversity
         return Evidence(
             kl_weight={n: ramp(0.0, w, steps=self.warm_up) if self.warm_up else w for n, w in weights.items()},
             free_bits=self.free_bits,
@@ -327,7 +329,9 @@ class HiTModel(EnergyModel):
     def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, **options: Any):
         super().__init__(method, skeleton, observed, **options)
         joints = body_parts(skeleton, PARTS) if method.diversity else {}
-        self.coordinates = {part: [3 * j + axis for j in held for axis in range(3)] for part, held in joints.items()}
+        self.coordinates = {
+            part: [3 * j + axis for j in members for axis in range(3)] for part, members in joints.items()
+        }
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
@@ -339,12 +343,14 @@ class HiTModel(EnergyModel):
             )
         size = rollout.batch // rollout.draws
         x = rollout.values[WHOLE]
-        made = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
-        truth, motions = (self.positions({WHOLE: each}, data)[WHOLE] for each in (self.seen(x[:size], data), made))
+        predicted = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
+        truth, motions = (
+            self.positions({WHOLE: values}, data)[WHOLE] for values in (self.seen(x[:size], data), predicted)
+        )
         means = self.realism(motions, truth, motions)
         method = self.method
         for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):
             if weight:
-                held = motions.index_select(-1, indices(self.coordinates[part], motions))
-                means[f"diversity_{part}"] = energies.pairwise_diversity(held, scale)
+                part_motion = motions.index_select(-1, indices(self.coordinates[part], motions))
+                means[f"diversity_{part}"] = energies.pairwise_diversity(part_motion, scale)
         return self.best(motions, truth, data) | {n: rollout.length * e for n, e in means.items()}

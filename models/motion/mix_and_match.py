@@ -5,9 +5,9 @@ h are the observed poses, x the poses that follow, and i indices that are drawn 
     p(z) p(x_t | x_{<t}, h, z, i)        q(z | x_{1:T}, h, i)
 
 Recurrent networks summarise past and future. The code of the past, perturbed by z at the drawn indices, is the initial
-state of a recurrent decoder. The decoder starts at the last observed pose and predicts quaternions of all joints. An
-option selects other ways to add the noise, with the same recurrent networks, losses and representation
-(see `dvae.networks.noise`):
+state of a recurrent decoder. The decoder starts at the last observed pose and predicts quaternions of all joints. The
+option `noise` selects other ways to add the noise (`dvae.networks.noise`), with the same recurrent networks, losses and
+representation:
 
     concatenate   p(z) p(x_t | x_{<t}, h, z)          q(z | x_{1:T}, h)
     add           p(z) p(x_t | x_{<t}, h, z)          q(z), the prior
@@ -126,20 +126,20 @@ class MixAndMatchMotion(PoseMethod):
 
     def entering(self) -> Noise | None:
         """Return how the noise enters the code; None if each step has its own noise."""
-        ways: dict[str, Noise] = {"mix": MixAndMatch(self.alpha), "concatenate": Concatenate(), "add": AddProjected()}
-        return ways.get(self.noise)
+        kinds: dict[str, Noise] = {"mix": MixAndMatch(self.alpha), "concatenate": Concatenate(), "add": AddProjected()}
+        return kinds.get(self.noise)
 
     @override
     def sizes(self) -> dict[str, int]:
-        width, way = self.width or 0, self.entering()
-        latent = self.latent or (half(width) if way is None else way.latent(width))
+        width, noise = self.width or 0, self.entering()
+        latent = self.latent or (half(width) if noise is None else noise.latent(width))
         return {"z": latent, **({INDICES: width} if self.noise == "mix" else {})}
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        way, width = self.entering(), self.width or 0
-        guide = {} if self.noise == "add" else {"q(z)": FutureEncoder(width, way)}
-        return {**guide, "p(x)": FutureDecoder(width, way, self.velocity)}
+        noise, width = self.entering(), self.width or 0
+        guide = {} if self.noise == "add" else {"q(z)": FutureEncoder(width, noise)}
+        return {**guide, "p(x)": FutureDecoder(width, noise, self.velocity)}
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
@@ -156,11 +156,11 @@ class MixAndMatchMotion(PoseMethod):
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            return self.with_presets(self.presets[""])._built(DynamicalVAE, schema.size(WHOLE), 2)
+            return self.with_presets(self.presets[""])._build_model(DynamicalVAE, schema.size(WHOLE), 2)
         schema, method = Poses.of(schema, self.name, self.representation), self.resolve_defaults(schema)
-        return method._built(MixAndMatchModel, schema.size(WHOLE), schema.protocol.observed, method, schema)
+        return method._build_model(MixAndMatchModel, schema.size(WHOLE), schema.protocol.observed, method, schema)
 
-    def _built(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:
+    def _build_model(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:
         model_arguments = self.model_arguments({WHOLE: size, HISTORY: frames * size})
         shared = {INDICES: MixAndMatch(self.alpha).indices} if self.noise == "mix" else {}
         model_arguments |= {"inference": None} if self.noise == "add" else {}
@@ -205,27 +205,28 @@ class MixAndMatchModel(DynamicalVAE):
         if not self.method.skeleton or WHOLE not in data or LENGTHS not in data:
             return {}
         value = rollout.values[WHOLE]
-        made = rollout.parameters(WHOLE, value)[0]
+        predicted = rollout.parameters(WHOLE, value)[0]
         with torch.no_grad():
-            theirs = _aligned(value, data[LENGTHS], self.turns)
-        ours = _aligned(made, data[LENGTHS], self.turns)
-        return {"skeleton": (ours - theirs).square().mean(-1).sum(-1)}
+            target = _unrotated_positions(value, data[LENGTHS], self.turns)
+        positions = _unrotated_positions(predicted, data[LENGTHS], self.turns)
+        return {"skeleton": (positions - target).square().mean(-1).sum(-1)}
 
 
-def _aligned(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
+def _unrotated_positions(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
     """Return positions (B, T, 3 J') of poses (B, T, D), with the root at the origin and without rotation."""
-    place, start = view.turning.index(view.skeleton.root), 3 * view.root
-    unturned = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
+    root, start = view.turning.index(view.skeleton.root), 3 * view.root
+    identity = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
     first = torch.zeros_like(quaternions[..., :start])
-    turns = quaternions[..., start:].unflatten(-1, (-1, 4))
-    turns = torch.cat([turns[..., :place, :], unturned[..., None, :], turns[..., place + 1 :, :]], -2)
-    found: Tensor = view.inverse(Batch({WHOLE: torch.cat([first, turns.flatten(-2)], -1), LENGTHS: lengths}))[WHOLE]
-    return found
+    rotations = quaternions[..., start:].unflatten(-1, (-1, 4))
+    rotations = torch.cat([rotations[..., :root, :], identity[..., None, :], rotations[..., root + 1 :, :]], -2)
+    x = torch.cat([first, rotations.flatten(-2)], -1)
+    positions: Tensor = view.inverse(Batch({WHOLE: x, LENGTHS: lengths}))[WHOLE]
+    return positions
 
 
 @dataclass(frozen=True)
 class FutureEncoder:
-    """Features of z from the codes of past and future, or of z_t from a network that continues from the past.
+    """Features of z from the codes of past and future, or of z_t from a network that starts at the code of the past.
 
     Args:
         width: L, number of units.
@@ -264,7 +265,7 @@ class FutureDecoder:
 
     Args:
         width: L, number of units.
-        noise: how the noise enters the first state; None if each step has its own noise, which joins after the state.
+        noise: how the noise enters the first state; None if each step has its own noise, which joins the state.
         velocity: whether to add the output to the previous pose.
     """
 
@@ -302,16 +303,16 @@ class FutureDecoderNetwork(Network):
 
         Its output is the first state, or the features of each step that poses are computed from.
         """
-        found: Any = self.noise if self.join is None else self.join
-        return found
+        module: Any = self.noise if self.join is None else self.join
+        return module
 
     def code(self, parents: Mapping[str, Tensor]) -> Tensor:
         """Return the first state (B, L)."""
         code = self.past(parents[HISTORY])
         if self.noise is None:
             return code
-        entered: Tensor = self.noise(code, parents["z"], parents.get(INDICES))
-        return entered
+        state: Tensor = self.noise(code, parents["z"], parents.get(INDICES))
+        return state
 
     def _last(self, parents: Mapping[str, Tensor]) -> Tensor:
         """Return the last pose of the past (B, D)."""
@@ -320,8 +321,8 @@ class FutureDecoderNetwork(Network):
     def _pose(self, state: Tensor, z: Tensor, before: Tensor) -> Tensor:
         if self.join is not None:
             state = self.join(torch.cat([state, z], -1))
-        made: Tensor = self.out(state)
-        return made + before if self.velocity else made
+        output: Tensor = self.out(state)
+        return output + before if self.velocity else output
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
@@ -329,8 +330,8 @@ class FutureDecoderNetwork(Network):
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        hidden, z, given, first = state
-        before = first if t == 0 else drawn[WHOLE][t - 1] if given is None else given[:, t - 1]
+        hidden, z, observed, first = state
+        before = first if t == 0 else drawn[WHOLE][t - 1] if observed is None else observed[:, t - 1]
         gates = torch.nn.functional.linear(before, self.cell.weight_ih_l0, self.cell.bias_ih_l0)
         hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
-        return self._pose(hidden, z if z.dim() == 2 else z[:, t], before), (hidden, z, given, first)
+        return self._pose(hidden, z if z.dim() == 2 else z[:, t], before), (hidden, z, observed, first)

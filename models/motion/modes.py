@@ -1,16 +1,16 @@
-"""Base of the methods that map a past jointly to latents of several futures, for the decoder of a fitted CVAE.
+"""Base of the methods that map a past to latents of several futures at once, for the decoder of a fitted CVAE.
 
     p(x_t | x_{<t}, h, k, ...)
 
-k = 1..K is the mode, a one-hot context. A network of the observed poses h returns the CVAE's latent in each mode, and
-the CVAE's decoder, with frozen weights, predicts the future. The K futures of a window are drawn together, and energies
+k = 1..K is the mode, a one-hot context. A network of the observed poses h returns the CVAE's latent in each mode. The
+CVAE's decoder, with frozen weights, predicts the future. The K futures of a window are drawn together, and energies
 compare them.
 
 The weights of the decoder are part of the model. They are from a run of `cvae` (`cvae_run`) on the same windows.
 Without such a run, a CVAE is fitted first, with the same number of steps, and not saved.
 
 Sources: Yuan and Kitani, 2020, arXiv 1907.04967 and 2003.08386. Our choices: a batch without k has random modes. If the
-number of samples is not a multiple of K, samples are whole sets and a random part of one set.
+number of samples is not a multiple of K, the last set is incomplete and has random modes.
 """
 
 from __future__ import annotations
@@ -92,9 +92,9 @@ class ModesMethod(FutureMethod):
         """
         if not self.cvae_run or all(getattr(self, name) is not None for name in OF_CVAE):
             return super().resolve_defaults(data)
-        cvae, *_ = _read(self.cvae_run)
-        taken = self.with_presets({name: getattr(cvae, name) for name in OF_CVAE})
-        return super(ModesMethod, taken).resolve_defaults(data)
+        cvae, *_ = _read_run(self.cvae_run)
+        method = self.with_presets({name: getattr(cvae, name) for name in OF_CVAE})
+        return super(ModesMethod, method).resolve_defaults(data)
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -124,15 +124,15 @@ class ModesMethod(FutureMethod):
             ValueError: if the run is not of a cvae, or has other windows or options.
             CheckpointError: if the run does not exist or is damaged.
         """
-        cvae: Any = self._loaded(train) if self.cvae_run else self._fitted(train, validation, steps)
+        cvae: Any = self._load_cvae(train) if self.cvae_run else self._fit_cvae(train, validation, steps)
         model.generator[WHOLE].network.decoder.load_state_dict(cvae.generator[WHOLE].network.state_dict())
         model.generator[WHOLE].head.load_state_dict(cvae.generator[WHOLE].head.state_dict())
 
-    def _loaded(self, windows: Any) -> FutureModel:
-        path, (cvae, schema, model) = self.cvae_run, _read(self.cvae_run)
-        ours, theirs = (dict(flat(each.windows.config())) for each in (Poses.of(windows, self.name), schema))
-        if differing := [name for name in ours | theirs if ours.get(name) != theirs.get(name)]:
-            values = (f"{name} is {brief(theirs.get(name))}, not {brief(ours.get(name))}" for name in differing)
+    def _load_cvae(self, windows: Any) -> FutureModel:
+        path, (cvae, schema, model) = self.cvae_run, _read_run(self.cvae_run)
+        current, recorded = (dict(flat(poses.windows.config())) for poses in (Poses.of(windows, self.name), schema))
+        if differing := [name for name in current | recorded if current.get(name) != recorded.get(name)]:
+            values = (f"{name} is {brief(recorded.get(name))}, not {brief(current.get(name))}" for name in differing)
             raise ValueError(
                 f"the cvae of {path} was fitted on other windows: {'; '.join(islice(values, 3))}; fit one on these "
                 "windows, with the same --data and --protocol"
@@ -146,7 +146,7 @@ class ModesMethod(FutureMethod):
         load_weights(model, path)
         return model
 
-    def _fitted(self, train: Any, validation: Any, steps: int) -> FutureModel:
+    def _fit_cvae(self, train: Any, validation: Any, steps: int) -> FutureModel:
         method = CVAE(**{name: getattr(self, name) for name in OF_CVAE})
         model, seed = method.build(train), int(torch.randint(2**31, ()))
         training = replace(method.training(train), steps=steps, seed=seed, progress=False)
@@ -154,17 +154,17 @@ class ModesMethod(FutureMethod):
         return model
 
 
-def _read(path: str) -> tuple[CVAE, Poses, FutureModel]:
+def _read_run(path: str) -> tuple[CVAE, Poses, FutureModel]:
     """Return options, schema and model of the run of a cvae; the weights are not loaded yet."""
     run = Run(path)
     config, size = run.config, run.size()
     try:
         schema = {**config["schema"]}
-        model_arguments, found = schema.pop("kind"), configured(config["method"])
-        if model_arguments == Poses.kind and isinstance(found, CVAE) and found.components == 1:
+        kind, method = schema.pop("kind"), configured(config["method"])
+        if kind == Poses.kind and isinstance(method, CVAE) and method.components == 1:
             poses = Poses.from_config(schema)
             with at_most(size, f"{run.path / CONFIG}"):
-                return found, poses, found.build(poses)
+                return method, poses, method.build(poses)
     except CheckpointError:
         raise
     except Exception as error:  # a file from elsewhere may contain anything
@@ -196,8 +196,8 @@ class ModesModel(FutureModel):
     @property
     def sampler(self) -> Sampler:
         """The network that returns the latents of all modes."""
-        found: Sampler = self.generator[WHOLE].network.sampler
-        return found
+        sampler: Sampler = self.generator[WHOLE].network.sampler
+        return sampler
 
     def in_modes(self, data: Batch, modes: Tensor) -> Batch:
         """Return data of B windows in each of the given modes, mode by mode.
@@ -210,20 +210,20 @@ class ModesModel(FutureModel):
             Data of M B rows.
         """
         size = len(data[HISTORY])
-        places = self._coded(modes.repeat_interleave(size), data[HISTORY])
-        group = torch.arange(size, device=places.device).repeat(len(modes))
-        return Batch(repeat(data, len(modes))) | {MODE: places, "group": group}
+        codes = self._one_hot(modes.repeat_interleave(size), data[HISTORY])
+        group = torch.arange(size, device=codes.device).repeat(len(modes))
+        return Batch(repeat(data, len(modes))) | {MODE: codes, "group": group}
 
-    def _coded(self, modes: Tensor, like: Tensor) -> Tensor:
+    def _one_hot(self, modes: Tensor, like: Tensor) -> Tensor:
         """Return the one-hot codes (B, K) of the modes of each row."""
         return torch.eye(self.modes, dtype=like.dtype, device=like.device).index_select(0, modes.to(like.device))
 
     def in_sets(self, batch: AnyBatch | None) -> Batch:
-        """Return a batch of B windows in all modes, as `in_modes` does, whose futures energies compare."""
+        """Return a batch of B windows in all modes, as `in_modes` does; energies compare the futures of a window."""
 
         def compute() -> Batch:
-            read = self.read(batch)
-            data = self.in_modes(read, torch.arange(self.modes, device=read[HISTORY].device))
+            windows = self.read(batch)
+            data = self.in_modes(windows, torch.arange(self.modes, device=windows[HISTORY].device))
             return data | {WHOLE_SETS: torch.ones_like(data.group, dtype=torch.bool)}
 
         return memoize(self.generator, [batch], compute)
@@ -246,8 +246,8 @@ class ModesModel(FutureModel):
         data = self.read(batch)
         if MODE in (self.inference if guide else self.generative).context and MODE not in data and HISTORY in data:
             history = data[HISTORY]
-            drawn = torch.randint(self.modes, history.shape[:1], device=history.device)
-            data = data | {MODE: self._coded(drawn, history)}
+            modes = torch.randint(self.modes, history.shape[:1], device=history.device)
+            data = data | {MODE: self._one_hot(modes, history)}
         rollout = super().rollout(data, length, size, guide=guide)
         return replace(rollout, draws=self.modes) if WHOLE_SETS in data else rollout
 
@@ -263,28 +263,28 @@ class ModesModel(FutureModel):
         **options: Any,
     ) -> dict[str, Tensor]:
         """Return whole sets of futures, one per mode; an incomplete last set has random modes."""
-        making = super().forecast
+        base_forecast = super().forecast
 
         def make(part: slice, modes: Tensor, count: int) -> dict[str, Tensor]:
-            held = {name: repeat(rows(torch.as_tensor(v), part), len(modes)) for name, v in (fix or {}).items()}
-            some = self.in_modes(rows(data, part), modes)
-            return making(some, horizon, count, fix=held or None, chunk=chunk, **options)
+            fixed = {name: repeat(rows(torch.as_tensor(v), part), len(modes)) for name, v in (fix or {}).items()}
+            inputs = self.in_modes(rows(data, part), modes)
+            return base_forecast(inputs, horizon, count, fix=fixed or None, chunk=chunk, **options)
 
         if isinstance(batch, Mapping) and MODE in batch:
-            return making(batch, horizon, samples, fix=fix, chunk=chunk, **options)
+            return base_forecast(batch, horizon, samples, fix=fix, chunk=chunk, **options)
         data = self.read(batch)
         return self._in_sets(make, data, samples, chunk)
 
     @override
     def reconstruct(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """Return the means of the data, in sets as in `forecast`."""
-        making = super().reconstruct
+        base_reconstruct = super().reconstruct
 
         def make(part: slice, modes: Tensor, count: int) -> dict[str, Tensor]:
-            return making(self.in_modes(rows(data, part), modes), count, chunk=chunk)
+            return base_reconstruct(self.in_modes(rows(data, part), modes), count, chunk=chunk)
 
         if isinstance(batch, Mapping) and MODE in batch:
-            return making(batch, samples, chunk=chunk)
+            return base_reconstruct(batch, samples, chunk=chunk)
         data = self.read(batch)
         return self._in_sets(make, data, samples, chunk)
 
@@ -298,18 +298,20 @@ class ModesModel(FutureModel):
     ) -> dict[str, Tensor]:
         """Return samples (S, B, ...) of all windows; `make` returns n draws (n, M b, ...) of b windows in M modes."""
         size, step = len(data[HISTORY]), max(chunk // self.modes, 1)
-        whole, rest = divmod(samples, self.modes)
-        sets = [(torch.arange(self.modes), whole)] if whole or not rest else []
-        sets += [(torch.randperm(self.modes)[:rest], 1)] if rest else []
+        n_full, n_rest = divmod(samples, self.modes)
+        sets = [(torch.arange(self.modes), n_full)] if n_full or not n_rest else []
+        sets += [(torch.randperm(self.modes)[:n_rest], 1)] if n_rest else []
 
         def parts() -> Iterator[dict[str, Tensor]]:
             for first in range(0, max(size, 1), step):
-                made = [(make(slice(first, first + step), modes, count), len(modes)) for modes, count in sets]
-                apart = [{n: v.unflatten(1, (m, -1)).flatten(0, 1) for n, v in each.items()} for each, m in made]
-                yield {name: torch.cat([each[name] for each in apart]) for name in apart[0]}
+                outputs = [(make(slice(first, first + step), modes, count), len(modes)) for modes, count in sets]
+                per_set = [
+                    {n: v.unflatten(1, (m, -1)).flatten(0, 1) for n, v in output.items()} for output, m in outputs
+                ]
+                yield {name: torch.cat([output[name] for output in per_set]) for name in per_set[0]}
 
-        found = list(parts())
-        return {name: torch.cat([each[name] for each in found], 1) for name in found[0]}
+        chunks = list(parts())
+        return {name: torch.cat([output[name] for output in chunks], 1) for name in chunks[0]}
 
 
 @dataclass(frozen=True)
@@ -342,35 +344,35 @@ class ModesDecoderNetwork(Network):
     code: ClassVar[str] = "w"
 
     def __init__(self, spec: ModesDecoder, inputs: Sequence[Input], size: int) -> None:
-        read = {parent.name: parent for parent in inputs}
-        given = [read[WHOLE], read[HISTORY], Input(self.code, spec.latent)]
-        decoder = SummaryDecoder(spec.width, spec.hidden).build(given, True, size)
+        parents = {parent.name: parent for parent in inputs}
+        decoder_inputs = [parents[WHOLE], parents[HISTORY], Input(self.code, spec.latent)]
+        decoder = SummaryDecoder(spec.width, spec.hidden).build(decoder_inputs, True, size)
         super().__init__(inputs, True, decoder.features)
-        self.noisy = NOISE in read
-        self.sampler = Sampler(size, read[MODE].size, (1 + self.noisy) * spec.latent, spec)
+        self.noisy = NOISE in parents
+        self.sampler = Sampler(size, parents[MODE].size, (1 + self.noisy) * spec.latent, spec)
         self.decoder = decoder
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        made: Tensor = self.decoder(self._coded(parents), length, lengths)
-        return made
+        features: Tensor = self.decoder(self._with_code(parents), length, lengths)
+        return features
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        return self.decoder.start(self._coded(given), batch, length, lengths)
+        return self.decoder.start(self._with_code(given), batch, length, lengths)
 
     @override
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         return self.decoder.step(state, t, drawn)
 
-    def _coded(self, parents: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _with_code(self, parents: Mapping[str, Tensor]) -> dict[str, Tensor]:
         modes = self.sampler(parents[HISTORY])
-        chosen = parents[MODE].unflatten(0, (-1, len(modes)))
-        found = torch.einsum("nrk,rkl->nrl", chosen, modes).flatten(0, 1)
+        one_hot = parents[MODE].unflatten(0, (-1, len(modes)))
+        codes = torch.einsum("nrk,rkl->nrl", one_hot, modes).flatten(0, 1)
         if self.noisy:
-            scale, location = found.chunk(2, -1)
-            found = scale * parents[NOISE] + location
-        return {**parents, self.code: found}
+            scale, location = codes.chunk(2, -1)
+            codes = scale * parents[NOISE] + location
+        return {**parents, self.code: codes}
 
 
 class Sampler(nn.Module):
@@ -393,13 +395,13 @@ class Sampler(nn.Module):
     def forward(self, history: Tensor) -> Tensor:
         """Return the parameters (R, K, L) of the modes from the past (N, O D).
 
-        R is N, or N / K if the rows repeat the same R rows K times; then they are computed once.
+        R is N, or N / K if the rows repeat the same R rows K times.
         """
 
         def compute() -> Tensor:
-            count, odd = divmod(len(history), self.modes)
-            alike = not odd and torch.equal(history[count:], history[:-count])
-            found: Tensor = self.heads(self.behind(self.past(history[:count] if alike else history)))
-            return found.unflatten(1, (self.modes, -1))
+            count, remainder = divmod(len(history), self.modes)
+            is_repeated = not remainder and torch.equal(history[count:], history[:-count])
+            parameters: Tensor = self.heads(self.behind(self.past(history[:count] if is_repeated else history)))
+            return parameters.unflatten(1, (self.modes, -1))
 
         return memoize(self, [history], compute)

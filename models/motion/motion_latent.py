@@ -1,4 +1,4 @@
-"""Structured latent space of 4D motion: one static latent generates a segment of a moving body with its timing.
+"""Structured latent space of 4D motion: one static latent generates a motion segment with its timing.
 
     p(z) p(rotations_t | z, beta) p(translation_t | z, beta) p(time_t | z, beta)
     q(z | rotations_{1:T}, translation_{1:T}, time_{1:T})
@@ -107,10 +107,10 @@ class MotionLatent(Method):
         """
         schema = Schema.of(data)
         sizes, length = {name: schema.size(name) for name in (*PARTS, SHAPE)}, schema.length or 100
-        made = {name: sizes[name] for name in PARTS}
+        part_sizes = {name: sizes[name] for name in PARTS}
         networks: dict[str, NetworkSpec] = {"q(z)": WholeEncoder(length, self.widths)}
         for name in PARTS:
-            networks[f"p({name})"] = WholeDecoder(length, self.widths[::-1], sizes=made, name=name)
+            networks[f"p({name})"] = WholeDecoder(length, self.widths[::-1], sizes=part_sizes, name=name)
         generative, inference = self.equations()
         model_arguments: dict[str, Any] = {
             "generative": generative,
@@ -133,10 +133,14 @@ class MotionLatent(Method):
         first = Evidence(kl_weight=self.kl, select="loss")
         others = replace(first, likelihood_weight=0.0, draws={"z": 1})
         phases = [(steps - second, PARTS, first, None), (second, (SURFACE, TIME), others, self.finish_rate)]
-        stages = [Stage(many, self._weighing(tasks, rest), rate) for many, tasks, rest, rate in phases if many]
+        stages = [
+            Stage(n_steps, self._balance(tasks, objective), rate)
+            for n_steps, tasks, objective, rate in phases
+            if n_steps
+        ]
         return Recipe(train, validation, stages)
 
-    def _weighing(self, tasks: tuple[str, ...], others: Evidence) -> GradNorm:
+    def _balance(self, tasks: tuple[str, ...], others: Evidence) -> GradNorm:
         last = 2 * len(self.widths) - 2  # each row of the next layer belongs to one task
         shared = f"generator.{ROTATIONS}.network.trunk.hidden.{last}."
         return GradNorm(tasks, shared, others, asymmetry=0.0, learning_rate=self.pace)
@@ -178,15 +182,15 @@ class MotionLatentModel(DynamicalVAE):
             A function of frames (K,), or None for all, and a slice of coordinates, by default all; see `decode`.
         """
         network = self.generator[ROTATIONS].network
-        given = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
+        parents = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
         # for all parts at once; the features of each part are its means (`MotionLatent.distributions`)
-        features = network.trunk.features([given[parent.name] for parent in network.inputs])
+        features = network.trunk.features([parents[parent.name] for parent in network.inputs])
 
-        def made(frames: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:
-            found: Tensor = network.trunk.made(features, frames, coordinates)
-            return found.unflatten(0, latent.shape[:-1])
+        def decode_frames(frames: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:
+            values: Tensor = network.trunk.made(features, frames, coordinates)
+            return values.unflatten(0, latent.shape[:-1])
 
-        return made
+        return decode_frames
 
     def vertices(self, x: Tensor, shape: Tensor) -> Tensor:
         """Return surfaces (..., N, V, 3), in metres, of frames (..., N, D) on bodies (..., S), with gradients."""
@@ -197,14 +201,14 @@ class MotionLatentModel(DynamicalVAE):
         """Return the squared error of the surface, mean over vertices, in deviations, if the objective has draws."""
         if not draws or not set(PARTS) <= data.keys():
             return {}
-        made = self._moved({name: rollout.parameters(name, rollout.values[name])[0] for name in PARTS})
+        predicted = self._unpack({name: rollout.parameters(name, rollout.values[name])[0] for name in PARTS})
         with torch.no_grad():
-            theirs = self._moved(data)
-        away = self.body.squared_error(data[SHAPE], made, theirs).sum(-1)
-        return {SURFACE: away / (2 * self.method.deviation**2)}
+            target = self._unpack(data)
+        error = self.body.squared_error(data[SHAPE], predicted, target).sum(-1)
+        return {SURFACE: error / (2 * self.method.deviation**2)}
 
-    def _moved(self, parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _unpack(self, parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return rotations (B, N, J, 3, 3) and translation (B, N, 3)."""
-        whole = self.view.inverse(Batch({name: parts[name] for name in PARTS}))[WHOLE]
-        rotations, place, _ = self.timed.unpack(whole)
-        return rotations, place
+        x = self.view.inverse(Batch({name: parts[name] for name in PARTS}))[WHOLE]
+        rotations, translation, _ = self.timed.unpack(x)
+        return rotations, translation

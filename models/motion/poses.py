@@ -32,13 +32,13 @@ def without_gaps(skeleton: Skeleton, poses: Tensor, seen: Tensor) -> Tensor:
         poses: (B, T, D), with any values at missing entries.
         seen: (B, T, D), True where an entry was observed.
     """
-    found, shown = (
+    positions, is_observed = (
         skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (interpolate_missing(poses, seen), seen.any(1))
     )
     for joint in skeleton.order[1:]:
-        above = found[..., skeleton.parents[joint], :]
-        found[..., joint, :] = torch.where(shown[:, None, joint], found[..., joint, :], above)
-    return skeleton.without_root(found).flatten(-2)
+        parent = positions[..., skeleton.parents[joint], :]
+        positions[..., joint, :] = torch.where(is_observed[:, None, joint], positions[..., joint, :], parent)
+    return skeleton.without_root(positions).flatten(-2)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Base of the methods that complete motion from one pose and given paths of some joints.
+"""Base of the methods that complete a motion from one pose and given paths of some joints.
 
     s the first pose, y_{1:T} the given trajectories, r_{1:T} the other joints', x_{1:T} the motion
 
@@ -6,7 +6,7 @@ Poses are positions in metres relative to the first pelvis, so that the body mov
 x with zeros at all other joints. In training, every joint of a window is given with probability `keep`, over all its
 frames. One model therefore accepts any number of trajectories.
 
-Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with what its public implementation does.
+Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) and its public implementation.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class TrajectoryMethod(PoseMethod):
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
         """Return the preset, without headings if left and right of the skeleton are unknown."""
-        found = super().preset(skeleton)
-        return found if skeleton.left and skeleton.right else {**found, "heading": False}
+        preset = super().preset(skeleton)
+        return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
     def extra_inputs(self) -> Paths:
         """Return the view that adds inputs to the motion."""
@@ -90,7 +90,7 @@ class TrajectoryMethod(PoseMethod):
         """
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
-            return self.with_presets(self.presets[HUMAN36M.name])._built(DynamicalVAE, schema.size(WHOLE))
+            return self.with_presets(self.presets[HUMAN36M.name])._build_model(DynamicalVAE, schema.size(WHOLE))
         protocol = Poses.of(schema, self.name).protocol
         if (protocol.root, protocol.observed) != NEEDED:
             raise ValueError(
@@ -105,9 +105,9 @@ class TrajectoryMethod(PoseMethod):
         method = self.with_presets(self.preset(skeleton))
         if method.heading:
             skeleton.heading(torch.zeros(skeleton.joints, 3))  # raises without left and right
-        return method._built(method.kind(), 3 * skeleton.joints, method, skeleton, frames)
+        return method._build_model(method.kind(), 3 * skeleton.joints, method, skeleton, frames)
 
-    def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
+    def _build_model(self, kind: Any, size: int, *arguments: Any) -> Any:
         generative, inference = self.equations()
         names = {*generative.variables, *generative.context, *inference.context}
         poses = {name: size for name in (WHOLE, FIRST, GIVEN, REST) if name in names}
@@ -116,8 +116,8 @@ class TrajectoryMethod(PoseMethod):
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
         """Return one stage that maximises the bound, on windows with random rotations and given paths."""
-        turned = train.with_protocol(replace(train.protocol, rotate=self.rotate))
-        return Recipe(turned.given(self.keep), validation and validation.given(self.keep), [Stage(steps)])
+        windows = train.with_protocol(replace(train.protocol, rotate=self.rotate))
+        return Recipe(windows.given(self.keep), validation and validation.given(self.keep), [Stage(steps)])
 
 
 @dataclass(frozen=True)
@@ -181,10 +181,10 @@ class OtherJoints(Paths):
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         if WHOLE not in data:
             return data
-        seen, x = super().__call__(data, view_inputs), data[WHOLE]
+        inputs, x = super().__call__(data, view_inputs), data[WHOLE]
         if (mask := data.mask()) is not None:
             x = torch.where(mask, x, 0.0)
-        return Batch({REST: torch.where(seen[GIVEN] == 0, x, 0.0) if self.complement else x, **seen})
+        return Batch({REST: torch.where(inputs[GIVEN] == 0, x, 0.0) if self.complement else x, **inputs})
 
 
 class TrajectoryModel(DynamicalVAE):
@@ -203,10 +203,10 @@ class TrajectoryModel(DynamicalVAE):
     """
 
     def __init__(self, method: TrajectoryMethod, skeleton: Skeleton, frames: int | None, **options: Any):
-        seen: list[View] = [Past(FIRST, also=(GIVEN,)), method.extra_inputs()]
+        views: list[View] = [Past(FIRST, also=(GIVEN,)), method.extra_inputs()]
         if method.heading:
-            seen.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
-        super().__init__(view=Views(*seen), **options)
+            views.append(Heading(skeleton, pose=FIRST, turned=(FIRST, GIVEN, REST, WHOLE)))
+        super().__init__(view=Views(*views), **options)
         self.method, self.skeleton, self.frames = method, skeleton, frames
 
     @override
@@ -239,10 +239,8 @@ class TrajectoryModel(DynamicalVAE):
     ) -> dict[str, Tensor]:
         """Continue from a pose, along the given trajectories if there are any.
 
-        (This function is longer than others because of the documentation of its arguments.)
-
-        For a horizon shorter than the motions that the model was fitted to, it predicts the whole motion and returns
-        the beginning, because z has the length of the whole. Joints rest where their trajectories end.
+        If the horizon is shorter than the motions that the model was fitted to, it predicts a motion of their length
+        and returns its beginning, because z has this length. Joints rest where their trajectories end.
 
         Args:
             batch: x (B, 1, D) and, if trajectories are given, y (B, 1 + H, D) or longer; or s (B, D) and y (B, H, D).
@@ -269,7 +267,7 @@ class TrajectoryModel(DynamicalVAE):
         data = self.read(batch)
         if WHOLE in data or FIRST not in data:
             raise ValueError("a motion starts from one pose; give a batch with x (B, 1, D) or s (B, D)")
-        data = self._whole(data, horizon)
+        data = self._extend_paths(data, horizon)
         if self.frames is not None and horizon > self.frames:
             warnings.warn(
                 f"this model was fitted to motions of {self.frames} frames, and may predict {horizon} frames badly; "
@@ -281,43 +279,44 @@ class TrajectoryModel(DynamicalVAE):
         distinct = samples if draw_emission or (temperature and self.latents) else 1
 
         def futures(part: slice, count: int) -> dict[str, Tensor]:
-            some, latents = rows(data, part), {}
+            inputs, latents = rows(data, part), {}
             for name in self.latents:  # the prior is evaluated once for all samples
-                loc, scale = self.generator[name](some, len(some[FIRST]), length)
+                loc, scale = self.generator[name](inputs, len(inputs[FIRST]), length)
                 noise = torch.randn(count, *loc.shape, dtype=loc.dtype, device=loc.device)
                 latents[name] = torch.addcmul(loc, scale, noise, value=temperature).flatten(0, 1)
             program = poutine.condition(self.model, data=latents)
-            out = program(repeat(some, count), length=length, mean_emission=not draw_emission)
-            made = {name: out[name].unflatten(0, (count, -1)) for name in (WHOLE, *self.latents)}
-            made[WHOLE] = made[WHOLE][:, :, :horizon]
-            return self.to_data_space(made, some)
+            out = program(repeat(inputs, count), length=length, mean_emission=not draw_emission)
+            values = {name: out[name].unflatten(0, (count, -1)) for name in (WHOLE, *self.latents)}
+            values[WHOLE] = values[WHOLE][:, :, :horizon]
+            return self.to_data_space(values, inputs)
 
         with self.running():
             out = in_chunks(futures, len(data[FIRST]), distinct, chunk)
         # Equal samples are copies of one, because rows of one matrix product may differ in their last bits.
         return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
 
-    def _whole(self, data: Batch, horizon: int) -> Batch:
+    def _extend_paths(self, data: Batch, horizon: int) -> Batch:
         """Return the data with trajectories over all frames that the networks predict for a horizon.
 
         Raises:
             ValueError: if trajectories end before the horizon or do not have the size of the poses.
         """
         first = data[FIRST]
-        given = data.get(GIVEN, first.new_zeros(len(first), horizon, first.shape[-1]))
-        if given.dim() != 3 or (len(given), given.shape[-1]) != first.shape:
+        trajectories = data.get(GIVEN, first.new_zeros(len(first), horizon, first.shape[-1]))
+        if trajectories.dim() != 3 or (len(trajectories), trajectories.shape[-1]) != first.shape:
             raise ValueError(
-                f"poses have shape {tuple(first.shape)}; expected trajectories (B, frames, D), got {tuple(given.shape)}"
+                f"poses have shape {tuple(first.shape)}; expected trajectories (B, frames, D), got "
+                f"{tuple(trajectories.shape)}"
             )
-        if given.shape[1] < horizon:
-            raise ValueError(f"the trajectories have {given.shape[1]} frames, but the horizon is {horizon}")
-        if not given.isfinite().all():
+        if trajectories.shape[1] < horizon:
+            raise ValueError(f"the trajectories have {trajectories.shape[1]} frames, but the horizon is {horizon}")
+        if not trajectories.isfinite().all():
             raise ValueError(
                 "trajectories must be finite, and 0 at joints that are not given; `complete` accepts paths with gaps"
             )
-        made = max(horizon, self.frames or horizon)
-        rest = given[:, -1:].expand(-1, max(made - given.shape[1], 0), -1)
-        return data | {GIVEN: torch.cat([given[:, :made], rest], 1)}
+        length = max(horizon, self.frames or horizon)
+        tail = trajectories[:, -1:].expand(-1, max(length - trajectories.shape[1], 0), -1)
+        return data | {GIVEN: torch.cat([trajectories[:, :length], tail], 1)}
 
     def complete(
         self,
@@ -333,11 +332,9 @@ class TrajectoryModel(DynamicalVAE):
     ) -> Completion:
         """Return motions that start at a pose and follow paths of some joints.
 
-        (This function is longer than others because of the arguments that it refuses.)
-
-        The networks read a path frame by frame. Missing frames are interpolated linearly, starting from the joint's
-        position in the first pose; after the last known frame the joint rests. `forecast` describes motions of other
-        lengths than those that the model was fitted to.
+        Missing frames of a path are interpolated linearly, starting from the joint's position in the first pose. After
+        the last known frame the joint rests. `forecast` describes motions of other lengths than the model was fitted
+        to.
 
         Args:
             initial_pose: positions (J, 3) of all joints, in metres, in world coordinates.
@@ -357,29 +354,31 @@ class TrajectoryModel(DynamicalVAE):
             ValueError: if a joint is unknown, a path has another length or no known frame, positions are not in metres,
                 or `exact` is given without a path.
         """
-        pose = _numbers(initial_pose, "the initial pose")
+        pose = _to_numbers(initial_pose, "the initial pose")
         if pose.shape != (self.skeleton.joints, 3):
             raise ValueError(
                 f"the initial pose has shape {tuple(pose.shape)}, expected ({self.skeleton.joints}, 3): "
                 f"{', '.join(self.skeleton.names)}"
             )
-        if lacking := [name for name, place in zip(self.skeleton.names, pose, strict=True) if place.isnan().any()]:
+        if missing := [
+            name for name, position in zip(self.skeleton.names, pose, strict=True) if position.isnan().any()
+        ]:
             raise ValueError(
-                f"the initial pose has no positions of {', '.join(lacking)}, but must be complete; choose another "
+                f"the initial pose has no positions of {', '.join(missing)}, but must be complete; choose another "
                 "window, or fill the gaps first (`dvae impute RUN --filled FILE`)"
             )
-        if complaint := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
-            raise ValueError(complaint.replace("clip initial/pose", "the initial pose"))
-        given = trajectories or {}
-        paths = {self.skeleton.find(joint): self._path(joint, path, pose) for joint, path in given.items()}
-        if len(paths) < len(given):
-            raise ValueError(f"the trajectories name a joint twice: {', '.join(given)}")
-        lengths = {joint: len(path) for joint, path in zip(given, paths.values(), strict=True)}
+        if problem := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
+            raise ValueError(problem.replace("clip initial/pose", "the initial pose"))
+        named_paths = trajectories or {}
+        paths = {self.skeleton.find(joint): self._check_path(joint, path, pose) for joint, path in named_paths.items()}
+        if len(paths) < len(named_paths):
+            raise ValueError(f"the trajectories name a joint twice: {', '.join(named_paths)}")
+        lengths = {joint: len(path) for joint, path in zip(named_paths, paths.values(), strict=True)}
         if frames is not None:
             lengths["frames"] = frames
         if len(set(lengths.values())) != 1 or min(lengths.values()) < 1:
-            got = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
-            raise ValueError(f"expected paths of one length, or frames= without any; got {got}")
+            lengths_text = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
+            raise ValueError(f"expected paths of one length, or frames= without any; got {lengths_text}")
         if exact and not paths:
             raise ValueError("exact=True makes motions follow paths, but got no path; give trajectories")
         if exact and not self.latents:
@@ -389,62 +388,68 @@ class TrajectoryModel(DynamicalVAE):
             )
         length = next(iter(lengths.values()))
         world = pose[self.skeleton.root]
-        told, known = pose.new_zeros(2, length, self.skeleton.joints, 3)
+        targets, known_mask = pose.new_zeros(2, length, self.skeleton.joints, 3)
         for joint, path in paths.items():
-            seen = path.isfinite().all(-1)
-            told[:, joint] = _interpolated(path, seen, pose[joint]) - world
-            known[:, joint] = seen[:, None].double()
-            if not told[:, joint].any():
+            is_known = path.isfinite().all(-1)
+            targets[:, joint] = _interpolate(path, is_known, pose[joint]) - world
+            known_mask[:, joint] = is_known[:, None].double()
+            if not targets[:, joint].any():
                 warnings.warn(
-                    f"{self.skeleton.names[joint]} rests at the root of the first pose, which networks read as a joint "
-                    "without a path; exact=True keeps it there",
+                    f"the path of {self.skeleton.names[joint]} stays at the root of the first pose, and networks "
+                    "read it as no path; exact=True keeps the joint there",
                     stacklevel=2,
                 )
         first = (pose - world).flatten()[None]
         parameter = next(self.parameters())
-        data = {FIRST: first.to(parameter), GIVEN: told.flatten(1)[None].to(parameter)}
+        data = {FIRST: first.to(parameter), GIVEN: targets.flatten(1)[None].to(parameter)}
         out = self.forecast(data, length, samples, temperature=temperature)
         x, corrections = out[WHOLE][:, 0], None
         if exact:
-            latents, known = out[self.latents[0]][:, 0], known.flatten(1).to(parameter)
-            x, moved = self._followed(data, latents, known, steps=steps, progress=progress)
-            corrections = moved[:, :length].cpu().double().unflatten(-1, (-1, 3)).norm(dim=-1).numpy()
+            latents, known_mask = out[self.latents[0]][:, 0], known_mask.flatten(1).to(parameter)
+            x, shifts = self._follow(data, latents, known_mask, steps=steps, progress=progress)
+            corrections = shifts[:, :length].cpu().double().unflatten(-1, (-1, 3)).norm(dim=-1).numpy()
         motion = x[:, :length].cpu().double().unflatten(-1, (-1, 3)) + world
         names = self.skeleton.names
         if exact:
-            self._warn_of_stretching(motion, pose)
+            self._warn_about_bones(motion, pose)
         errors = {names[joint]: (motion[:, :, joint] - path).norm(dim=-1).numpy() for joint, path in paths.items()}
         return Completion(self.skeleton, motion.numpy(), errors, corrections)
 
-    def _path(self, joint: str, given: Any, pose: Tensor) -> Tensor:
-        """Return a given path, after checking it."""
-        path = _numbers(given, f"the path of {joint}")
+    def _check_path(self, joint: str, values: Any, pose: Tensor) -> Tensor:
+        """Return a path as float64, with NaN at all coordinates that are not finite.
+
+        Raises:
+            ValueError: if the path has another shape, no known frame, or moves implausibly fast.
+        """
+        path = _to_numbers(values, f"the path of {joint}")
         path[~path.isfinite()] = torch.nan
         if path.dim() != 2 or path.shape[-1] != 3:
             raise ValueError(f"the path of {joint} has shape {tuple(path.shape)}, expected (frames, 3) in metres")
-        seen = path.isfinite().all(-1)
-        if not seen.any():
+        is_known = path.isfinite().all(-1)
+        if not is_known.any():
             raise ValueError(f"the path of {joint} has no known frame; leave it out")
-        frames = torch.cat([torch.tensor([-1]), seen.nonzero()[:, 0]])
-        places = torch.cat([pose[None, self.skeleton.find(joint)], path[seen]])
-        leaps = places.diff(dim=0).norm(dim=-1) / frames.diff()
+        frames = torch.cat([torch.tensor([-1]), is_known.nonzero()[:, 0]])
+        positions = torch.cat([pose[None, self.skeleton.find(joint)], path[is_known]])
+        leaps = positions.diff(dim=0).norm(dim=-1) / frames.diff()
         worst = int(leaps.argmax())
         if leaps[worst] > LEAP:
-            what = (
+            message = (
                 f"the path of {joint} moves by {leaps[worst]:.4g} m a frame before its frame {frames[worst + 1]} "
                 f"(since {'the pose' if worst == 0 else f'frame {frames[worst]}'})"
             )
             if leaps[worst] > FAR:
-                raise ValueError(f"{what}; paths are in metres, in the same world as the pose")
-            warnings.warn(what, stacklevel=3)
+                raise ValueError(f"{message}; paths are in metres, in the same world as the pose")
+            warnings.warn(message, stacklevel=3)
         return path
 
-    def _followed(
-        self, batch: Mapping[str, Tensor], latents: Tensor, known: Tensor, **options: Any
+    def _follow(
+        self, batch: Mapping[str, Tensor], latents: Tensor, known_mask: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor]:
         """Return motions (S, T, D) that are on the given paths at known frames, and their corrections."""
-        data = self._whole(self.read(batch), len(known))
-        known = torch.cat([known, known.new_zeros(data[GIVEN].shape[1] - len(known), known.shape[1])])
+        data = self._extend_paths(self.read(batch), len(known_mask))
+        known_mask = torch.cat(
+            [known_mask, known_mask.new_zeros(data[GIVEN].shape[1] - len(known_mask), known_mask.shape[1])]
+        )
         bones = self.skeleton.limbs(data[FIRST][0]).norm(dim=-1)
 
         def means(z: Tensor) -> Tensor:
@@ -455,11 +460,13 @@ class TrajectoryModel(DynamicalVAE):
 
         with self.running():
             with torch.no_grad():
-                scale = self.generator[self.latents[0]](data, 1, len(known))[1]
-            x, corrections = follow_paths(means, latents, scale, data[GIVEN][0], known, self.skeleton, bones, **options)
+                scale = self.generator[self.latents[0]](data, 1, len(known_mask))[1]
+            x, corrections = follow_paths(
+                means, latents, scale, data[GIVEN][0], known_mask, self.skeleton, bones, **options
+            )
         return self.to_data_space({WHOLE: x}, data)[WHOLE], corrections
 
-    def _warn_of_stretching(self, motion: Tensor, pose: Tensor) -> None:
+    def _warn_about_bones(self, motion: Tensor, pose: Tensor) -> None:
         """Warn if more than 5 % of the bones are more than 10 % too long or too short."""
         lengths, true = (self.skeleton.bone_lengths(positions.numpy()) for positions in (motion, pose))
         share = np.mean(np.abs(lengths - true) < 0.1 * true)
@@ -495,26 +502,26 @@ class Completion:
         samples, frames = self.positions.shape[:2]
         lines = [f"{samples} motions of {frames} frames"]
         for joint, errors in self.errors.items():
-            missed = errors[np.isfinite(errors)]
-            near = f"within 1 cm in {np.mean(missed < 0.01):.0%} of frames"
-            lines.append(f"  {joint}: off its path by {missed.mean():.3f} m (mean), {near}")
+            known_errors = errors[np.isfinite(errors)]
+            share = f"within 1 cm in {np.mean(known_errors < 0.01):.0%} of frames"
+            lines.append(f"  {joint}: off its path by {known_errors.mean():.3f} m (mean), {share}")
         if self.corrections is not None:
-            moved = f"{self.corrections.mean():.3f} m (mean), {self.corrections.max():.3f} m at most"
-            lines.append(f"  beyond what the model makes: joints corrected by {moved}")
+            distances = f"{self.corrections.mean():.3f} m (mean), {self.corrections.max():.3f} m at most"
+            lines.append(f"  beyond what the model makes: joints corrected by {distances}")
         return "\n".join(lines)
 
 
-def _numbers(given: Any, what: str) -> Tensor:
+def _to_numbers(values: Any, name: str) -> Tensor:
     """Return a copy of an array, in double precision."""
     try:
-        return torch.tensor(np.array(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=np.float64))
+        return torch.tensor(np.array(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} is not an array of numbers: {error}") from error
+        raise ValueError(f"{name} is not an array of numbers: {error}") from error
 
 
-def _interpolated(path: Tensor, seen: Tensor, start: Tensor) -> Tensor:
+def _interpolate(path: Tensor, is_known: Tensor, start: Tensor) -> Tensor:
     """Return the path (T, 3), interpolated linearly between known frames, from `start` one frame before it."""
-    times = np.concatenate([[-1], seen.nonzero()[:, 0].numpy()])
-    places = torch.cat([start[None], path[seen]]).numpy()
-    now = np.arange(len(path))
-    return torch.from_numpy(np.stack([np.interp(now, times, places[:, axis]) for axis in range(3)], axis=-1))
+    times = np.concatenate([[-1], is_known.nonzero()[:, 0].numpy()])
+    positions = torch.cat([start[None], path[is_known]]).numpy()
+    frames = np.arange(len(path))
+    return torch.from_numpy(np.stack([np.interp(frames, times, positions[:, axis]) for axis in range(3)], axis=-1))

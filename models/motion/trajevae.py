@@ -1,4 +1,4 @@
-"""TrajeVAE: motion from one pose and any number of joint trajectories, all steps at once, by cosine coefficients.
+"""TrajeVAE: complete a motion from one pose and any number of joint trajectories, by cosine coefficients.
 
     p(z_k | y_{1:T}, s) p(x_t | z_{1:T}, s)        q(z_k | r_{1:T}, s)
 
@@ -12,7 +12,7 @@ Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its pu
 share the perceptrons of poses and two of three transformers; the decoder shares the perceptron of s. Two choices are
 ours. Scales of z use softplus, whereas the public implementation has log-variances. Without the learned prior, on which
 the paper gives little detail, the decoder reads z and the trajectories, the latter in time without a transform. On
-other data than the paper's, the defaults are small networks, few coefficients, a smaller weight of the KL and windows
+other data than the paper's, the defaults are small networks, few coefficients, a smaller weight of the KL, and windows
 rotated to one heading (docs/results/trajevae.md).
 """
 
@@ -112,10 +112,10 @@ class TrajeVAE(LatentTrajectoryMethod):
         shared = ("width", "feedforward", "layers", "dropout", "cosine", "components")
         shape: dict[str, Any] = {"heads": self.heads_count, **{name: getattr(self, name) for name in shared}}
         encoder = CosineEncoder(**shape)
-        found: dict[str, NetworkSpec] = {"q(z)": encoder}
+        networks: dict[str, NetworkSpec] = {"q(z)": encoder}
         if self.learned_prior:
-            found["p(z)"] = encoder
-        return {**found, "p(x)": CosineDecoder(hidden=2 * shape["width"], **shape)}
+            networks["p(z)"] = encoder
+        return {**networks, "p(x)": CosineDecoder(hidden=2 * shape["width"], **shape)}
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
@@ -125,8 +125,8 @@ class TrajeVAE(LatentTrajectoryMethod):
         return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
 
     @override
-    def _built(self, kind: Any, size: int, *arguments: Any) -> Any:
-        model = super()._built(kind, size, *arguments)
+    def _build_model(self, kind: Any, size: int, *arguments: Any) -> Any:
+        model = super()._build_model(kind, size, *arguments)
         guide, decoder = model.encoder["z"].network, model.generator["x"].network
         share_modules([guide, decoder], "static")
         if self.learned_prior:

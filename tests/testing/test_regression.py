@@ -88,7 +88,7 @@ def test_the_note_tells_the_fall_that_is_found_nine_times_in_ten(tmp_path, exact
     model, x, _ = exact
     notes, particles, n = [], 100, 1000
     regression(tmp_path, notes).check(model.model, model.guide, x, particles=particles, alpha=0.05)
-    fall = float(re.search(r"a loss of (\S+) would be found with probability 0.9", notes[0])[1])
+    fall = float(re.search(r"a loss of (\S+) would be detected with probability 0.9", notes[0])[1])
     scale = Record.loads((tmp_path / "test_it.json").read_text()).mean_error * math.sqrt(particles)
     old, new = np.random.default_rng(0).normal(scale=scale, size=(2, n, particles, 1))
     found = [Change(Record.of(a, {}), Record.of(b - fall, {}), 0.05).worse for a, b in zip(old, new, strict=True)]
@@ -191,7 +191,7 @@ def test_a_fall_is_told_with_the_worst_sequences(tmp_path, exact):
     [
         (lambda batch: {n: v[:3] for n, v in batch.items()}, r"the shape of lengths was \(4,\), now \(3,\)"),
         (lambda batch: {**batch, "x": batch["x"] + 1e-3 * torch.eye(4)[2, :, None, None]}, "x differs in sequence 2;"),
-        (lambda batch: {"x": batch["x"]}, "it holds lengths, x, now there are x"),
+        (lambda batch: {"x": batch["x"]}, "it has lengths, x, the test has x"),
     ],
 )
 def test_other_data_are_refused(tmp_path, exact, change, message):

@@ -1,4 +1,4 @@
-"""One HTML page in one file, with text, tables, pictures and trusted scripts.
+"""A self-contained HTML page with text, tables, pictures and trusted scripts.
 
 All content is escaped, unless it is `Markup`, which only this package and players of applications create. As a second
 defence, a content security policy lets the browser load nothing and run only the scripts whose hashes the page lists.
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 DPI = 160
-"""Resolution of pictures, at which their text has the size of the page's text."""
+"""Resolution of pictures; their text then has the size of the page's text."""
 
 COLOURS = 64
 """Number of colours of a picture."""
@@ -59,7 +59,7 @@ def document(title: str, sections: Sequence[Section], scripts: Sequence[str] = (
         scripts: scripts of the page, which must not come from a run.
     """
     hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
-    allowed = " ".join(f"'sha256-{each}'" for each in hashes) or "'none'"
+    allowed = " ".join(f"'sha256-{digest}'" for digest in hashes) or "'none'"
     links = Markup(" ").join(
         Markup('<a href="#part{}">{}</a>').format(n, section.title) for n, section in enumerate(sections)
     )
@@ -95,7 +95,7 @@ _PAGE = Markup(
 
 
 def _section(number: int, section: Section) -> Markup:
-    about = paragraph(section.about) if section.about else ""
+    explanation = paragraph(section.about) if section.about else ""
     owners: dict[str, list[str]] = {}
     for name, cell in section.cells.items():
         owners.setdefault(cell, []).append(name)
@@ -104,8 +104,8 @@ def _section(number: int, section: Section) -> Markup:
         Markup("<article>{}{}</article>").format(Markup("<h3>{}</h3>").format(", ".join(names)) if headed else "", cell)
         for cell, names in owners.items()
     )
-    beside = Markup('<div class="runs">{}</div>').format(cells) if cells else ""
-    inner = Markup("<h2>{}</h2>{}{}{}").format(section.title, about, section.before, beside)
+    columns = Markup('<div class="runs">{}</div>').format(cells) if cells else ""
+    inner = Markup("<h2>{}</h2>{}{}{}").format(section.title, explanation, section.before, columns)
     return Markup('<section id="part{}">{}</section>').format(number, inner)
 
 
@@ -115,7 +115,7 @@ def paragraph(text: str) -> Markup:
 
 
 def missing_part(text: str) -> Markup:
-    """Return a paragraph about a missing result."""
+    """Return a paragraph that reports a missing result."""
     return Markup('<p class="lacking">{}</p>').format(text)
 
 
@@ -162,9 +162,9 @@ def picture(figure: Figure, about: str) -> Markup:
     """
     from PIL import Image
 
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=DPI)
-    with Image.open(drawn) as image:
+    original, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(original, format="png", dpi=DPI)
+    with Image.open(original) as image:
         image.convert("RGB").quantize(COLOURS).save(small, format="png", optimize=True)
     width, height = (96 * figure.get_size_inches()).round().astype(int).tolist()
     return Markup(

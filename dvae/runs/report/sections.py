@@ -1,6 +1,6 @@
 """Sections of a report for any sequences, from the files of run directories and from held-out windows.
 
-For a missing or damaged result, the section shows a sentence with the command that computes it.
+If a result is missing or damaged, the section shows a message, with the command that computes it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ LARGEST = 2**24
 """Maximum size in bytes of a record that is shown."""
 
 PANEL = 3.0, 2.2
-"""Width and height of a small picture in inches: one fits the width of a phone, two fit half a page."""
+"""Width and height of a small picture in inches; one fits the width of a phone, and two fit half a page."""
 
 MOST = 24
 """Maximum number of pictures of one kind."""
@@ -119,12 +119,12 @@ class SelectedWindows:
 def overview(runs: Runs) -> Section:
     """Return the section with facts and scores of the runs, a column for each run."""
     columns = {name: {**_facts(run), **_scores(run)} for name, run in runs.items()}
-    shown = Table()
+    table = Table()
     for name in ("", *columns):
-        shown.add_column(name)
+        table.add_column(name)
     for fact in dict.fromkeys(fact for facts in columns.values() for fact in facts):
-        shown.add_row(fact, *(facts.get(fact, "–") for facts in columns.values()))
-    return Section("Runs" if len(runs) > 1 else "Run", before=tabulated(shown))
+        table.add_row(fact, *(facts.get(fact, "–") for facts in columns.values()))
+    return Section("Runs" if len(runs) > 1 else "Run", before=tabulated(table))
 
 
 def equations(runs: Runs) -> Section:
@@ -140,8 +140,8 @@ def equations(runs: Runs) -> Section:
             options.add_column(column)
         for name, value in list(flat(run.method.config()))[:200]:
             options.add_row(name, str(value)[:200])
-        rest = Markup("<details><summary>options</summary>{}</details>").format(tabulated(options))
-        return Markup().join([*lines, paragraph(run.method.source), rest])
+        details = Markup("<details><summary>options</summary>{}</details>").format(tabulated(options))
+        return Markup().join([*lines, paragraph(run.method.source), details])
 
     return Section("Equations", cells(runs, cell))
 
@@ -151,22 +151,22 @@ def graphs(runs: Runs) -> Section:
 
     def cell(run: Loaded) -> Markup:
         model = run.model
-        generative = _drawn(model.generative.draw(STEPS, observed=model.observed), "model")
+        generative = _graph_picture(model.generative.draw(STEPS, observed=model.observed), "model")
         if not model.inference.factors:
-            why = "All latents are summed out" if model.summed else "Nothing is latent"
-            return generative + paragraph(f"{why}: there is no guide, and the bound is the log evidence.")
-        found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed)
+            reason = "All latents are summed out" if model.summed else "Nothing is latent"
+            return generative + paragraph(f"{reason}: there is no guide, and the bound is the log evidence.")
+        findings = audit(model.generative, model.inference, observed=model.observed, summed=model.summed)
         return (
-            side_by_side(generative, _drawn(found.draw(STEPS), "guide"))
-            + paragraph(found.verdict)
-            + tabulated(found.table())
+            side_by_side(generative, _graph_picture(findings.draw(STEPS), "guide"))
+            + paragraph(findings.verdict)
+            + tabulated(findings.table())
         )
 
-    about = (
+    explanation = (
         "Latents are open, data shaded. Dashed red: dependencies of the exact posterior that the guide ignores. "
         "Dotted: dependencies that are not needed."
     )
-    return Section("Graph and audit", cells(runs, cell), about)
+    return Section("Graph and audit", cells(runs, cell), explanation)
 
 
 def curves(runs: Runs) -> Section:
@@ -178,26 +178,30 @@ def curves(runs: Runs) -> Section:
             return missing_part("The run has no log.jsonl, which training writes; copy the whole run directory.")
         names = {name for row in fit.history for name in row}
         order = ("bound", "loss", "log_likelihood/", "kl/", "energy/")
-        kept = [name for start in order for name in sorted(names) if name.startswith(start)]
-        more = paragraph(f"And {len(kept) - MOST} more terms.") if len(kept) > MOST else ""
-        return side_by_side(*(_curve(fit, name) for name in kept[:MOST])) + more
+        selected = [name for start in order for name in sorted(names) if name.startswith(start)]
+        remainder = paragraph(f"And {len(selected) - MOST} more terms.") if len(selected) > MOST else ""
+        return side_by_side(*(_curve(fit, name) for name in selected[:MOST])) + remainder
 
-    about = "Grey: training batches. Blue: validation. Dotted: the step whose weights were kept."
-    return Section("Learning curves", cells(runs, cell), about)
+    explanation = "Grey: training batches. Blue: validation. Dotted: step of the best weights."
+    return Section("Learning curves", cells(runs, cell), explanation)
 
 
 def evaluated(runs: Runs) -> Section:
     """Return the section with scores on test windows, next to the reference rows."""
 
     def cell(run: Loaded) -> Markup:
-        if (found := _evaluation(run)) is None:
+        if (evaluation := _evaluation(run)) is None:
             return _missing(run, "evaluation.json", "scores", "evaluate")
-        again = Markup("The run has changed since it was scored; score it again with {}.").format(
+        notice = Markup("The run has changed since it was scored; score it again with {}.").format(
             _command(run, "evaluate")
         )
-        drawn = any("PIT" in row.histograms for row in found.rows.values())
-        calibrated = picture(found.plot_calibration(), "calibration of forecasts") if drawn else ""
-        return tabulated(found.table()) + calibrated + (missing_part(again) if _row(run, found) is None else "")
+        has_pit = any("PIT" in row.histograms for row in evaluation.rows.values())
+        calibration_plot = picture(evaluation.plot_calibration(), "calibration of forecasts") if has_pit else ""
+        return (
+            tabulated(evaluation.table())
+            + calibration_plot
+            + (missing_part(notice) if _row(run, evaluation) is None else "")
+        )
 
     return Section(
         "Scores",
@@ -214,8 +218,8 @@ def calibration(runs: Runs) -> Section:
             return _missing(run, "calibration.json", "calibration and no predictive checks", "check calibration")
         document, parts = json.loads(text), []
         if "calibration" in document:
-            found = Calibration.of(document["calibration"])
-            parts += [picture(found.plot(), found.verdict), tabulated(found.table())]
+            result = Calibration.of(document["calibration"])
+            parts += [picture(result.plot(), result.verdict), tabulated(result.table())]
         else:
             parts += [
                 paragraph("The guide was not calibrated, because the model has no latents or conditions on data.")
@@ -225,8 +229,10 @@ def calibration(runs: Runs) -> Section:
             parts += [picture(checks.plot(), "statistics of real and of replicated windows"), tabulated(checks.table())]
         return Markup().join(parts)
 
-    about = "Does the guide match the posterior on data simulated from the model, and do replicates match real windows?"
-    return Section("Calibration and predictive checks", cells(runs, cell), about)
+    explanation = (
+        "Does the guide match the posterior on data simulated from the model, and do replicates match real windows?"
+    )
+    return Section("Calibration and predictive checks", cells(runs, cell), explanation)
 
 
 def bracketed(runs: Runs) -> Section:
@@ -235,11 +241,13 @@ def bracketed(runs: Runs) -> Section:
     def cell(run: Loaded) -> Markup:
         if (text := _record(run, "gap.json")) is None:
             return _missing(run, "gap.json", "bounds from both sides", "check gap")
-        found = Bracket.from_json(text)
-        return picture(found.plot(), "bounds of the evidence from both sides") + tabulated(found.table())
+        bracket = Bracket.from_json(text)
+        return picture(bracket.plot(), "bounds of the evidence from both sides") + tabulated(bracket.table())
 
-    about = "Distance of the evidence from the ELBO that was trained, and the part that a better guide would recover."
-    return Section("Evidence from both sides", cells(runs, cell), about)
+    explanation = (
+        "Distance of the evidence from the ELBO that was trained, and the part that a better guide would recover."
+    )
+    return Section("Evidence from both sides", cells(runs, cell), explanation)
 
 
 def reference_posteriors(runs: Runs) -> Section:
@@ -252,12 +260,12 @@ def reference_posteriors(runs: Runs) -> Section:
         kinds: dict[str, type[SteinDiscrepancy | ReferencePosterior]]
         kinds = {"stein": SteinDiscrepancy, "posterior": ReferencePosterior}
         for name in [name for name in kinds if name in document]:
-            found = kinds[name].of(document[name])
-            parts += picture(found.plot(), found.verdict) + tabulated(found.table())
+            result = kinds[name].of(document[name])
+            parts += picture(result.plot(), result.verdict) + tabulated(result.table())
         return parts
 
-    about = "The guide compared with the posterior of the latents of some test windows."
-    return Section("Guide and posterior", cells(runs, cell), about)
+    explanation = "The guide compared with the posterior of the latents of some test windows."
+    return Section("Guide and posterior", cells(runs, cell), explanation)
 
 
 def prediction_bands(runs: Runs) -> Section:
@@ -266,18 +274,20 @@ def prediction_bands(runs: Runs) -> Section:
     def cell(run: Loaded) -> Markup:
         if (text := _record(run, "coverage.json")) is None:
             return _missing(run, "coverage.json", "prediction bands around forecasts", "check coverage")
-        found, held = PredictionBands.from_json(text), _record(run, "coverage-test.json")
-        shown = picture(found.plot(), "factors over the horizon") + tabulated(found.table())
-        return shown + (tabulated(Evaluation.from_json(held).table()) if held is not None else "")
+        bands, test_record = PredictionBands.from_json(text), _record(run, "coverage-test.json")
+        content = picture(bands.plot(), "factors over the horizon") + tabulated(bands.table())
+        return content + (tabulated(Evaluation.from_json(test_record).table()) if test_record is not None else "")
 
-    about = "Factors by which forecasts are widened to reach the given coverage, and the coverage on other windows."
-    return Section("Prediction bands around forecasts", cells(runs, cell), about)
+    explanation = (
+        "Factors by which forecasts are widened to reach the given coverage, and the coverage on other windows."
+    )
+    return Section("Prediction bands around forecasts", cells(runs, cell), explanation)
 
 
 def edges(found: Ablation) -> Section:
     """Return the section with the cost of every edge of a model and its guide."""
-    shown = picture(found.plot(), "model and guide of one step, edges as thick as their cost")
-    return Section("Cost of every edge", before=shown + tabulated(found.table()))
+    plot = picture(found.plot(), "model and guide of one step, edges as thick as their cost")
+    return Section("Cost of every edge", before=plot + tabulated(found.table()))
 
 
 # ------------------------------------------------------------------------------------------ sections that need windows
@@ -287,36 +297,38 @@ def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int 
     """Return the section with bounds and their errors, the KL of every latent over time, and Pareto k-hat."""
     likely = {name: run.model for name, run in runs.items() if run.model.likelihood}
     settings: dict[str, Any] = {"particles": particles, "contrasts": 0, "samples": 0, "seed": seed}
-    about = f"Of {len(windows.keys)} test windows, evenly spread, with {particles} particles each."
+    explanation = f"Of {len(windows.keys)} test windows, evenly spread, with {particles} particles each."
     title = "Bounds, KL over time, k-hat"
     try:
-        found = compare(likely, windows, **settings) if likely else None
+        comparison = compare(likely, windows, **settings) if likely else None
     except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
         return Section(title, before=missing_part(f"The bounds cannot be computed: {error_message(error)[:500]}"))
 
     def cell(name: str) -> Markup:
-        if found is None or name not in found.rows:
+        if comparison is None or name not in comparison.rows:
             return missing_part(
                 "The model has no likelihood: its data are functions of its latents, so there is no bound and no KL."
             )
-        return _evidence(found, name)
+        return _evidence(comparison, name)
 
-    return Section(title, {name: cell(name) for name in runs}, about, tabulated(found.table()) if found else "")
+    return Section(
+        title, {name: cell(name) for name in runs}, explanation, tabulated(comparison.table()) if comparison else ""
+    )
 
 
 def posteriors(runs: Runs, windows: HeldOutWindows, seed: int = 0) -> Section:
     """Return the section with densities of the latents under the guide, and in free-running draws of the model."""
-    about = (
+    explanation = (
         "Grey: the prior, in free-running draws of the model. Line: the posterior, drawn from the guide for "
-        f"{len(windows.keys)} test windows. Both are over all windows and steps. Shown are the coordinates of each "
-        "latent whose posterior mean varies most over windows and steps."
+        f"{len(windows.keys)} test windows. Both are over all windows and steps, for the coordinates of each latent "
+        "whose posterior mean varies most."
     )
-    return Section("Posterior against prior", cells(runs, partial(_latents, windows=windows, seed=seed)), about)
+    return Section("Posterior against prior", cells(runs, partial(_latents, windows=windows, seed=seed)), explanation)
 
 
-def _evidence(found: Comparison, name: str) -> Markup:
+def _evidence(comparison: Comparison, name: str) -> Markup:
     """Return KL over time and k-hat of one model."""
-    row, parts = found.rows[name], []
+    row, parts = comparison.rows[name], []
     for latent, steps in list(row.kl_steps.items())[:MOST]:
         figure, axes = _panel(f"KL of {latent}", "step", "nats a step")
         axes.plot(range(1, steps.shape[-1] + 1), steps.mean(0), linewidth=1.3)
@@ -350,8 +362,8 @@ def _latents(run: Loaded, windows: HeldOutWindows, seed: int) -> Markup:
     parts = []
     for latent in model.latents:
         posterior = inferred[latent].unflatten(0, (DRAWS, size)).double().cpu()
-        told = posterior.mean(0).flatten(0, -2).var(0, correction=0)
-        for coordinate in told.argsort(descending=True, stable=True)[:COORDINATES].tolist():
+        variances = posterior.mean(0).flatten(0, -2).var(0, correction=0)
+        for coordinate in variances.argsort(descending=True, stable=True)[:COORDINATES].tolist():
             values = (free[latent].double().cpu()[..., coordinate], posterior[..., coordinate])
             parts.append(_densities(f"{latent}[{coordinate}]", *values))
     return side_by_side(*parts)
@@ -380,21 +392,23 @@ def cells(runs: Runs, make: Callable[[Loaded], Markup], doing: str = "") -> dict
         make: function from a run to its content.
         doing: text of a progress bar; "" for no bar.
     """
-    found = {}
+    contents = {}
     with progress_bar(bool(doing)) as bar:
         for name, run in bar.track(runs.items(), description=doing):
             try:
-                found[name] = make(run)
+                contents[name] = make(run)
             except Exception as error:  # files of an untrusted run may raise any error
-                found[name] = missing_part(
+                contents[name] = missing_part(
                     f"This cannot be shown: {error_message(error)[:500] or type(error).__name__}"
                 )
-    return found
+    return contents
 
 
-def _missing(run: Loaded, file: str, what: str, name: str) -> Markup:
+def _missing(run: Loaded, file: str, results: str, name: str) -> Markup:
     return missing_part(
-        Markup("The run has no {}, so there are no {}. Compute them with {}.").format(file, what, _command(run, name))
+        Markup("The run has no {}, so there are no {}. Compute them with {}.").format(
+            file, results, _command(run, name)
+        )
     )
 
 
@@ -425,8 +439,8 @@ def _fit(run: Loaded) -> Fit:
     """Return the stored result of the training."""
     state, history = Run(run.path).state, JSONLines(run.path / "log.jsonl").read()
     per = run.model.per if isinstance(run.model, Program) else Fit.per
-    told = state["step"], state["best_step"], state["best_bound"], state["status"]
-    return Fit(history, *told, run.path, per, last_value=state.get("last_value"))
+    record = state["step"], state["best_step"], state["best_bound"], state["status"]
+    return Fit(history, *record, run.path, per, last_value=state.get("last_value"))
 
 
 def _facts(run: Loaded) -> dict[str, str]:
@@ -450,21 +464,21 @@ def _facts(run: Loaded) -> dict[str, str]:
 def _scores(run: Loaded) -> dict[str, str]:
     """Return the scores of a run in its own evaluation, in words."""
     try:
-        found = _evaluation(run)
-        name = None if found is None else _row(run, found)
-        if found is None or name is None:
+        evaluation = _evaluation(run)
+        name = None if evaluation is None else _row(run, evaluation)
+        if evaluation is None or name is None:
             return {}
         values = {}
-        for name_of, score in found[name].items():
-            metric = found.metrics[name_of]
+        for metric_name, score in evaluation[name].items():
+            metric = evaluation.metrics[metric_name]
             unit = f" ({metric.unit})" if metric.unit else ""
-            values[name_of + ARROWS[metric.better] + unit] = str(score)
+            values[metric_name + ARROWS[metric.better] + unit] = str(score)
     except Exception:  # the section of scores reports the error
         return {}
-    return {"forecasts scored, K": str(found.rows[name].samples), **values}
+    return {"forecasts scored, K": str(evaluation.rows[name].samples), **values}
 
 
-def _drawn(axes: Any, title: str) -> Markup:
+def _graph_picture(axes: Any, title: str) -> Markup:
     """Return a graph as a picture, and close its figure."""
     axes.set_title(title)
     axes.figure.set_size_inches(GRAPH * axes.figure.get_size_inches())
@@ -484,18 +498,18 @@ def _panel(title: str, x: str, y: str) -> tuple[Any, Any]:
 
 
 def _curve(fit: Fit, name: str) -> Markup:
-    kind, _, of = name.partition("/")
-    said = {"log_likelihood": "log p", "kl": "KL", "energy": ""}.get(kind, kind)
+    kind, _, variable = name.partition("/")
+    label = {"log_likelihood": "log p", "kl": "KL", "energy": ""}.get(kind, kind)
     unit = f"a {fit.per}" if kind in ("loss", "energy") else f"nats a {fit.per}"
-    figure, axes = _panel(f"{said} {of}".strip(), "step", unit)
+    figure, axes = _panel(f"{label} {variable}".strip(), "step", unit)
     values = []
     for series, style in (
         (name, {"color": "0.7"}),
         (f"validation/{name}", {"color": "C0", "marker": ".", "markersize": 4}),
     ):
-        steps, found = fit.series(series)
-        axes.plot(steps, found, linewidth=1.1, **style)
-        values += [value for value in found if math.isfinite(value)]
+        steps, series_values = fit.series(series)
+        axes.plot(steps, series_values, linewidth=1.1, **style)
+        values += [value for value in series_values if math.isfinite(value)]
     if values:  # the first steps may be so far off that all others would look equal
         low, high = np.quantile(values, (0.02, 0.98))
         axes.set_ylim(low - 0.1 * (high - low or 1), high + 0.1 * (high - low or 1))

@@ -44,8 +44,8 @@ def elbo_regression(request: pytest.FixtureRequest) -> ElboRegression:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """List new and renewed records, and improved bounds."""
     reports = [report for group in terminalreporter.stats.values() for report in group]
-    found = [entry for report in reports for entry in getattr(report, "user_properties", ())]
-    if lines := dict.fromkeys(line for key, line in found if key == "elbo_regression"):
+    properties = [entry for report in reports for entry in getattr(report, "user_properties", ())]
+    if lines := dict.fromkeys(line for key, line in properties if key == "elbo_regression"):
         terminalreporter.section("evidence bounds")
         for line in lines:
             terminalreporter.line(line)

@@ -11,7 +11,7 @@ import dvae
 from dvae import motion
 from dvae.distributions import Subset
 from dvae.models.motion.codes import CodeDiversity, codes
-from dvae.models.motion.mix_and_match import _aligned
+from dvae.models.motion.mix_and_match import _unrotated_positions
 from dvae.motion.geometry.views import ROTATIONS
 from dvae.networks.noise import MixAndMatch
 from dvae.testing import FactorizationContract
@@ -128,7 +128,11 @@ def test_the_loss_is_of_quaternions_and_positions_and_the_annealed_kl(windows):
     means = sequence.rollout.parameters("x", data["x"])[0]
     size, lengths = model.sizes["x"], data["bone_lengths"]
     rotations = (means - data["x"]).square().mean()
-    positions = (_aligned(means, lengths, model.turns) - _aligned(data["x"], lengths, model.turns)).square().mean()
+    positions = (
+        (_unrotated_positions(means, lengths, model.turns) - _unrotated_positions(data["x"], lengths, model.turns))
+        .square()
+        .mean()
+    )
     errors = size / (2 * 0.01**2) * (rotations + 0.5 * positions)
     constant = size * (np.log(0.01) + 0.5 * np.log(2 * np.pi))
     kl = (terms.kl["z"].sum() / terms.frames.sum()).detach()
