@@ -151,12 +151,8 @@ def retarget(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
     parameters = _shapes(shapes, motion, body)
     scales = standing_heights(body, parameters) / standing_heights(body, shapes_of(motion, body))
     motions = (_local_rotations(clip, motion.skeleton) for clip in motion)
-    return _on_bodies(
-        motion,
-        body,
-        parameters,
-        ((local, scale * place) for scale, (local, place) in zip(scales, motions, strict=True)),
-    )
+    scaled = ((local, scale * root) for scale, (local, root) in zip(scales, motions, strict=True))
+    return _on_bodies(motion, body, parameters, scaled)
 
 
 def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
@@ -367,9 +363,7 @@ def _bodies(motion: MotionSet) -> list[list[int]]:
     groups: list[tuple[Tensor, list[int]]] = []
     for n, clip in enumerate(motion):
         lengths = motion.skeleton.bone_lengths(tensor_of(clip.positions).double()).mean(0)
-        people = next(
-            (people for group_lengths, people in groups if (group_lengths - lengths).abs().max() < SAME), None
-        )
+        people = next((people for known, people in groups if (known - lengths).abs().max() < SAME), None)
         if people is None:
             groups.append((lengths, [n]))
         else:

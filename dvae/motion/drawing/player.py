@@ -82,11 +82,11 @@ def _scene(stage: Scene) -> dict[str, Any]:
         "reach": float(np.nanmax(np.linalg.norm(motion[..., :2] - middle[:2], axis=-1))),
         "low": float(low[2]),
         "high": float(high[2]),
-        "packed": _packed(np.concatenate([piece.ravel() for piece in pieces])),
+        "packed": _pack(np.concatenate([piece.ravel() for piece in pieces])),
     }
 
 
-def _packed(steps: np.ndarray) -> str:
+def _pack(steps: np.ndarray) -> str:
     """Encode integers modulo 2^16; sums of differences are still correct."""
     planes = steps.astype(np.int64).astype("<u2").view(np.uint8).reshape(-1, 2).T
     return base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()

@@ -121,7 +121,7 @@ class SegmentCompletion:
         with pyro.plate("sequences", size):
             z = pyro.sample(LATENT, prior.expand([size]))
             shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(parameters, kind).expand([size]))
-            times, decoded = self._made(z, shape, seen)
+            times, decoded = self._decode(z, shape, seen)
             if TIMES in seen:
                 _observe(TIMES, times, seen[TIMES], deviations.time)
             for name, value in decoded.items():
@@ -152,7 +152,7 @@ class SegmentCompletion:
         Returns:
             Mapping from "surfaces", "points" or "markers" to the distances; for points, to the nearest vertex.
         """
-        decoded = self._made(z, shape, seen)[1]
+        decoded = self._decode(z, shape, seen)[1]
         return {name: (value - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, value in decoded.items()}
 
     def guide(self, seen: Mapping[str, Any]) -> Any:
@@ -166,15 +166,15 @@ class SegmentCompletion:
         if POINTS not in seen:
             return dict(seen)
         shape = values.get(SHAPE, seen.get(SHAPE))
-        met, _ = self._met(values[LATENT], shape, seen)
-        rotations, places = self.model.timed.poses(met)
+        frames, _ = self._at_moments(values[LATENT], shape, seen)
+        rotations, places = self.model.timed.poses(frames)
         return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
 
-    def _made(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+    def _decode(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the times (B, K) of the moments, and the decoded counterparts of all observations by name."""
         body = self.model.body
-        met, times = self._met(z, shape, seen)
-        rotations, places = self.model.timed.poses(met)
+        frames, times = self._at_moments(z, shape, seen)
+        rotations, places = self.model.timed.poses(frames)
         pose, decoded = (shape, rotations, places), {}
         if SURFACES in seen:
             decoded[SURFACES] = body.some(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
@@ -185,8 +185,8 @@ class SegmentCompletion:
             decoded[POINTS] = body.some(*pose, vertices)
         return times, decoded
 
-    def _met(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """Return `_met` of the decoded segments; only the needed frames are decoded."""
+    def _at_moments(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+        """Return `_at_moments` of the decoded segments; only the needed frames are decoded."""
         frames, decode = seen.get(FRAMES), self.model.decoder(z, shape)
         if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
             return decode(frames[0].long()), frames
@@ -265,19 +265,19 @@ class Completed:
     @property
     def x(self) -> Tensor:
         """The most probable frames (B, N, D)."""
-        return self._made(self.posterior.mode)[0]
+        return self._decode(self.posterior.mode)[0]
 
     @property
     def shape(self) -> Tensor:
         """The most probable bodies (B, S), or the known ones."""
-        return self._made(self.posterior.mode)[1]
+        return self._decode(self.posterior.mode)[1]
 
     def draw(self, n: int, seed: int = 0) -> tuple[Tensor, Tensor]:
         """Draw frames (n, B, N, D) and bodies (n, B, S) from the posterior."""
-        return self._made(self.posterior.draw(n, seed))
+        return self._decode(self.posterior.draw(n, seed))
 
     @torch.no_grad()
-    def _made(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _decode(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         z = values[LATENT]
         shape = values.get(SHAPE, self.seen.get(SHAPE)).expand(*z.shape[:-1], -1)  # type: ignore[union-attr]
         return self.model.decode(z, shape), shape
@@ -356,7 +356,7 @@ def simulate_observations(
         observations = {TIMES: torch.where(moments <= end[:, None] + 1e-4, moments, torch.nan)}
     else:
         observations = {FRAMES: torch.tensor(frames).to(x).expand(len(x), -1)}
-    rotations, places = model.timed.poses(_met(model.timed, x, observations)[0])
+    rotations, places = model.timed.poses(_at_moments(model.timed, x, observations)[0])
     if kind == SPOTS:
         positions = model.body.some(shape, rotations, places, torch.tensor(markers))
     else:
@@ -392,8 +392,8 @@ def chamfer(points: Tensor, vertices: Tensor) -> Tensor:
 
 def surfaces_at(model: Any, x: Tensor, shape: Tensor, times: Tensor) -> Tensor:
     """Return surfaces (B, K, V, 3) of frames (B, N, D) on bodies (B, S) at times (B, K); NaN after the end."""
-    met, reached = _met(model.timed, x, {TIMES: times})
-    surfaces: Tensor = model.body(shape, *model.timed.poses(met))[0]
+    frames, reached = _at_moments(model.timed, x, {TIMES: times})
+    surfaces: Tensor = model.body(shape, *model.timed.poses(frames))[0]
     return torch.where((times <= reached + 1e-4)[..., None, None], surfaces, torch.nan)
 
 
@@ -414,8 +414,8 @@ def error_by_time(
     """
     moments = torch.tensor(times).to(truth[0]).expand(len(truth[0]), -1)
     true_surfaces = surfaces_at(model, *truth, moments)
-    met, _ = _met(model.timed, made[0], {TIMES: moments})
-    surfaces = model.body(made[1], *model.timed.poses(met))[0]
+    frames, _ = _at_moments(model.timed, made[0], {TIMES: moments})
+    surfaces = model.body(made[1], *model.timed.poses(frames))[0]
     errors = vertex_error(surfaces[:, :, None], true_surfaces[:, :, None])
     return errors.nanmean(0), errors.isfinite().sum(0)
 
@@ -461,7 +461,7 @@ def _observe(name: str, decoded: Tensor, seen: Tensor, deviation: float) -> None
     pyro.factor(name, -squared_error / (2 * deviation**2) - observed.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
 
 
-def _met(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+def _at_moments(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """Return the frames (B, K, D) at the observed moments, from frames (B, N, D), and their times (B, K) in seconds.
 
     Moments after the end use the last frame; its time then shows how much too early the segment ends.
@@ -472,7 +472,7 @@ def _met(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor
 def _interpolate(
     decoded: Tensor, decode: Callable[[Tensor | None], Tensor], seen: Mapping[str, Any]
 ) -> tuple[Tensor, Tensor]:
-    """Return `_met` for frames at times `decoded` (B, N); `made` decodes the given frames, or all of them (None)."""
+    """Return `_at_moments` for frames at times `decoded` (B, N); `decode` takes frame indices, or None for all."""
     n_frames = decoded.shape[1]
     times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)
     moments = times.nan_to_num(0.0)

@@ -178,9 +178,9 @@ class SegmentData:
         takes = {f"{clip.split}/{clip.labels['source']}": clip for clip in reversed([*self.segments])}
         clips = among(segments) or among(takes)
         if len(clips) != 1:
-            names_near = [key.partition("/")[2] for key in (*takes, *segments)]
+            names = [key.partition("/")[2] for key in (*takes, *segments)]
             raise ValueError(
-                f"no segment or take {name!r}{nearest(name, names_near)} in {self.path}; the first is {next(iter(segments))}"
+                f"no segment or take {name!r}{nearest(name, names)} in {self.path}; the first is {next(iter(segments))}"
                 if not clips
                 else f"{name!r} is the name of several; choose {' or '.join('/'.join(clip.key) for clip in clips)}"
             )

@@ -138,19 +138,17 @@ class TimedFrames:
         """Return the results of `of` and of `to` for these segments; their frames are computed only once."""
         if scaling not in ("identity", "deviation"):
             raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
-        conversion = cls(motion.skeleton, frames, references=references)
-        unscaled = conversion._unscaled(motion)
+        view = cls(motion.skeleton, frames, references=references)
+        unscaled = view._unscaled(motion)
         # in single precision, so that units do not depend on the last digits of a double
-        x = conversion._scaled(unscaled)[WHOLE]
-        metres = max(float(x[..., conversion.parts["translation"]].abs().max()), 1e-3)
-        conversion = replace(conversion, metres=metres, seconds=float(conversion.lasts(x[..., -1:].double()).max()))
+        x = view._scaled(unscaled)[WHOLE]
+        metres = max(float(x[..., view.parts["translation"]].abs().max()), 1e-3)
+        view = replace(view, metres=metres, seconds=float(view.lasts(x[..., -1:].double()).max()))
         if scaling == "deviation":
-            rotations = conversion._six_numbers(x.double()).flatten(-2).flatten(0, 1)
+            rotations = view._six_numbers(x.double()).flatten(-2).flatten(0, 1)
             deviation = rotations.std(0, correction=0).clamp(STEADY)
-            conversion = replace(
-                conversion, mean=tuple(rotations.mean(0).tolist()), deviation=tuple(deviation.tolist())
-            )
-        return conversion, conversion._scaled(unscaled)
+            view = replace(view, mean=tuple(rotations.mean(0).tolist()), deviation=tuple(deviation.tolist()))
+        return view, view._scaled(unscaled)
 
     @property
     def turning(self) -> list[int]:
@@ -165,12 +163,8 @@ class TimedFrames:
     @property
     def parts(self) -> Mapping[str, list[int]]:
         """Coordinates of a frame by part: rotations (Theta), translation of the root (Gamma), time (Phi)."""
-        n_rotations = 6 * len(self.turning)
-        return {
-            "rotations": [*range(n_rotations)],
-            "translation": [*range(n_rotations, n_rotations + 3)],
-            "time": [n_rotations + 3],
-        }
+        end = 6 * len(self.turning)
+        return {"rotations": [*range(end)], "translation": [*range(end, end + 3)], "time": [end + 3]}
 
     def to(self, motion: MotionSet) -> dict[str, Any]:
         """Convert segments, each a clip, to time-stamped frames.
@@ -273,8 +267,8 @@ class TimedFrames:
             getattr(self.skeleton, name) for name in ("names", "parents", "up")
         ):
             raise ValueError(
-                f"{motion.name or 'these segments'} have the tree of joints {skeleton.name!r}, and frames here are of "
-                f"{self.skeleton.name!r}; dvae.motion.segments.gait.on_common_joints selects the joints that two sources share"
+                f"{motion.name or 'these segments'} have the joint tree of {skeleton.name!r}, expected that of "
+                f"{self.skeleton.name!r}; dvae.motion.segments.gait.on_common_joints maps two sources to one tree"
             )
         for clip in motion:
             segment = f"segment {'/'.join(clip.key)}"
