@@ -94,21 +94,21 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
         )
     motion = _y_up(motion)
     if _has_matching_rotations(motion, body):
-        parameters = _known_shapes(motion, body) if shapes is None else _shapes(shapes, motion, body)
-        return _on_bodies(motion, body, parameters, (_local_rotations(clip, motion.skeleton) for clip in motion))
+        shapes_of_clips = _known_shapes(motion, body) if shapes is None else _shapes(shapes, motion, body)
+        return _on_bodies(motion, body, shapes_of_clips, (_local_rotations(clip, motion.skeleton) for clip in motion))
     source = _Source.of(motion, body)
     marks_of_clips = [source.marks(tensor_of(clip.positions).double()) for clip in motion]
-    parameters = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
+    shapes_of_clips = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
     slopes = torch.zeros(len(motion), dtype=torch.float64)
     person_of_clip = np.zeros(len(motion), int)
     for person, people in enumerate(_bodies(motion)):
         person_of_clip[people] = person
         lengths = torch.cat([source.lengths(marks_of_clips[n]) for n in people])
-        parameters[people] = source.shape(body, lengths.mean(0))
+        shapes_of_clips[people] = source.shape(body, lengths.mean(0))
         slopes[people] = source.steepness([marks_of_clips[n] for n in people], motion.skeleton.fps)
-    parameters = parameters if shapes is None else _shapes(shapes, motion, body)
-    joints, frames = _joints(body, parameters), [clip.frames for clip in motion]
-    batch_keys = zip(np.cumsum(frames) // AT_ONCE, person_of_clip, parameters.tolist(), strict=True)
+    shapes_of_clips = shapes_of_clips if shapes is None else _shapes(shapes, motion, body)
+    joints, frames = _joints(body, shapes_of_clips), [clip.frames for clip in motion]
+    batch_keys = zip(np.cumsum(frames) // AT_ONCE, person_of_clip, shapes_of_clips.tolist(), strict=True)
 
     def rotations() -> Iterator[tuple[Tensor, Tensor]]:
         """Yield rotations and root positions of each clip, computed for several clips of one body at once."""
@@ -118,7 +118,7 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
             motions = source.rotations(body, marks_of_batch, joints[clips[0]], slopes[clips[0]])
             yield from zip(*(values.split([frames[n] for n in clips]) for values in motions), strict=True)
 
-    return _on_bodies(motion, body, parameters, rotations())
+    return _on_bodies(motion, body, shapes_of_clips, rotations())
 
 
 def shapes_of(motion: MotionSet, body: Body) -> Tensor:
@@ -259,11 +259,11 @@ class _Source(NamedTuple):
                     ends = marks[f"{side} ankle"], marks[f"{side} toe"]
                     speeds = [fps * end.diff(dim=0).norm(dim=-1) for end in ends]
                     slopes.append(_descent(ends[1] - ends[0])[1:][torch.maximum(*speeds) < STILL])
-        every = torch.cat(slopes)
-        return every.median() if len(every) else every.new_tensor(torch.nan)
+        all_slopes = torch.cat(slopes)
+        return all_slopes.median() if len(all_slopes) else all_slopes.new_tensor(torch.nan)
 
     def rotations(
-        self, body: Body, targets: Mapping[str, Tensor], joints: Tensor, steep: Tensor
+        self, body: Body, targets: Mapping[str, Tensor], joints: Tensor, slope: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return local rotations (F, J, 3, 3) of a clip, and positions of its root (F, 3).
 
@@ -271,7 +271,7 @@ class _Source(NamedTuple):
             body: target body.
             targets: positions by part, (F, 3) each.
             joints: (J, 3), joints of the body at rest.
-            steep: result of `steepness`.
+            slope: result of `steepness`.
         """
         rest, parents, root = _marks(joints, self.body_joints), body.parents, body.parents.index(-1)
 
@@ -322,7 +322,7 @@ class _Source(NamedTuple):
                 point(middle, end)
             if f"{side}toe" in self.source_joints:
                 foot = rest[f"{side}toe"] - rest[f"{side}ankle"]
-                point(f"{side}ankle", f"{side}toe", foot if steep.isnan() else _direction(foot, steep))
+                point(f"{side}ankle", f"{side}toe", foot if slope.isnan() else _direction(foot, slope))
         world_rotations = torch.stack([carried(joint) for joint in range(body.joints)], -3)
         parent_rotations = world_rotations[:, [max(parent, 0) for parent in parents]]
         local = parent_rotations.mT @ world_rotations
@@ -452,9 +452,9 @@ def _y_up(motion: MotionSet) -> MotionSet:
 def _on_bodies(motion: MotionSet, body: Body, shapes: Tensor, rotations: Iterable[tuple[Tensor, Tensor]]) -> MotionSet:
     """Return clips on bodies (N, S) with local rotations (F, J, 3, 3) and root positions (F, 3)."""
     offsets, clips = body.offsets(shapes), []
-    for clip, bones, (local, place) in zip(motion, offsets, rotations, strict=True):
+    for clip, bones, (local, root) in zip(motion, offsets, rotations, strict=True):
         quaternions = continuous(from_matrix(local, "quaternion")).numpy()
-        positions, _ = forward(body.parents, local, bones, place)
+        positions, _ = forward(body.parents, local, bones, root)
         clips.append(replace(clip, positions=positions.numpy(), rotations=quaternions))
     source = motion.skeleton
     rest = tuple(offsets.mean(0).flatten().tolist())

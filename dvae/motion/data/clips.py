@@ -364,7 +364,7 @@ class MotionSet:
             ends = clip.positions[:, joints].astype(np.float64)
             varies = np.maximum(varies, np.linalg.norm(ends[:, :, None] - ends[:, None], axis=-1).std(0))
         groups = nx.connected_components(nx.from_numpy_array(varies < STIFF))
-        return sorted(([joints[place] for place in sorted(group)] for group in groups), key=len, reverse=True)
+        return sorted(([joints[index] for index in sorted(group)] for group in groups), key=len, reverse=True)
 
     def resampled(self, fps: float) -> MotionSet:
         """Return the same motion at another frame rate, as `Clip.resampled` does.
@@ -460,7 +460,7 @@ class MotionSet:
             [np.median(extents(some_frames(clip.positions))[:, self.skeleton.vertical]) for clip in self]
         )
         missing_joints = [
-            sum(np.isnan(some).any(axis=2).mean(axis=1).sum() for some in blocks(clip.positions)) / clip.frames
+            sum(np.isnan(block).any(axis=2).mean(axis=1).sum() for block in blocks(clip.positions)) / clip.frames
             for clip in self
         ]
 

@@ -49,7 +49,7 @@ _OPTION = Markup('<option value="{}">{}</option>')
 def player(scenes: Mapping[str, Scene]) -> Markup:
     """Return the HTML of scenes by title, shown one at a time; the page must contain `SCRIPT` once."""
     motion = json.dumps(list(map(_scene, scenes.values())), separators=(",", ":"), allow_nan=False)
-    windows = Markup().join(_OPTION.format(place, title) for place, title in enumerate(scenes))
+    windows = Markup().join(_OPTION.format(index, title) for index, title in enumerate(scenes))
     return _PLAYER.format(motion=motion, windows=windows)
 
 

@@ -241,8 +241,8 @@ def read_expmap(path: str | Path) -> Recording:
     values = numbers(text, str(path))
     bones = {name: Bone(parent, (x, y, z), torch.eye(3), "") for name, (parent, x, y, z) in SUBJECT_02.items()}
     names, parents, offsets = joints_of(bones)
-    rows, rest = divmod(len(values), 3 + 3 * len(names))
-    if rest or rows < 2:
+    rows, remainder = divmod(len(values), 3 + 3 * len(names))
+    if remainder or rows < 2:
         raise ValueError(
             f"{path}: got {len(values):,} numbers, expected rows of {3 + 3 * len(names)}, the first row a pose at rest"
         )

@@ -222,7 +222,7 @@ def _skeleton_of(
 
 
 def read_labels(default: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
-    """Return rows by (split, clip), or by (None, clip) without a split column; `default` is the default file."""
+    """Return rows by (split, clip), or by (None, clip) without a split column; `default` replaces absent `labels`."""
     file = Path(labels) if labels else default
     if not file.is_file():
         if labels:
@@ -259,7 +259,7 @@ def _table(path: Path, *most: int) -> Iterator[tuple[list[str], Iterator[tuple[i
         reader = csv.reader(text, strict=True)
         try:
             header = next(reader, [])
-            if unnamed := [place for place, name in enumerate(header, 1) if not is_name(name)]:
+            if unnamed := [position for position, name in enumerate(header, 1) if not is_name(name)]:
                 raise ValueError(f"{path}: column {unnamed[0]} is {brief(header[unnamed[0] - 1])}, expected a name")
             yield header, numbered()
         except csv.Error as error:

@@ -169,7 +169,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             continue
         if kind == "MOTION":
             if open_ or awaits_brace or not joints:
-                raise error(number, "the hierarchy to be whole before")
+                raise error(number, "MOTION after a complete hierarchy")
             lines[number - 1] = lines[number - 1][lines[number - 1].upper().rindex(kind) + len(kind) :]
             return joints, number - 1
         if kind in ("ROOT", "JOINT", "END"):
@@ -182,7 +182,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             if any(joint.name == name for joint in joints):
                 same = sum(joint.name.startswith(name) for joint in joints)
                 if kind != "END":
-                    raise error(number, f"a name of its own; there is another joint {name!r}")
+                    raise error(number, f"a unique name; there is another joint {name!r}")
                 name += str(same + 1)
             joints.append(_Joint(name, parent, ends=kind == "END"))
             check_joints(path, len(joints))
@@ -207,7 +207,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             count, *channels = [word.lower() for word in following(_is_value)] or [""]
             unknown = [channel for channel in channels if channel not in _AXES]
             if unknown or not count.isdecimal() or len(channels) != len(set(channels)) or str(len(channels)) != count:
-                raise error(number, "their number and as many of Xposition ... Zrotation, each once")
+                raise error(number, "the number of channels, then Xposition ... Zrotation, each once")
             joints[open_[-1]].channels = [_AXES.index(channel) for channel in channels]
         else:
             raise error(number, "ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION or a brace")

@@ -149,9 +149,9 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     bones = (raised[:, [max(parent, 0) for parent in parents]] @ torch.from_numpy(offsets)[..., None])[0, ..., 0]
     smpl_rotations = torch.eye(3, dtype=torch.float64).repeat(len(world), len(JOINTS), 1, 1)
     all_offsets = np.zeros_like(OFFSETS)
-    for place, (name, parent) in enumerate(zip(names, parents, strict=True)):
-        smpl_rotations[:, JOINTS.index(name)] = world[:, place] if parent < 0 else world[:, parent].mT @ world[:, place]
-        all_offsets[JOINTS.index(name)] = bones[place]
+    for index, (name, parent) in enumerate(zip(names, parents, strict=True)):
+        smpl_rotations[:, JOINTS.index(name)] = world[:, index] if parent < 0 else world[:, parent].mT @ world[:, index]
+        all_offsets[JOINTS.index(name)] = bones[index]
     poses = np.zeros((len(world), 156))
     poses[:, : 3 * len(JOINTS)] = from_matrix(smpl_rotations, "vector").flatten(1).numpy()
     betas = np.array([float(value) for value in clip.labels.get("betas", "").split()] or [0.0] * 16)

@@ -295,4 +295,4 @@ def _measures(angles: Angles, counts: Sequence[int]) -> list[Measure]:
         f"Euler angles z y x of {len(angles.joints)} joints without the root, {int(angles.varying.sum())} that vary, "
         f"rotations {source}; the best future has the smallest mean error over all times"
     )
-    return [measure(count, *each) for count in counts for each in enumerate(angles.protocol.times)]
+    return [measure(count, *numbered_time) for count in counts for numbered_time in enumerate(angles.protocol.times)]

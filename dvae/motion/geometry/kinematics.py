@@ -38,10 +38,10 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
         generations.append(below)
     order = [joint for joints in generations for joint in joints]
     first_to_last = indices(order, rotations)
-    many = [len(joints) for joints in generations]
+    counts = [len(joints) for joints in generations]
     # index_select has a cheaper gradient than indexing by a list
-    first, *local_rotations = rotations.index_select(-3, first_to_last).split(many, -3)
-    _, *bones = offsets.index_select(-2, first_to_last)[..., None].split(many, -3)
+    first, *local_rotations = rotations.index_select(-3, first_to_last).split(counts, -3)
+    _, *bones = offsets.index_select(-2, first_to_last)[..., None].split(counts, -3)
     world_rotations, positions = [first], [root[..., None, :]]
     for (before, joints), local, bone in zip(pairwise(generations), local_rotations, bones, strict=True):
         above = indices([before.index(parents[joint]) for joint in joints], rotations)
@@ -59,7 +59,7 @@ def resting(parents: Sequence[int], offsets: Tensor) -> Tensor:
 
 
 def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
-    """Return local rotations with which `forward` approximates poses as closely as the bone lengths allow.
+    """Return local rotations for which `forward` approximates poses as closely as the bone lengths allow.
 
     Each joint with several children is rotated by Procrustes analysis of the unit vectors to its children. A joint with
     one child is aligned with it exactly, by the smallest rotation relative to its parent. A joint without children

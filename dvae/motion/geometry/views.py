@@ -204,9 +204,9 @@ class Bones(View):
 
     def _assemble(self, data: Batch, pieces: Mapping[str, Sequence[int]]) -> Tensor:
         """Return x assembled from pieces, 0 elsewhere; the start of each bone must be the root or in a piece."""
-        size = 1 + max(place for places in self.pieces.values() for place in places)
+        size = 1 + max(index for places in self.pieces.values() for index in places)
         joints = [j for j in range(self.skeleton.joints) if j != self.skeleton.root or size == 3 * self.skeleton.joints]
-        known_joints = {joints[place // 3] for places in pieces.values() for place in places} | {self.skeleton.root}
+        known_joints = {joints[index // 3] for places in pieces.values() for index in places} | {self.skeleton.root}
         if undetermined := [
             joint for joint in known_joints - {self.skeleton.root} if self.skeleton.parents[joint] not in known_joints
         ]:
@@ -245,8 +245,8 @@ class Rotations(View):
     """Joint rotations instead of positions, and bones of constant length.
 
     Outside the model, x is positions (B, T, D) in metres. The model sees the position of the root, if x has it, and
-    then the rotation of every joint with children, in `form` and without jumps (`rotations.in_time`). Rotations are
-    taken from the data, or else estimated by `kinematics.inverse`, including the twist. Bones have their mean length in
+    then the rotation of every joint with children, in `form` and without jumps (`rotations.in_time`). Rotations come
+    from the data, or else from `kinematics.inverse`, which also estimates the twist. Bones have their mean length in
     the data, or their length in the rest pose if data are unavailable.
 
     Densities are densities of these numbers, not of positions, which have other volumes and one more dimension per

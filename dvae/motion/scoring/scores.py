@@ -238,13 +238,13 @@ def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
 
 
 def _path_error(windows: Windows | ExchangedWindows) -> Measure:
-    places = [windows.joints.index(name) for name in windows.given_joints or ()]
+    columns = [windows.joints.index(name) for name in windows.given_joints or ()]
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         paths = past["y"][:, None, windows.protocol.observed :]
         paths = torch.where(truth[:, None].isnan(), torch.nan, paths)
         distances = (forecasts - paths).unflatten(-1, (-1, 3)).norm(dim=-1)
-        return mean_of_known(distances[..., places], (1, 2, 3))
+        return mean_of_known(distances[..., columns], (1, 2, 3))
 
     return Measure("path error", function, "m")
 
@@ -374,7 +374,7 @@ def _jerk(windows: Windows | ExchangedWindows) -> Measure:
     def jerk(x: Tensor) -> Tensor:
         """Return the jerk (B, ...) of frames (B, ..., T, D)."""
         changes = (_norm(_coordinates(window).diff(n=3, dim=-1)) for window in body(x))
-        return torch.stack([mean_of_known(each, (0, -1)) for each in changes]) * windows.protocol.fps**3
+        return torch.stack([mean_of_known(steps, (0, -1)) for steps in changes]) * windows.protocol.fps**3
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         observed = past.mask_to_nan()[:, None, start:].expand(-1, forecasts.shape[1], -1, -1)
@@ -394,7 +394,7 @@ def _where_true(forecasts: Tensor, truth: Tensor) -> Tensor:
 def _pose_nll(prior: Any, observed: int) -> Measure:
     if prior.forward_at not in (None, observed - 1):
         raise ValueError(
-            f"the pose prior reads windows turned at their frame {prior.forward_at + 1}, but here "
+            f"the pose prior reads windows rotated at their frame {prior.forward_at + 1}, but here "
             f"{observed} frames are observed; fit one under this protocol"
         )
 
@@ -422,7 +422,7 @@ def _classifier_scores(
     settings = {"label": classifier.label, "classes": list(classifier.classes)}
     basis = {f"classifier {name}": {**settings, "weights": _hash(classifier), "unknown": unknown}}
     note = f"ACC, FID {name}: classifier {_hash(classifier)[:12]}"
-    note += f"; {unknown} of {len(labels)} windows are of no class it knows" if unknown else ""
+    note += f"; {unknown} of {len(labels)} windows have a class that it does not know" if unknown else ""
     shared: Any = {"truth": "real motion", "note": note, "basis": basis}
 
     @lru_cache(maxsize=1)  # shared by both scores of a batch

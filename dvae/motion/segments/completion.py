@@ -240,7 +240,7 @@ class SegmentCompletion:
 
 @dataclass(frozen=True)
 class Completed:
-    """Segments that were completed.
+    """Completed segments and their posterior.
 
     Args:
         program: program of the observations.
@@ -426,11 +426,11 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
     with torch.no_grad():
         at_once = max(1, AT_ONCE // points.shape[1])
         parts = (part.split(at_once) for part in (shape, rotations, places, points.nan_to_num(0.0)))
-        for some in zip(*parts, strict=True):
-            vertices = body(*some[:3])[0]
+        for batch in zip(*parts, strict=True):
+            vertices = body(*batch[:3])[0]
             pairs = max(1, PAIRS // (points.shape[2] * vertices.shape[2]))
-            each = zip(vertices.flatten(0, 1).split(pairs), some[3].flatten(0, 1).split(pairs), strict=True)
-            for flat, near in each:  # |p - v|^2 - |p|^2; the second term is constant
+            blocks = zip(vertices.flatten(0, 1).split(pairs), batch[3].flatten(0, 1).split(pairs), strict=True)
+            for flat, near in blocks:  # |p - v|^2 - |p|^2; the second term is constant
                 indices.append(torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2).argmin(-1))
     return torch.cat(indices).unflatten(0, points.shape[:2])  # type: ignore[no-any-return]
 
@@ -438,8 +438,8 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
 def _shrink(means: Tensor, variance: Tensor) -> Tensor:
     """Return the covariance (Z, Z) of a mixture of N normals with these means (N, Z) and mean variances (Z,).
 
-    It is shrunk towards its mean variance in all directions, by oracle approximating shrinkage (Chen, Wiesel, Eldar and
-    Hero 2010, IEEE Transactions on Signal Processing 58:10), so that a few segments do not exclude everything else. The
+    It is shrunk towards a multiple of the identity by oracle approximating shrinkage (Chen, Wiesel, Eldar and Hero
+    2010, IEEE Transactions on Signal Processing 58:10), so that a few segments do not exclude everything else. The
     estimator assumes independent means, so many segments of one take are shrunk too little.
     """
     (n, p), centred = means.shape, means - means.mean(0)
@@ -478,14 +478,14 @@ def _interpolate(
     moments = times.nan_to_num(0.0)
     before = torch.searchsorted(decoded.detach(), moments.contiguous(), right=True).sub(1).clamp(0, n_frames - 2)
     ends = torch.stack([before, before + 1], -1)
-    start, end = (decoded.gather(1, each) for each in ends.unbind(-1))
+    start, end = (decoded.gather(1, columns) for columns in ends.unbind(-1))
     share = ((moments - start) / (end - start)).clamp(0, 1)
     if FRAMES in seen:
         frames = seen[FRAMES].nan_to_num(0.0)
         located, around = seen[FRAMES].isfinite(), torch.stack([frames.floor(), frames.ceil()], -1)
         ends = torch.where(located[..., None], around.long(), ends)
         share = torch.where(located, frames - around[..., 0], share)
-        start, end = (decoded.gather(1, each) for each in ends.unbind(-1))
+        start, end = (decoded.gather(1, columns) for columns in ends.unbind(-1))
     is_needed = torch.zeros(n_frames, dtype=torch.bool, device=ends.device).index_fill(0, ends.flatten(), True)
     if few := 2 * int(is_needed.sum()) <= n_frames:  # for more frames, selection takes longer than decoding all
         ends = (is_needed.cumsum(0) - 1)[ends]

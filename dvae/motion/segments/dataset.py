@@ -233,7 +233,7 @@ class SegmentData:
         clips = [clip for clip in self.segments if split_of(clip) == split]
         if not clips:
             raise ValueError(
-                f"{self.path} has no segments for {split}: {len(self.segments)} are of takes in "
-                f"{', '.join(self.segments.splits)}, and validation takes a tenth of those in train"
+                f"{self.path} has no segments for {split}: its {len(self.segments)} segments are in "
+                f"{', '.join(self.segments.splits)}, and a tenth of the training takes is for validation"
             )
         return replace(self.segments, clips=clips)

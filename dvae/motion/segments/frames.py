@@ -94,11 +94,11 @@ class TimedFrames:
         for attribute in ("offsets", "sides"):
             getattr(self.skeleton, attribute)  # these properties raise errors that explain what to do
         if self.frames < 2:
-            raise ValueError(f"{self.frames} frame has no time between frames; expected at least 2")
+            raise ValueError(f"frames must be at least 2, got {self.frames}")
         for name in ("mean", "deviation"):
             if (numbers := len(getattr(self, name))) not in (0, 6 * len(self.turning)):
                 raise ValueError(
-                    f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints that turn"
+                    f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints with children"
                 )
         if not np.isfinite([*self.mean, *self.deviation]).all():
             raise ValueError("mean or deviation have NaN or infinite numbers")
@@ -204,16 +204,18 @@ class TimedFrames:
             values = _join(continuous(from_matrix(rotations[b][:, self.turning], "quaternion")), places[b])
             moments = np.arange(int(float(times[b, -1]) * skeleton.fps + 1e-3) + 1) / skeleton.fps
             interpolation = _cubic(times[b].numpy(), moments.clip(max=float(times[b, -1])))
-            local_quaternions, place = _split_joined(_normalise(interpolation @ values))
-            local = torch.eye(3).to(x).repeat(len(local_quaternions), skeleton.joints, 1, 1)
-            local[:, self.turning] = to_matrix(local_quaternions, "quaternion")
+            turned_quaternions, root_positions = _split_joined(_normalise(interpolation @ values))
+            local = torch.eye(3).to(x).repeat(len(turned_quaternions), skeleton.joints, 1, 1)
+            local[:, self.turning] = to_matrix(turned_quaternions, "quaternion")
             if HEADING in seen:
-                turn, place = self._rotate_root(local[:, skeleton.root], place, seen[HEADING][b].cpu().double())
+                turn, root_positions = self._rotate_root(
+                    local[:, skeleton.root], root_positions, seen[HEADING][b].cpu().double()
+                )
                 local[:, skeleton.root] = turn
             if ORIGIN in seen:
-                place = place + seen[ORIGIN][b].cpu().double()
+                root_positions = root_positions + seen[ORIGIN][b].cpu().double()
             offsets = seen[OFFSETS][b].cpu().double() if OFFSETS in seen else skeleton.offsets
-            positions, _ = kinematics.forward(skeleton.parents, local, offsets, place)
+            positions, _ = kinematics.forward(skeleton.parents, local, offsets, root_positions)
             quaternions = continuous(from_matrix(local, "quaternion"))
             clips.append(Clip("all", f"{b:04d}", positions.numpy(), rotations=quaternions.numpy()))
         return MotionSet(clips, skeleton, "segments")
@@ -267,7 +269,7 @@ class TimedFrames:
             getattr(self.skeleton, name) for name in ("names", "parents", "up")
         ):
             raise ValueError(
-                f"{motion.name or 'these segments'} have the joint tree of {skeleton.name!r}, expected that of "
+                f"{motion.name or 'these segments'} have the joint tree of {skeleton.name!r}, expected the tree of "
                 f"{self.skeleton.name!r}; dvae.motion.segments.gait.on_common_joints maps two sources to one tree"
             )
         for clip in motion:
@@ -275,7 +277,7 @@ class TimedFrames:
             if clip.rotations is None:
                 raise ValueError(f"{segment} has no rotations of joints; MotionSet.with_rotations() computes them")
             if clip.frames < 2:
-                raise ValueError(f"{segment} has {clip.frames} frame, expected at least 2, between which time passes")
+                raise ValueError(f"{segment} has {clip.frames} frame, expected at least 2")
         first = torch.from_numpy(np.stack([clip.positions[0] for clip in motion])).double()
         heading = skeleton.heading(first)
         x = first.new_empty(len(motion), self.frames, self.size)
@@ -303,8 +305,8 @@ class TimedFrames:
         )
         quaternions[:, :, root] = from_matrix(first, "quaternion")
         original = _join(continuous(normalised(quaternions[:, :, self.turning])), root_positions)
-        to_frames = torch.stack([_cubic(times, each) for each in frames])
-        from_frames = torch.stack([_cubic(each, times) for each in frames])
+        to_frames = torch.stack([_cubic(times, row) for row in frames])
+        from_frames = torch.stack([_cubic(row, times) for row in frames])
         values = _normalise(to_frames @ original)
         for _ in range(ROUNDS):  # add the error of the round trip to the values
             values = _normalise(values + to_frames @ (original - _normalise(from_frames @ values)))
@@ -320,10 +322,10 @@ class TimedFrames:
         x = (unscaled[WHOLE] - pad(mean, (0, 4))).div_(torch.cat([deviation, others]))
         return {name: value.float() for name, value in {**unscaled, WHOLE: x}.items()}
 
-    def _rotate_root(self, turn: Tensor, place: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    def _rotate_root(self, turn: Tensor, positions: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
         """Rotate the root's rotations (..., 3, 3) and positions (..., 3) about the up axis by angles (...)."""
         up = self.skeleton.up
-        return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(place, angle, up)
+        return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(positions, angle, up)
 
     def _six_numbers(self, x: Tensor) -> Tensor:
         """Return six numbers of each joint with children (..., K, 6)."""
@@ -354,16 +356,16 @@ def _of_one_length(motion: MotionSet) -> Iterator[tuple[np.ndarray, Tensor, Tens
     """Yield batches of equally long clips: indices in the set, quaternions (B, F, J, 4) and positions (B, F, J, 3)."""
     lengths = np.array([clip.frames for clip in motion])
     for frames in np.unique(lengths):
-        alike = np.flatnonzero(lengths == frames)
-        for rows in np.array_split(alike, -(-len(alike) * frames // AT_ONCE)):
+        same_length = np.flatnonzero(lengths == frames)
+        for rows in np.array_split(same_length, -(-len(same_length) * frames // AT_ONCE)):
             arrays = zip(*((motion.clips[n].rotations, motion.clips[n].positions) for n in rows), strict=True)
             quaternions, positions = (torch.from_numpy(np.stack(array)).double() for array in arrays)
             yield rows, quaternions, positions
 
 
-def _join(quaternions: Tensor, place: Tensor) -> Tensor:
+def _join(quaternions: Tensor, root: Tensor) -> Tensor:
     """Concatenate (..., K, 4) and (..., 3) to (..., 4 K + 3)."""
-    return torch.cat([quaternions.flatten(-2), place], -1)
+    return torch.cat([quaternions.flatten(-2), root], -1)
 
 
 def _split_joined(values: Tensor) -> tuple[Tensor, Tensor]:

@@ -190,7 +190,7 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
         costs = subsequence_costs(_distances(reference.hips, hips), longest)
         costs[~possible] = np.inf
         for first, frames in _select_cheapest(costs, cycles.threshold, cycles.overlap):
-            start, end = (min(round(place * ratio), clip.frames - 1) for place in (first, first + frames))
+            start, end = (min(round(frame * ratio), clip.frames - 1) for frame in (first, first + frames))
             found_cycles.append(Found(reference.side, start, end, float(costs[first, frames])))
     return sorted(found_cycles, key=lambda each: (each.first, each.side))
 
@@ -220,9 +220,10 @@ def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[R
                 cycles_of_side += [(hips[first : last + 1], clip) for first, last in _between_peaks(angle, period)]
     if not all(candidates):
         raise ValueError(
-            f"no clip of {motion.name or 'this motion'} has legs that swing by at least {cycles.swing:g} rad, twice "
-            f"and alike (at best {max(most_regular, 0):.2f}, expected {cycles.regular:g} of 2), {cycles.shortest:g} to "
-            f"{cycles.longest:g} s each; give references= of walking people, or lower `regular` or `swing`"
+            f"no clip of {motion.name or 'this motion'} is a regular walk, with thighs that swing by at least "
+            f"{cycles.swing:g} rad, a period of {cycles.shortest:g} to {cycles.longest:g} s and a regularity from "
+            f"{cycles.regular:g} (best: {max(most_regular, 0):.2f}); give references= of walking people, or lower "
+            "`regular` or `swing`"
         )
     left, right = (_most_typical(cycles_of_side) for cycles_of_side in candidates)
     return (
@@ -362,8 +363,8 @@ def _deviations(angle: np.ndarray, longest: int) -> np.ndarray:
     """Return (F, K) standard deviations of an angle (F,) over k + 1 frames from s on; 0 if the clip ends earlier."""
     frames = np.arange(len(angle))[:, None] + np.arange(longest + 1)
     sums, squares = (np.pad(np.cumsum(values), (1, longest), mode="edge") for values in (angle, angle**2))
-    many = np.arange(1, longest + 1)
-    mean, square = ((each[frames[:, 1:]] - each[frames[:, :1]]) / many for each in (sums, squares))
+    counts = np.arange(1, longest + 1)
+    mean, square = ((total[frames[:, 1:]] - total[frames[:, :1]]) / counts for total in (sums, squares))
     inside = frames[:, :-1] < len(angle)
     return np.where(inside, np.sqrt(np.maximum(square - mean**2, 0)), 0.0)
 

@@ -134,8 +134,8 @@ def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any],
     """
     if steps < 2 or len(first[WHOLE]) != len(second[WHOLE]):
         raise ValueError(
-            f"expected at least 2 steps between as many segments as others, got {steps} between {len(first[WHOLE])} "
-            f"and {len(second[WHOLE])}"
+            f"expected at least 2 steps and two batches of the same size, got {steps} steps, and "
+            f"{len(first[WHOLE])} and {len(second[WHOLE])} segments"
         )
     with seeded_evaluation(model, 0):
         ends = [on_device_of(model, batch) for batch in (first, second)]

@@ -59,7 +59,7 @@ UNRELIABLE = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Recovered:
-    """Segments that were recovered.
+    """Completed segments, with draws from the posterior and distances from the observations.
 
     Args:
         found: most probable segments.
@@ -98,16 +98,14 @@ class Recovered:
         errors = {f"from\n{name}\nmm": value for name, value in self.away.items()}
         titles = {"vertex error": "vertex\nerror\nmm", "duration error": "duration\nerror\nms"}
         errors |= {titles[name]: value for name, value in self.errors.items()}
-        caption = (
-            f"[ ]: {100 * LEVEL:g} % of {draws} draws, too narrow where errors are alike or larger than deviations say"
-        )
+        caption = f"[ ]: {100 * LEVEL:g} % of {draws} draws; too narrow if errors are correlated or exceed deviations"
         results = _table((*measures, *errors), caption)
         diagnostics = _table(
             ("left\nnats", "behind\nnats", "bent", "k-hat"),
-            "left: by which the energy would still fall, about 0 where the search has converged\n"
-            "behind: by which other starts arrived above the best\n"
-            "bent: directions in which it is less sure than the prior: no normal\n"
-            f"k-hat: above {UNRELIABLE} the draws, and so intervals, are rough",
+            "left: remaining reduction of the energy, about 0 if the search has converged\n"
+            "behind: energy of the other starts minus the energy of the best\n"
+            "bent: number of directions with less curvature than the prior, where a normal does not fit\n"
+            f"k-hat: above {UNRELIABLE}, draws and intervals are unreliable",
         )
         posterior = self.found.posterior
         measured = [(measure(self.found.x), measure(self.drawn[0])) for measure in measures.values()]

@@ -385,7 +385,7 @@ class TestWindows:
         assert {c.labels["style"] for c in test.clips} == {"B"}
         assert test.labels("style") == ["B"] * len(test)
         assert {c.split for c in test.clips} == {"train", "test"}
-        with pytest.raises(ValueError, match="label 'style', which clip train/clip_0 lacks"):
+        with pytest.raises(ValueError, match="label 'style', but clip train/clip_0 does not have it"):
             windows(motion(), protocol, "test")
         with pytest.raises(KeyError, match="no label 'mood'; there are style"):
             test.labels("mood")

@@ -161,7 +161,7 @@ def test_archives_of_clips_are_joined(three, tmp_path, capsys):
     write_motion(tmp_path / "a.bvh", replace(three, clips=[three.clips[0]]))
     for other, message in (
         (tmp_path / "a.bvh", "is an archive of clips and"),  # which was left out without a word
-        (paths[0], "have the clip name"),
+        (paths[0], "occurs twice"),
         (folder / "z.npz", "z is up, and y in"),
     ):
         save(folder / "z.npz", MotionSet([three.clips[0]], replace(WALKER, up="z")))

@@ -110,7 +110,7 @@ def test_what_is_no_segment_is_refused(people):
         (lambda: TimedFrames(replace(skeleton, rest=())), "has no rest pose"),
         (lambda: TimedFrames(replace(skeleton, left=(), right=())), "has no left and right joints"),
         (lambda: TimedFrames(skeleton, mean=(0.0,)), "expected 6 for each of 12 joints"),
-        (lambda: TimedFrames(skeleton, frames=1), "1 frame has no time between frames"),
+        (lambda: TimedFrames(skeleton, frames=1), "frames must be at least 2, got 1"),
         (lambda: TimedFrames.of(people, scaling="centred"), "expected 'identity' or 'deviation'"),
     ):
         with pytest.raises(ValueError, match=message):
