@@ -229,8 +229,8 @@ class _Source(NamedTuple):
         """Return lengths (..., 8) in metres: limbs (mean of both sides), widths, trunk to shoulders and to top."""
 
         def length(start: str, end: str) -> Tensor:
-            found: Tensor = (marks[end] - marks[start]).norm(dim=-1)
-            return found
+            lengths_of_bone: Tensor = (marks[end] - marks[start]).norm(dim=-1)
+            return lengths_of_bone
 
         bones = [bone for limb in _LIMBS for bone in pairwise(limb.split())]
         limbs = [(length(f"l {a}", f"l {b}") + length(f"r {a}", f"r {b}")) / 2 for a, b in bones]

@@ -631,8 +631,8 @@ class Windows:
         """Yield the keys of the listed windows one at a time, because there may be as many as frames."""
         for clip, first, count in zip(self.clips, self._first.tolist(), self._starts.tolist(), strict=True):
             for starts in torch.arange(0, count, _at_least_one(stride)).split(4096):
-                listed = starts[self._has_usable_frames(first + starts)] if self.missing else starts
-                yield from ((*clip.key, start) for start in listed.tolist())
+                kept_starts = starts[self._has_usable_frames(first + starts)] if self.missing else starts
+                yield from ((*clip.key, start) for start in kept_starts.tolist())
 
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:
         """Return the clip index and first frame of every listed window."""

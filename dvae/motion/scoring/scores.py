@@ -211,8 +211,8 @@ def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
         futures: (N, T, D).
         sets: indices of the futures in each set; the APD of a single future is NaN.
     """
-    used = torch.cat([*sets]).unique()
-    rows = futures[used].flatten(1).double()
+    members_of_any = torch.cat([*sets]).unique()
+    rows = futures[members_of_any].flatten(1).double()
     centre = rows.mean(0)
     if centre.isnan().any():
         apds = [metrics.average_pairwise_distance(futures[members]) if len(members) > 1 else None for members in sets]
@@ -221,7 +221,7 @@ def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
     products = rows @ rows.T
     squares = products.diagonal()
     distances = (squares[:, None] + squares).sub_(products, alpha=2).clamp_(min=0).sqrt_().fill_diagonal_(0.0)
-    membership = torch.stack([torch.isin(used, members) for members in sets]).to(distances)
+    membership = torch.stack([torch.isin(members_of_any, members) for members in sets]).to(distances)
     sums, counts = (membership @ distances * membership).sum(1), membership.sum(1)
     return (sums / (counts * (counts - 1))).to(futures)
 

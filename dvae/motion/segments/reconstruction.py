@@ -200,15 +200,15 @@ def reconstruct_segments(
     linear: dict[tuple[str, int], str] = {}
     with progress_bar(progress) as bar:
 
-        def score(name: str, held: Segments, function: Callable[[Mapping[str, Any]], Mapping[str, Tensor]]) -> None:
+        def score(name: str, subset: Segments, function: Callable[[Mapping[str, Any]], Mapping[str, Tensor]]) -> None:
             batches = []
-            for part in bar.track(torch.arange(len(held)).split(batch_size), description=name):
-                batches.append(function(Batch(held.all()).rows(part)))
+            for part in bar.track(torch.arange(len(subset)).split(batch_size), description=name):
+                batches.append(function(Batch(subset.all()).rows(part)))
             rows[name] = {
                 key: torch.cat([batch[key].cpu() for batch in batches]).double().numpy() for key in batches[0]
             }
             if invalid := np.flatnonzero(~np.isfinite(rows[name][ERROR])).tolist():
-                segment = "/".join(held.motion.clips[invalid[0]].key)
+                segment = "/".join(subset.motion.clips[invalid[0]].key)
                 raise FloatingPointError(f"the output of {name} for segment {segment} is not finite")
 
         for name, model in models.items():
