@@ -71,27 +71,27 @@ def follow_paths(
         raise ValueError(f"steps must be at least 1, got {steps}")
     covariance = smooth_covariance(len(known))
     root = CORRECTION * torch.linalg.cholesky(covariance)
-    root, white, gain = (each.to(latents) for each in (root, torch.linalg.inv(root), gains(covariance, known)))
-    kept = bones > SHORTEST
+    root, white, gain = (matrix.to(latents) for matrix in (root, torch.linalg.inv(root), gains(covariance, known)))
+    constrained = bones > SHORTEST
 
-    def bent(z: Tensor) -> tuple[Tensor, Tensor]:
+    def fit(z: Tensor) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
             moves = torch.zeros_like(z), torch.zeros_like(decode(z))
-        for each in moves:
-            each.requires_grad_()
+        for move in moves:
+            move.requires_grad_()
 
         def motion() -> tuple[Tensor, Tensor]:
-            made, free = decode(z + scale * moves[0]), root @ moves[1]
-            correction = free + torch.einsum("dts,...sd->...td", gain, paths - made - free)
-            return made + correction, correction
+            decoded, free = decode(z + scale * moves[0]), root @ moves[1]
+            correction = free + torch.einsum("dts,...sd->...td", gain, paths - decoded - free)
+            return decoded + correction, correction
 
         def loss() -> Tensor:
             x, correction = motion()
-            stretched = skeleton.limbs(x)[..., kept, :].norm(dim=-1) / bones[kept] - 1
+            stretched = skeleton.limbs(x)[..., constrained, :].norm(dim=-1) / bones[constrained] - 1
             residuals = moves[0], white @ correction, stretched / STRETCH
-            total = torch.stack([each.square().sum() for each in residuals]).sum()
-            for each, gradient in zip(moves, torch.autograd.grad(total, moves), strict=True):
-                each.grad = gradient
+            total = torch.stack([residual.square().sum() for residual in residuals]).sum()
+            for move, gradient in zip(moves, torch.autograd.grad(total, moves), strict=True):
+                move.grad = gradient
             return total.detach()
 
         optimiser = torch.optim.LBFGS(
@@ -103,17 +103,17 @@ def follow_paths(
             return motion()
 
     with progress_bar(progress) as bar:
-        found = [bent(z) for z in bar.track(latents.split(1), description="following the paths")]
-    motions, corrections = zip(*found, strict=True)
+        fits = [fit(z) for z in bar.track(latents.split(1), description="following the paths")]
+    motions, corrections = zip(*fits, strict=True)
     return torch.cat(motions), torch.cat(corrections)
 
 
 def smooth_covariance(frames: int) -> Tensor:
     """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, conditioned on 0 at frame 0."""
     frame = torch.arange(frames + 1, dtype=torch.float64)
-    apart = sqrt(3) / SMOOTH * (frame[:, None] - frame).abs()
-    whole = (1 + apart) * (-apart).exp()
-    return whole[1:, 1:] - whole[1:, :1] * whole[:1, 1:]
+    distance = sqrt(3) / SMOOTH * (frame[:, None] - frame).abs()
+    kernel = (1 + distance) * (-distance).exp()
+    return kernel[1:, 1:] - kernel[1:, :1] * kernel[:1, 1:]
 
 
 def gains(covariance: Tensor, known: Tensor) -> Tensor:
@@ -121,10 +121,10 @@ def gains(covariance: Tensor, known: Tensor) -> Tensor:
 
     The mean of coordinate d is conditioned on the values at known[:, d]; all other values are ignored.
     """
-    found = covariance.new_zeros(known.shape[1], *covariance.shape)
-    patterns, which = known.bool().cpu().unique(dim=1, return_inverse=True)
-    for n, seen in enumerate(patterns.T):
+    matrices = covariance.new_zeros(known.shape[1], *covariance.shape)
+    patterns, pattern = known.bool().cpu().unique(dim=1, return_inverse=True)
+    for n, observed in enumerate(patterns.T):
         gain = torch.zeros_like(covariance)
-        gain[:, seen] = torch.linalg.solve(covariance[seen][:, seen], covariance[seen]).T
-        found[which == n] = gain
-    return found
+        gain[:, observed] = torch.linalg.solve(covariance[observed][:, observed], covariance[observed]).T
+        matrices[pattern == n] = gain
+    return matrices

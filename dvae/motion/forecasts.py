@@ -56,18 +56,18 @@ class Forecasts:
                 f"expected forecasts (S, {windows}, H, {joint[0]}, 3), observed ({windows}, O, {joint[0]}, 3) and "
                 f"truth ({windows}, up to H, {joint[0]}, 3), got {shapes[0]}, {shapes[1]} and {shapes[2]}"
             )
-        for what, array in (("futures", self.forecasts), ("observed frames", self.observed), ("truth", self.truth)):
-            bad = np.isinf(array) if array.ndim == 4 else ~np.isfinite(array)
-            wrong = bad.any((*range(array.ndim - 4), -3, -2, -1))
-            if wrong.any():
-                split, clip, start = self.keys[int(wrong.argmax())]
-                raise FloatingPointError(f"the {what} of clip {clip!r} ({split}), frame {start}, are NaN or infinite")
+        for name, array in (("futures", self.forecasts), ("observed frames", self.observed), ("truth", self.truth)):
+            invalid = np.isinf(array) if array.ndim == 4 else ~np.isfinite(array)
+            invalid_windows = invalid.any((*range(array.ndim - 4), -3, -2, -1))
+            if invalid_windows.any():
+                split, clip, start = self.keys[int(invalid_windows.argmax())]
+                raise FloatingPointError(f"the {name} of clip {clip!r} ({split}), frame {start}, are NaN or infinite")
 
     def window(self, n: int, samples: int | None = None) -> Forecasts:
         """Return the first `samples` futures, or all futures, of window n alone."""
-        one = slice(n, n + 1)
-        future = self.forecasts[:samples, one]
-        return Forecasts(self.skeleton, self.keys[one], future, self.observed[one], self.truth[one], self.emission)
+        row = slice(n, n + 1)
+        future = self.forecasts[:samples, row]
+        return Forecasts(self.skeleton, self.keys[row], future, self.observed[row], self.truth[row], self.emission)
 
     def motion(self) -> MotionSet:
         """Return one clip per future, including its observed frames.

@@ -24,10 +24,10 @@ def readings(name: str) -> list[tuple[str, str]]:
     """
     name = _PREFIX.sub("", name)
     for pattern in _SIDE:
-        found = pattern.search(name)
-        if found and found.group():
-            word = name[: found.start()] + name[found.end() :]
-            return [("l" if found["l"] else "r", letters(word))]
+        match = pattern.search(name)
+        if match and match.group():
+            word = name[: match.start()] + name[match.end() :]
+            return [("l" if match["l"] else "r", letters(word))]
     word = letters(name)
     return [("", word), *([(word[0], word[1:])] if word[:1] in ("l", "r") else [])]
 
@@ -39,10 +39,14 @@ def letters(word: str) -> str:
 
 def sides(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the joints on the left and on the right; each of them has a counterpart on the other side."""
-    there: dict[tuple[str, str], list[int]] = {}
+    joints_by_reading: dict[tuple[str, str], list[int]] = {}
     for joint, name in enumerate(names):
-        for meant in readings(name):
-            there.setdefault(meant, []).append(joint)
-    words = {word for _, word in there if ("l", word) in there and ("r", word) in there}
-    left, right = (tuple(sorted(joint for word in words for joint in there[side, word])) for side in ("l", "r"))
+        for reading in readings(name):
+            joints_by_reading.setdefault(reading, []).append(joint)
+    words = {
+        word for _, word in joints_by_reading if ("l", word) in joints_by_reading and ("r", word) in joints_by_reading
+    }
+    left, right = (
+        tuple(sorted(joint for word in words for joint in joints_by_reading[side, word])) for side in ("l", "r")
+    )
     return left, right

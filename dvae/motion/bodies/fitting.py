@@ -87,38 +87,38 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
     Raises:
         ValueError: a required joint is missing in the skeleton or in a frame, or the shapes have a wrong size.
     """
-    if lacking := [clip for clip in motion if np.isnan(clip.positions).any()]:
+    if incomplete := [clip for clip in motion if np.isnan(clip.positions).any()]:
         raise ValueError(
-            f"clip {'/'.join(lacking[0].key)} has missing joints and cannot be fitted to a body; remove the clip, or "
+            f"clip {'/'.join(incomplete[0].key)} has missing joints and cannot be fitted to a body; remove it, or "
             "fill its gaps first (`dvae impute RUN --filled FILE`)"
         )
     motion = _y_up(motion)
-    if _turned_alike(motion, body):
-        each = _kept(motion, body) if shapes is None else _shapes(shapes, motion, body)
-        return _made(motion, body, each, (_turns(clip, motion.skeleton) for clip in motion))
+    if _has_matching_rotations(motion, body):
+        shapes_of_clips = _known_shapes(motion, body) if shapes is None else _shapes(shapes, motion, body)
+        return _on_bodies(motion, body, shapes_of_clips, (_local_rotations(clip, motion.skeleton) for clip in motion))
     source = _Source.of(motion, body)
-    seen = [source.seen(tensor_of(clip.positions).double()) for clip in motion]
-    each = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
-    steep = torch.zeros(len(motion), dtype=torch.float64)
-    whose = np.zeros(len(motion), int)
+    marks_of_clips = [source.marks(tensor_of(clip.positions).double()) for clip in motion]
+    shapes_of_clips = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
+    slopes = torch.zeros(len(motion), dtype=torch.float64)
+    person_of_clip = np.zeros(len(motion), int)
     for person, people in enumerate(_bodies(motion)):
-        whose[people] = person
-        lengths = torch.cat([source.lengths(seen[n]) for n in people])
-        each[people] = source.shape(body, lengths.mean(0))
-        steep[people] = source.steepness([seen[n] for n in people], motion.skeleton.fps)
-    each = each if shapes is None else _shapes(shapes, motion, body)
-    joints, frames = _joints(body, each), [clip.frames for clip in motion]
-    alike = zip(np.cumsum(frames) // AT_ONCE, whose, each.tolist(), strict=True)
+        person_of_clip[people] = person
+        lengths = torch.cat([source.lengths(marks_of_clips[n]) for n in people])
+        shapes_of_clips[people] = source.shape(body, lengths.mean(0))
+        slopes[people] = source.steepness([marks_of_clips[n] for n in people], motion.skeleton.fps)
+    shapes_of_clips = shapes_of_clips if shapes is None else _shapes(shapes, motion, body)
+    joints, frames = _joints(body, shapes_of_clips), [clip.frames for clip in motion]
+    batch_keys = zip(np.cumsum(frames) // AT_ONCE, person_of_clip, shapes_of_clips.tolist(), strict=True)
 
-    def turns() -> Iterator[tuple[Tensor, Tensor]]:
+    def rotations() -> Iterator[tuple[Tensor, Tensor]]:
         """Yield rotations and root positions of each clip, computed for several clips of one body at once."""
-        for _, together in groupby(enumerate(alike), key=itemgetter(1)):
-            some = [n for n, _ in together]
-            marks = {part: torch.cat([seen[n][part] for n in some]) for part in seen[0]}
-            found = source.turns(body, marks, joints[some[0]], steep[some[0]])
-            yield from zip(*(values.split([frames[n] for n in some]) for values in found), strict=True)
+        for _, batch in groupby(enumerate(batch_keys), key=itemgetter(1)):
+            clips = [n for n, _ in batch]
+            marks_of_batch = {part: torch.cat([marks_of_clips[n][part] for n in clips]) for part in marks_of_clips[0]}
+            motions = source.rotations(body, marks_of_batch, joints[clips[0]], slopes[clips[0]])
+            yield from zip(*(values.split([frames[n] for n in clips]) for values in motions), strict=True)
 
-    return _made(motion, body, each, turns())
+    return _on_bodies(motion, body, shapes_of_clips, rotations())
 
 
 def shapes_of(motion: MotionSet, body: Body) -> Tensor:
@@ -148,12 +148,11 @@ def retarget(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
         ValueError: the clips have other joints or no rotations, or the shapes have a wrong size.
     """
     _check(motion, body)
-    each = _shapes(shapes, motion, body)
-    scales = standing_heights(body, each) / standing_heights(body, shapes_of(motion, body))
-    turns = (_turns(clip, motion.skeleton) for clip in motion)
-    return _made(
-        motion, body, each, ((local, scale * place) for scale, (local, place) in zip(scales, turns, strict=True))
-    )
+    parameters = _shapes(shapes, motion, body)
+    scales = standing_heights(body, parameters) / standing_heights(body, shapes_of(motion, body))
+    motions = (_local_rotations(clip, motion.skeleton) for clip in motion)
+    scaled = ((local, scale * root) for scale, (local, root) in zip(scales, motions, strict=True))
+    return _on_bodies(motion, body, parameters, scaled)
 
 
 def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
@@ -164,30 +163,30 @@ def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
     Raises:
         ValueError: a clip has no betas, or too few.
     """
-    found = []
+    rows = []
     for clip in motion:
-        said = clip.labels.get("betas", "").split()
-        if len(said) < parameters:
+        values = clip.labels.get("betas", "").split()
+        if len(values) < parameters:
             raise ValueError(
-                f"clip {'/'.join(clip.key)} has {len(said) or 'no'} betas, expected {parameters}; files in AMASS's "
-                "layout contain them, and fitted(motion, body) does not need them"
+                f"clip {'/'.join(clip.key)} has {len(values) or 'no'} betas, expected {parameters}; files in AMASS's "
+                "layout contain them, and fit_to_body(motion, body) does not need them"
             )
-        found.append([float(value) for value in said[:parameters]])
-    return torch.tensor(found, dtype=torch.float64)
+        rows.append([float(number) for number in values[:parameters]])
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 class _Source(NamedTuple):
     """Corresponding joints of a skeleton and of a body.
 
     Attributes:
-        there: joints of the skeleton by part, for the parts that both have.
-        own: joints of the body.
+        source_joints: joints of the skeleton by part, for the parts that both have.
+        body_joints: joints of the body.
         waist, top: parts where the spine begins and ends.
         girdle: part on both sides of the chest.
     """
 
-    there: Mapping[str, int]
-    own: Mapping[str, int]
+    source_joints: Mapping[str, int]
+    body_joints: Mapping[str, int]
     waist: str
     top: str
     girdle: str
@@ -196,43 +195,42 @@ class _Source(NamedTuple):
     def of(cls, motion: MotionSet, body: Body) -> _Source:
         """Match the joints by the meaning of their names."""
         skeleton, pose = motion.skeleton, motion.clips[0].positions[0]
-        there, own = parts(skeleton.names), parts(body.names)
-        if {"l clavicle", "r clavicle"} <= there.keys():
-            ends = [there.pop(f"{side} clavicle") for side in "lr"]
+        source_joints, body_joints = parts(skeleton.names), parts(body.names)
+        if {"l clavicle", "r clavicle"} <= source_joints.keys():
+            ends = [source_joints.pop(f"{side} clavicle") for side in "lr"]
             if np.linalg.norm(pose[ends[0]] - pose[ends[1]]) > APART:
-                there |= {"l clavicle": ends[0], "r clavicle": ends[1]}
+                source_joints |= {"l clavicle": ends[0], "r clavicle": ends[1]}
         # if there are two, the lower one is in the chest
         for part, higher in (("neck", "upperneck"), ("head", "headtop")):
-            there |= {part: there[higher]} if higher in there else {}
-        for what, found, names, needed in (
-            (f"skeleton {skeleton.name!r}", there, skeleton.names, _NEEDED),
-            ("the body", own, body.names, [*_NEEDED, "neck"]),
+            source_joints |= {part: source_joints[higher]} if higher in source_joints else {}
+        for owner, joints, names, required in (
+            (f"skeleton {skeleton.name!r}", source_joints, skeleton.names, _NEEDED),
+            ("the body", body_joints, body.names, [*_NEEDED, "neck"]),
         ):
-            if lacking := [part for part in needed if part not in found]:
+            if missing := [part for part in required if part not in joints]:
                 raise ValueError(
-                    f"{what} has no {', '.join(lacking)}, and motion is fitted to a body by these joints; its joints "
-                    "are "
+                    f"{owner} has no {', '.join(missing)}, which fitting to a body requires; its joints are "
                     f'{", ".join(names)[:600]}. read_motion(..., joints={{"name there": "LHip", ...}}) renames joints'
                 )
-        both = there.keys() & own.keys()
+        both = source_joints.keys() & body_joints.keys()
         return cls(
-            {part: joint for part, joint in there.items() if part in both},
-            own,
+            {part: joint for part, joint in source_joints.items() if part in both},
+            body_joints,
             "spine" if "spine" in both else "pelvis",
             "neck" if "neck" in both else "shoulders",
             "clavicle" if both >= {"l clavicle", "r clavicle"} else "shoulder",
         )
 
-    def seen(self, places: Tensor) -> dict[str, Tensor]:
+    def marks(self, positions: Tensor) -> dict[str, Tensor]:
         """Return positions (..., 3) by part, from the skeleton's joints (..., J, 3)."""
-        return _marks(places, self.there)
+        return _marks(positions, self.source_joints)
 
     def lengths(self, marks: Mapping[str, Tensor]) -> Tensor:
         """Return lengths (..., 8) in metres: limbs (mean of both sides), widths, trunk to shoulders and to top."""
 
         def length(start: str, end: str) -> Tensor:
-            found: Tensor = (marks[end] - marks[start]).norm(dim=-1)
-            return found
+            lengths_of_bone: Tensor = (marks[end] - marks[start]).norm(dim=-1)
+            return lengths_of_bone
 
         bones = [bone for limb in _LIMBS for bone in pairwise(limb.split())]
         limbs = [(length(f"l {a}", f"l {b}") + length(f"r {a}", f"r {b}")) / 2 for a, b in bones]
@@ -247,37 +245,39 @@ class _Source(NamedTuple):
         changes = torch.stack(units, -1) - average[..., None]
 
         def off(shape: np.ndarray) -> np.ndarray:
-            found = self.lengths(_marks(average + changes @ torch.from_numpy(shape), self.own))
-            return np.concatenate([(found - lengths).numpy() / WITHIN, shape])
+            deviation = self.lengths(_marks(average + changes @ torch.from_numpy(shape), self.body_joints))
+            return np.concatenate([(deviation - lengths).numpy() / WITHIN, shape])
 
         return torch.from_numpy(scipy.optimize.least_squares(off, np.zeros(size), bounds=(-MOST, MOST)).x)
 
-    def steepness(self, seen: Iterable[Mapping[str, Tensor]], fps: float) -> Tensor:
+    def steepness(self, clips: Iterable[Mapping[str, Tensor]], fps: float) -> Tensor:
         """Return the median angle of descent from ankles to toes for feet that stand flat; NaN if none does."""
-        found = [torch.zeros(0, dtype=torch.float64)]
-        if self.there.keys() >= {"l toe", "r toe"}:
-            for marks in seen:
+        slopes = [torch.zeros(0, dtype=torch.float64)]
+        if self.source_joints.keys() >= {"l toe", "r toe"}:
+            for marks in clips:
                 for side in "lr":
                     ends = marks[f"{side} ankle"], marks[f"{side} toe"]
                     speeds = [fps * end.diff(dim=0).norm(dim=-1) for end in ends]
-                    found.append(_down(ends[1] - ends[0])[1:][torch.maximum(*speeds) < STILL])
-        every = torch.cat(found)
-        return every.median() if len(every) else every.new_tensor(torch.nan)
+                    slopes.append(_descent(ends[1] - ends[0])[1:][torch.maximum(*speeds) < STILL])
+        all_slopes = torch.cat(slopes)
+        return all_slopes.median() if len(all_slopes) else all_slopes.new_tensor(torch.nan)
 
-    def turns(self, body: Body, seen: Mapping[str, Tensor], joints: Tensor, steep: Tensor) -> tuple[Tensor, Tensor]:
+    def rotations(
+        self, body: Body, targets: Mapping[str, Tensor], joints: Tensor, slope: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return local rotations (F, J, 3, 3) of a clip, and positions of its root (F, 3).
 
         Args:
             body: target body.
-            seen: positions by part, (F, 3) each.
+            targets: positions by part, (F, 3) each.
             joints: (J, 3), joints of the body at rest.
-            steep: result of `steepness`.
+            slope: result of `steepness`.
         """
-        rest, parents, root = _marks(joints, self.own), body.parents, body.parents.index(-1)
+        rest, parents, root = _marks(joints, self.body_joints), body.parents, body.parents.index(-1)
 
         def across(girdle: str, low: str, high: str) -> Tensor:
-            return _turn(
-                *((marks[f"l {girdle}"] - marks[f"r {girdle}"], marks[high] - marks[low]) for marks in (rest, seen))
+            return _align(
+                *((marks[f"l {girdle}"] - marks[f"r {girdle}"], marks[high] - marks[low]) for marks in (rest, targets))
             )
 
         world = {root: across("hip", "hips", self.waist)}
@@ -290,43 +290,45 @@ class _Source(NamedTuple):
 
         def point(start: str, end: str, resting: Tensor | None = None) -> None:
             """Rotate a part by the smallest rotation that aligns it with the direction to another part."""
-            turn, bone = carried(self.own[start]), rest[end] - rest[start] if resting is None else resting
-            world[self.own[start]] = (
-                swing(turn @ normalize(bone, dim=-1), normalize(seen[end] - seen[start], dim=-1)) @ turn
+            turn, bone = carried(self.body_joints[start]), rest[end] - rest[start] if resting is None else resting
+            world[self.body_joints[start]] = (
+                swing(turn @ normalize(bone, dim=-1), normalize(targets[end] - targets[start], dim=-1)) @ turn
             )
 
         bent = from_matrix(world[root].mT @ across(self.girdle, self.waist, self.top), "vector")
-        spine = [parents[self.own["neck"]]]
+        spine = [parents[self.body_joints["neck"]]]
         while parents[spine[0]] != root:
             spine.insert(0, parents[spine[0]])
         ends = [*(joints[joint] for joint in spine), rest[self.top]]
         for n, joint in enumerate(spine, 1):
             world[joint] = world[root] @ to_matrix(n / len(spine) * bent, "vector")
         bones = [world[joint] @ (end - start) for joint, (start, end) in zip(spine, pairwise(ends), strict=True)]
-        lags = swing(normalize(torch.stack(bones).sum(0), dim=-1), normalize(seen[self.top] - seen[self.waist], dim=-1))
-        world |= {joint: lags @ world[joint] for joint in spine}
-        if {"neck", "head"} <= self.there.keys():
+        correction = swing(
+            normalize(torch.stack(bones).sum(0), dim=-1), normalize(targets[self.top] - targets[self.waist], dim=-1)
+        )
+        world |= {joint: correction @ world[joint] for joint in spine}
+        if {"neck", "head"} <= self.source_joints.keys():
             point("neck", "head")
         for side, mirror in (("l ", 1.0), ("r ", -1.0)):
             if self.girdle == "clavicle":
                 point(f"{side}clavicle", f"{side}shoulder")
-            for limb, about in _LIMBS.items():
+            for limb, hinge_axis in _LIMBS.items():
                 start, middle, end = (side + part for part in limb.split())
-                hinge = joints.new_tensor([about[0], mirror * about[1], mirror * about[2]])
+                hinge = joints.new_tensor([hinge_axis[0], mirror * hinge_axis[1], mirror * hinge_axis[2]])
                 point(start, middle)
-                upper, lower = (normalize(seen[b] - seen[a], dim=-1) for a, b in ((start, middle), (middle, end)))
-                bend = upper.cross(lower, dim=-1) + STRETCHED * world[self.own[start]] @ hinge
-                world[self.own[start]] = _turn((rest[middle] - rest[start], hinge), (upper, bend))
+                upper, lower = (normalize(targets[b] - targets[a], dim=-1) for a, b in ((start, middle), (middle, end)))
+                bend = upper.cross(lower, dim=-1) + STRETCHED * world[self.body_joints[start]] @ hinge
+                world[self.body_joints[start]] = _align((rest[middle] - rest[start], hinge), (upper, bend))
                 point(middle, end)
-            if f"{side}toe" in self.there:
+            if f"{side}toe" in self.source_joints:
                 foot = rest[f"{side}toe"] - rest[f"{side}ankle"]
-                point(f"{side}ankle", f"{side}toe", foot if steep.isnan() else _sloping(foot, steep))
-        turns = torch.stack([carried(joint) for joint in range(body.joints)], -3)
-        above = turns[:, [max(parent, 0) for parent in parents]]
-        local = above.mT @ turns
-        local[:, root] = turns[:, root]
+                point(f"{side}ankle", f"{side}toe", foot if slope.isnan() else _direction(foot, slope))
+        world_rotations = torch.stack([carried(joint) for joint in range(body.joints)], -3)
+        parent_rotations = world_rotations[:, [max(parent, 0) for parent in parents]]
+        local = parent_rotations.mT @ world_rotations
+        local[:, root] = world_rotations[:, root]
         hips = (world[root] @ (rest["hips"] - joints[root])[:, None]).squeeze(-1)
-        return local, seen["hips"] - hips
+        return local, targets["hips"] - hips
 
 
 def _marks(places: Tensor, joints: Mapping[str, int]) -> dict[str, Tensor]:
@@ -335,7 +337,7 @@ def _marks(places: Tensor, joints: Mapping[str, int]) -> dict[str, Tensor]:
     return marks | {f"{part}s": (marks[f"l {part}"] + marks[f"r {part}"]) / 2 for part in ("hip", "shoulder")}
 
 
-def _turn(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
+def _align(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
     """Return the rotation (..., 3, 3) that maps one vector onto another, and a second pair as closely as possible."""
     frames = []
     for first, second in (start, end):
@@ -345,12 +347,12 @@ def _turn(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
     return frames[1] @ frames[0].mT
 
 
-def _down(bones: Tensor) -> Tensor:
+def _descent(bones: Tensor) -> Tensor:
     """Return the angle of bones (..., 3) below the horizontal."""
     return torch.atan2(-bones[..., 1], bones[..., [0, 2]].norm(dim=-1))
 
 
-def _sloping(bone: Tensor, angle: Tensor) -> Tensor:
+def _direction(bone: Tensor, angle: Tensor) -> Tensor:
     """Return a unit vector in the horizontal direction of a bone (3,), at this angle below the horizontal."""
     ahead = normalize(bone * bone.new_tensor([1.0, 0, 1]), dim=-1)
     return ahead * angle.cos() - bone.new_tensor([0.0, 1, 0]) * angle.sin()
@@ -376,11 +378,11 @@ def _joints(body: Body, shapes: Tensor) -> Tensor:
 
 def standing_heights(body: Body, shapes: Tensor) -> Tensor:
     """Return heights (N,) of the root above the soles of bodies (N, S) at rest, in metres, float64."""
-    found = []
-    for some in shapes.to(body.template).split(256):
-        vertices, joints = body.at_rest(some)
-        found.append(joints[:, body.parents.index(-1), 1] - vertices[..., 1].amin(-1))
-    return torch.cat(found).double()
+    heights = []
+    for batch in shapes.to(body.template).split(256):
+        vertices, joints = body.at_rest(batch)
+        heights.append(joints[:, body.parents.index(-1), 1] - vertices[..., 1].amin(-1))
+    return torch.cat(heights).double()
 
 
 def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
@@ -393,25 +395,25 @@ def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
     return shapes.detach().cpu().double().expand(len(motion), size)
 
 
-def _kept(motion: MotionSet, body: Body) -> Tensor:
+def _known_shapes(motion: MotionSet, body: Body) -> Tensor:
     """Return shapes (N, S) of motion that has the body's rotations: from joint offsets, or else from bone lengths."""
-    source, found = _Source.of(motion, body), []
+    source, shapes = _Source.of(motion, body), []
     for offsets in resting_offsets(motion):
         shape = body.shape_of(offsets)
         if (body.offsets(shape) - offsets).abs().max() > SAME:
-            shape = source.shape(body, source.lengths(source.seen(resting(body.parents, offsets))))
-        found.append(shape)
-    return torch.stack(found)
+            shape = source.shape(body, source.lengths(source.marks(resting(body.parents, offsets))))
+        shapes.append(shape)
+    return torch.stack(shapes)
 
 
-def _turns(clip: Clip, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
+def _local_rotations(clip: Clip, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
     """Return local rotations (F, J, 3, 3) of a clip, and positions of its root (F, 3)."""
     assert clip.rotations is not None
     local = to_matrix(tensor_of(clip.rotations).double(), "quaternion")
     return local, tensor_of(clip.positions[:, skeleton.root]).double()
 
 
-def _turned_alike(motion: MotionSet, body: Body) -> bool:
+def _has_matching_rotations(motion: MotionSet, body: Body) -> bool:
     """Return whether the rotations belong to the body's joints and refer to a similar rest pose."""
     skeleton = motion.skeleton
     if not skeleton.rest or any(clip.rotations is None for clip in motion):
@@ -424,7 +426,7 @@ def _turned_alike(motion: MotionSet, body: Body) -> bool:
 
 
 def _check(motion: MotionSet, body: Body) -> None:
-    if not _turned_alike(motion, body):
+    if not _has_matching_rotations(motion, body):
         raise ValueError(
             f"{motion.name or 'this motion'} does not have the joints of the body, or its rotations do not start from "
             "its rest pose; dvae.motion.bodies.fit_to_body converts it"
@@ -438,25 +440,25 @@ def _y_up(motion: MotionSet) -> MotionSet:
     turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     clips = []
     for clip in motion:
-        turns = clip.rotations
-        if turns is not None:
-            local, _ = _turns(clip, motion.skeleton)
+        rotations = clip.rotations
+        if rotations is not None:
+            local, _ = _local_rotations(clip, motion.skeleton)
             local[:, motion.skeleton.root] = turn @ local[:, motion.skeleton.root]
-            turns = continuous(from_matrix(local, "quaternion")).numpy()
-        clips.append(replace(clip, positions=clip.positions @ turn.numpy().T, rotations=turns))
+            rotations = continuous(from_matrix(local, "quaternion")).numpy()
+        clips.append(replace(clip, positions=clip.positions @ turn.numpy().T, rotations=rotations))
     return replace(motion, clips=clips, skeleton=replace(motion.skeleton, up="y"))
 
 
-def _made(motion: MotionSet, body: Body, shapes: Tensor, turns: Iterable[tuple[Tensor, Tensor]]) -> MotionSet:
+def _on_bodies(motion: MotionSet, body: Body, shapes: Tensor, rotations: Iterable[tuple[Tensor, Tensor]]) -> MotionSet:
     """Return clips on bodies (N, S) with local rotations (F, J, 3, 3) and root positions (F, 3)."""
     offsets, clips = body.offsets(shapes), []
-    for clip, bones, (local, place) in zip(motion, offsets, turns, strict=True):
+    for clip, bones, (local, root) in zip(motion, offsets, rotations, strict=True):
         quaternions = continuous(from_matrix(local, "quaternion")).numpy()
-        positions, _ = forward(body.parents, local, bones, place)
+        positions, _ = forward(body.parents, local, bones, root)
         clips.append(replace(clip, positions=positions.numpy(), rotations=quaternions))
-    own = motion.skeleton
+    source = motion.skeleton
     rest = tuple(offsets.mean(0).flatten().tolist())
-    skeleton = Skeleton(body.names, body.parents, *sides(body.names), "y", own.fps, own.name, rest=rest)
+    skeleton = Skeleton(body.names, body.parents, *sides(body.names), "y", source.fps, source.name, rest=rest)
     return MotionSet(
         clips, skeleton, motion.name, copy=False, skipped=motion.skipped, interpretation=motion.interpretation
     )

@@ -227,11 +227,11 @@ def human() -> Body:
         >>> float(tall[:, 1].max() - tall[:, 1].min()) > 1.8
         True
     """
-    return Body(JOINTS, PARENTS, *(tensor.clone() for tensor in _made()))
+    return Body(JOINTS, PARENTS, *(tensor.clone() for tensor in _arrays()))
 
 
 @cache
-def _made() -> tuple[Tensor, ...]:
+def _arrays() -> tuple[Tensor, ...]:
     """Return template, shapes, regressor, weights and faces; computed once."""
     average = _vertices(torch.zeros(len(SHAPE), dtype=torch.float64))
     changes = [_vertices(unit) - average for unit in torch.eye(len(SHAPE), dtype=torch.float64)]
@@ -240,10 +240,10 @@ def _made() -> tuple[Tensor, ...]:
     first = 0
     for name, side in _sided():
         around, _, _, rings = part = _PARTS[name]
-        for place, ring in enumerate(rings):
+        for index, ring in enumerate(rings):
             joint = _joint(ring.start, side)
             if joint is not None and ring.along == 0:
-                regressor[joint, [first + place * around, first + place * around + around // 2]] = 0.5
+                regressor[joint, [first + index * around, first + index * around + around // 2]] = 0.5
         vertices = average[first : first + len(rings) * around + 2]
         triangles = _triangles(len(rings), around)
         faces.append(first + (triangles if enclosed_volume(vertices, triangles) > 0 else triangles.flip(-1)))
@@ -260,7 +260,7 @@ def _sided() -> list[tuple[str, str]]:
 
 def _joint(name: str, side: str) -> int | None:
     """Return the index of a joint by its name, with or without the side; None for an end that is not a joint."""
-    return next((JOINTS.index(known) for known in (name, side + name) if known in JOINTS), None)
+    return next((JOINTS.index(joint) for joint in (name, side + name) if joint in JOINTS), None)
 
 
 def _places(parameters: Tensor) -> dict[str, Tensor]:
@@ -268,53 +268,53 @@ def _places(parameters: Tensor) -> dict[str, Tensor]:
     shape = dict(zip(SHAPE, parameters, strict=True))
     places = {"Pelvis": parameters.new_zeros(3)}
     for name, (parent, offset) in _BONES.items():
-        grown = (1 + _SIZE * shape["size"]).repeat(3)
+        scale = (1 + _SIZE * shape["size"]).repeat(3)
         for parameter, (share, axes, bones) in _LENGTHS.items():
             if name in bones:
-                grown[["xyz".index(axis) for axis in axes]] += share * shape[parameter]
-        places[name] = places[parent] + grown * parameters.new_tensor(offset)
+                scale[["xyz".index(axis) for axis in axes]] += share * shape[parameter]
+        places[name] = places[parent] + scale * parameters.new_tensor(offset)
     return places
 
 
 def _vertices(parameters: Tensor) -> Tensor:
     """Return the vertices (V, 3) of a person with parameters (8,): each part's rings, then the centres of its ends."""
     places = _places(parameters)
-    found = []
+    parts = []
     for name, side in _sided():
         part = _PARTS[name]
         rings = [_ring(name, ring, places, parameters) for ring in part.rings]
-        whole = torch.cat([*rings, rings[0].mean(0, keepdim=True), rings[-1].mean(0, keepdim=True)])
-        found.append(whole * whole.new_tensor([-1.0, 1, 1]) if side == "R_" else whole)
-    return torch.cat(found)
+        vertices = torch.cat([*rings, rings[0].mean(0, keepdim=True), rings[-1].mean(0, keepdim=True)])
+        parts.append(vertices * vertices.new_tensor([-1.0, 1, 1]) if side == "R_" else vertices)
+    return torch.cat(parts)
 
 
 def _ring(name: str, ring: _Ring, places: Mapping[str, Tensor], parameters: Tensor) -> Tensor:
     """Return the vertices of a ring of a part, (around, 3)."""
     around, axes, *_ = _PARTS[name]
     shape = dict(zip(SHAPE, parameters, strict=True))
-    grown = (1 + _SIZE * shape["size"]).repeat(2)  # width and depth
+    scale = (1 + _SIZE * shape["size"]).repeat(2)  # width and depth
     for parameter, (*shares, parts, bones) in _GIRTHS.items():
         if name in parts and (not bones or ring.start in bones):
-            grown += shape[parameter] * parameters.new_tensor(shares)
+            scale += shape[parameter] * parameters.new_tensor(shares)
     angle = 2 * pi / around * torch.arange(around).to(parameters)
     depth = torch.where(angle <= pi, ring.front, ring.back)
     vertices = torch.lerp(places[ring.start], places[ring.end], ring.along).repeat(around, 1)
-    vertices[:, "xyz".index(axes[0])] += grown[0] * ring.width * angle.cos()
-    vertices[:, "xyz".index(axes[1])] += grown[1] * depth * angle.sin()
+    vertices[:, "xyz".index(axes[0])] += scale[0] * ring.width * angle.cos()
+    vertices[:, "xyz".index(axes[1])] += scale[1] * depth * angle.sin()
     return vertices
 
 
 def _triangles(rings: int, around: int) -> Tensor:
     """Return the triangles (F, 3) of a chain of rings with a centre at both ends."""
-    place = torch.arange(rings * around).reshape(rings, around)
-    after = place.roll(-1, 1)
-    low, low_after, high, high_after = place[:-1], after[:-1], place[1:], after[1:]
+    index = torch.arange(rings * around).reshape(rings, around)
+    after = index.roll(-1, 1)
+    low, low_after, high, high_after = index[:-1], after[:-1], index[1:], after[1:]
     ends = [torch.full((around,), rings * around + end) for end in (0, 1)]
     triangles = [
         torch.stack([low, high_after, low_after], -1).flatten(0, 1),
         torch.stack([low, high, high_after], -1).flatten(0, 1),
-        torch.stack([ends[0], place[0], after[0]], -1),
-        torch.stack([ends[1], after[-1], place[-1]], -1),
+        torch.stack([ends[0], index[0], after[0]], -1),
+        torch.stack([ends[1], after[-1], index[-1]], -1),
     ]
     return torch.cat(triangles)
 
@@ -333,10 +333,10 @@ def _weights(part: _Part, side: str, vertices: Tensor) -> Tensor:
     for joint in joints:
         bones = [places[end] for end, (start, _) in _BONES.items() if start == joint]
         distances.append(torch.stack([_distance(mirrored, places[joint], end) for end in bones]).amin(0))
-    nearest, which = torch.stack(distances, -1).topk(min(_MOST, len(joints)), largest=False)
+    nearest, indices = torch.stack(distances, -1).topk(min(_MOST, len(joints)), largest=False)
     columns = torch.tensor([_joint(joint, side) for joint in joints])
     weights = vertices.new_zeros(len(vertices), len(JOINTS))
-    return weights.scatter(1, columns[which], (-nearest / _REACH).softmax(-1))
+    return weights.scatter(1, columns[indices], (-nearest / _REACH).softmax(-1))
 
 
 def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:

@@ -67,8 +67,8 @@ class Body(nn.Module):
         }
         for name, (tensor, sizes) in expected.items():
             if tensor.shape != sizes:
-                known = f"{vertices} vertices and {joints} joints"
-                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {sizes} for {known}")
+                sizes_of_body = f"{vertices} vertices and {joints} joints"
+                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {sizes} for {sizes_of_body}")
             self.register_buffer(name, tensor, persistent=False)
         self.names, self.parents = tuple(names), tuple(parents)
 
@@ -100,8 +100,8 @@ class Body(nn.Module):
         """
         average, changes = self._bones()
         parameters = torch.linalg.pinv(changes.flatten(0, 1), rtol=UNTOLD)
-        found: Tensor = parameters @ (offsets.to(average) - average).flatten(-2)[..., None]
-        return found.squeeze(-1).to(offsets)
+        values: Tensor = parameters @ (offsets.to(average) - average).flatten(-2)[..., None]
+        return values.squeeze(-1).to(offsets)
 
     def _bones(self) -> tuple[Tensor, Tensor]:
         """Return offsets of the average body (J, 3) and their changes per parameter (J, 3, S), both float64."""
@@ -127,7 +127,7 @@ class Body(nn.Module):
             ValueError: the shapes of the arguments do not match the body or each other.
         """
         moves, joints = self._posed(shape, rotations, translation)
-        vertices = (_flat(moves) @ self._hung(shape).mT).unflatten(-2, (-1, 3)).mT
+        vertices = (_flat(moves) @ self._weighted(shape).mT).unflatten(-2, (-1, 3)).mT
         # added last, because rounding errors grow with the distance from the origin
         return vertices + translation[..., None, :], joints + translation[..., None, :]
 
@@ -145,23 +145,25 @@ class Body(nn.Module):
         if vertices.dim() == 1:
             resting = _changed(self.template[vertices], self.shapes[vertices], shape).mT[..., None, None, :, :]
             # weights first, because all bodies share them: in the other order, second derivatives take twice as long
-            moved = moves.movedim(-3, -1).contiguous() @ self.weights[vertices].mT  # (..., T, 3, 4, M)
-            placed = (moved[..., :3, :] * resting).sum(-2) + moved[..., 3, :]
-            return placed.mT + translation[..., None, :]
+            transforms = moves.movedim(-3, -1).contiguous() @ self.weights[vertices].mT  # (..., T, 3, 4, M)
+            positions = (transforms[..., :3, :] * resting).sum(-2) + transforms[..., 3, :]
+            return positions.mT + translation[..., None, :]
         frames = translation.shape[:-1]
-        which = vertices.flatten(-2)[..., None].expand(*frames[:-1], -1, 3)
-        resting = self.at_rest(shape)[0].gather(-2, which).unflatten(-2, vertices.shape[-2:])
+        vertex_indices = vertices.flatten(-2)[..., None].expand(*frames[:-1], -1, 3)
+        resting = self.at_rest(shape)[0].gather(-2, vertex_indices).unflatten(-2, vertices.shape[-2:])
         rows = torch.arange(frames.numel(), device=vertices.device).reshape(*frames, 1) * self.joints
-        weights, joints = self._carried
-        moved = torch.zeros_like(resting[..., None])
+        weights, joints = self._nonzero_weights
+        transforms = torch.zeros_like(resting[..., None])
         for share, joint in zip(weights.unbind(-1), joints.unbind(-1), strict=True):
-            going = moves.flatten(-2).flatten(0, -2)[rows + joint[vertices]].unflatten(-1, (3, 4))
-            moved = moved + share[vertices][..., None, None] * going
-        found: Tensor = (moved[..., :3] @ resting[..., None]).squeeze(-1) + moved[..., 3] + translation[..., None, :]
-        return found
+            transform = moves.flatten(-2).flatten(0, -2)[rows + joint[vertices]].unflatten(-1, (3, 4))
+            transforms = transforms + share[vertices][..., None, None] * transform
+        positions: Tensor = (
+            (transforms[..., :3] @ resting[..., None]).squeeze(-1) + transforms[..., 3] + translation[..., None, :]
+        )
+        return positions
 
     @property
-    def _carried(self) -> tuple[Tensor, Tensor]:
+    def _nonzero_weights(self) -> tuple[Tensor, Tensor]:
         """The largest skinning weights of each vertex (V, K), and their joints; all other weights are 0."""
         return self.weights.topk(int((self.weights > 0).sum(-1).max()), -1)
 
@@ -178,17 +180,19 @@ class Body(nn.Module):
         """
         for motion in (first, second):
             self._check(shape, *motion)
-        surface = self._hung(shape)
+        surface = self._weighted(shape)
         form = surface.mT @ surface / surface.shape[-2]
         pivots = self._pivots(shape)
-        ours, theirs = (_flat(_posed(pivots, rotations, self.parents)[0]) for rotations, _ in (first, second))
-        apart = (ours - theirs).unflatten(-1, (-1, 4))
-        moved = (first[1] - second[1]).flatten(-2)[..., None]  # the same for all joints, because weights sum to 1
-        apart = torch.cat([apart[..., :3], apart[..., 3:] + moved[..., None, :]], -1).flatten(-2)
-        found: Tensor = ((apart @ form) * apart).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
-        return found
+        first_transforms, second_transforms = (
+            _flat(_posed(pivots, rotations, self.parents)[0]) for rotations, _ in (first, second)
+        )
+        difference = (first_transforms - second_transforms).unflatten(-1, (-1, 4))
+        translation = (first[1] - second[1]).flatten(-2)[..., None]  # the same for all joints, because weights sum to 1
+        difference = torch.cat([difference[..., :3], difference[..., 3:] + translation[..., None, :]], -1).flatten(-2)
+        errors: Tensor = ((difference @ form) * difference).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
+        return errors
 
-    def _hung(self, shape: Tensor) -> Tensor:
+    def _weighted(self, shape: Tensor) -> Tensor:
         """Return vertices at rest, weighted by joint, (..., V, 4 J)."""
         resting = _changed(self.template, self.shapes, shape)
         surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
@@ -219,9 +223,9 @@ def _posed(pivots: Tensor, rotations: Tensor, parents: tuple[int, ...]) -> tuple
     pivots = pivots[..., None, :, :]
     offsets = pivots - pivots.index_select(-2, indices([max(parent, 0) for parent in parents], pivots))
     root = pivots[..., parents.index(-1), :].expand(*rotations.shape[:-3], 3)
-    joints, turns = forward(parents, rotations, offsets, root)
-    moved = joints - (turns @ pivots[..., None]).squeeze(-1)
-    return torch.cat([turns, moved[..., None]], -1), joints
+    joints, world = forward(parents, rotations, offsets, root)
+    translations = joints - (world @ pivots[..., None]).squeeze(-1)
+    return torch.cat([world, translations[..., None]], -1), joints
 
 
 def _flat(moves: Tensor) -> Tensor:
@@ -233,5 +237,5 @@ def _changed(average: Tensor, changes: Tensor, shape: Tensor) -> Tensor:
     """Return points (..., M, 3): their averages (M, 3) plus their changes (M, 3, S) by parameters (..., S)."""
     if shape.shape[-1:] != changes.shape[-1:]:
         raise ValueError(f"shape is {tuple(shape.shape)}, expected (..., {changes.shape[-1]})")
-    found: Tensor = average + (shape @ changes.flatten(0, 1).mT).unflatten(-1, (-1, 3))
-    return found
+    points: Tensor = average + (shape @ changes.flatten(0, 1).mT).unflatten(-1, (-1, 3))
+    return points

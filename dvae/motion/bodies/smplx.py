@@ -56,43 +56,43 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
         for name in _MEMBERS:
             if members[name].size > LARGEST:
                 raise ValueError(f"{path}: {name} has {members[name].size:,} bytes; a body has at most {LARGEST:,}")
-        found = {name: members[name].array() for name in _MEMBERS}
-    if reason := _defect(found, shapes):
+        arrays = {name: members[name].array() for name in _MEMBERS}
+    if reason := _defect(arrays, shapes):
         raise ValueError(f"{path}: {reason}")
-    tensors = [torch.from_numpy(found[name].astype(np.float32)) for name in ("v_template", "J_regressor", "weights")]
+    tensors = [torch.from_numpy(arrays[name].astype(np.float32)) for name in ("v_template", "J_regressor", "weights")]
     template, regressor, weights = tensors
-    changes = torch.from_numpy(found["shapedirs"][..., :shapes].astype(np.float32))
-    faces = torch.from_numpy(found["f"].astype(np.int64))
+    changes = torch.from_numpy(arrays["shapedirs"][..., :shapes].astype(np.float32))
+    faces = torch.from_numpy(arrays["f"].astype(np.int64))
     goes_with = list(range(len(JOINTS)))
-    for parent in found["kintree_table"][0, len(JOINTS) :]:
+    for parent in arrays["kintree_table"][0, len(JOINTS) :]:
         goes_with.append(goes_with[int(parent)])
-    kept = torch.zeros(len(template), len(JOINTS)).index_add(1, torch.tensor(goes_with), weights)
-    return Body(JOINTS, PARENTS, template, changes, regressor[: len(JOINTS)], kept, faces)
+    weights_of_joints = torch.zeros(len(template), len(JOINTS)).index_add(1, torch.tensor(goes_with), weights)
+    return Body(JOINTS, PARENTS, template, changes, regressor[: len(JOINTS)], weights_of_joints, faces)
 
 
-def _defect(found: dict[str, np.ndarray], shapes: int) -> str:
+def _defect(arrays: dict[str, np.ndarray], shapes: int) -> str:
     """Return the reason why arrays are not a body, or an empty string if they are."""
     sizes: dict[str | int, int] = {2: 2, 3: 3}
     for name, axes in _MEMBERS.items():
-        array, whole = found[name], name in ("kintree_table", "f")
+        array, is_integer = arrays[name], name in ("kintree_table", "f")
         for axis, size in zip(axes, array.shape, strict=False):
             sizes.setdefault(axis, size)
         expected = tuple(sizes.get(axis, 0) for axis in axes)
-        if array.shape != expected or not array.size or array.dtype.kind not in ("iu" if whole else "fiu"):
-            kind = "whole numbers" if whole else "numbers"
+        if array.shape != expected or not array.size or array.dtype.kind not in ("iu" if is_integer else "fiu"):
+            kind = "whole numbers" if is_integer else "numbers"
             return f"{name} holds {array.dtype} {array.shape}, expected {kind} ({', '.join(map(str, axes))})"
-        if not whole and not (np.abs(array) <= FURTHEST).all():
+        if not is_integer and not (np.abs(array) <= FURTHEST).all():
             return f"{name} holds numbers that are NaN or beyond {FURTHEST:g}"
     if sizes["V"] > MOST_VERTICES:
         return f"it has {sizes['V']:,} vertices; a body has at most {MOST_VERTICES:,}"
     if not 1 <= shapes <= sizes["S"]:
         return f"it has {sizes['S']} parameters of shape, not {shapes}; give their number with shapes="
-    parents = found["kintree_table"][0].astype(np.int64)
+    parents = arrays["kintree_table"][0].astype(np.int64)
     if tuple(parents[1 : len(JOINTS)]) != PARENTS[1:] or not (parents[1:] < np.arange(1, len(parents))).all():
         return f"its tree is not SMPL's; expected the first joints {', '.join(JOINTS)}"
-    if (parents[1:] < 0).any() or found["f"].min() < 0 or found["f"].max() >= sizes["V"]:
+    if (parents[1:] < 0).any() or arrays["f"].min() < 0 or arrays["f"].max() >= sizes["V"]:
         return f"a face or a joint refers to an index that does not exist; it has {sizes['V']} vertices"
     for name in ("weights", "J_regressor"):
-        if not np.allclose(found[name].astype(np.float64).sum(1), 1, atol=1e-3):
+        if not np.allclose(arrays[name].astype(np.float64).sum(1), 1, atol=1e-3):
             return f"{name} must be shares that add up to 1, but they do not"
     return ""

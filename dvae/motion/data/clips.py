@@ -60,8 +60,8 @@ class Clip:
 
     @override
     def __repr__(self) -> str:
-        turns = "" if self.rotations is None else ", with rotations"
-        return f"Clip({self.split}/{self.name}: {self.frames} frames of {self.positions.shape[1]} joints{turns})"
+        suffix = "" if self.rotations is None else ", with rotations"
+        return f"Clip({self.split}/{self.name}: {self.frames} frames of {self.positions.shape[1]} joints{suffix})"
 
     @property
     def key(self) -> tuple[str, str]:
@@ -75,9 +75,9 @@ class Clip:
 
     def between(self, start: int, end: int) -> Clip:
         """Return the frames from `start` to before `end`."""
-        turns = None if self.rotations is None else self.rotations[start:end]
+        rotations = None if self.rotations is None else self.rotations[start:end]
         truth = {k: v[start:end] if v.shape[:1] == (self.frames,) else v for k, v in self.truth.items()}
-        return replace(self, positions=self.positions[start:end], rotations=turns, truth=truth)
+        return replace(self, positions=self.positions[start:end], rotations=rotations, truth=truth)
 
     def resampled(self, ratio: float) -> Clip:
         """Return the clip with one frame for every `ratio` frames, a real number.
@@ -86,26 +86,28 @@ class Clip:
         arc. Simulator variables (`truth`) are dropped.
         """
         if abs(ratio - round(ratio)) < 1e-6 and ratio >= 1:
-            every = round(ratio)
-            turns = None if self.rotations is None else self.rotations[::every]
-            return replace(self, positions=self.positions[::every], rotations=turns, truth={})
-        at = np.arange(int((self.frames - 1) / ratio + 1e-6) + 1) * ratio
-        before = np.minimum(at.astype(int), max(self.frames - 2, 0))
+            step = round(ratio)
+            rotations = None if self.rotations is None else self.rotations[::step]
+            return replace(self, positions=self.positions[::step], rotations=rotations, truth={})
+        times = np.arange(int((self.frames - 1) / ratio + 1e-6) + 1) * ratio
+        before = np.minimum(times.astype(int), max(self.frames - 2, 0))
         after = np.minimum(before + 1, self.frames - 1)
-        part = (at - before)[:, None, None]
+        part = (times - before)[:, None, None]
         first, second = np.where(part < 1, self.positions[before], 0), np.where(part > 0, self.positions[after], 0)
         positions = (1 - part) * first + part * second  # a frame of weight 0 may be missing
-        turns = None if self.rotations is None else _between(self.rotations[before], self.rotations[after], part)
-        return replace(self, positions=positions.astype(self.positions.dtype), rotations=turns, truth={})
+        rotations = self.rotations
+        if rotations is not None:
+            rotations = _interpolate_quaternions(rotations[before], rotations[after], part)
+        return replace(self, positions=positions.astype(self.positions.dtype), rotations=rotations, truth={})
 
 
-def _between(first: np.ndarray, second: np.ndarray, part: np.ndarray) -> np.ndarray:
+def _interpolate_quaternions(first: np.ndarray, second: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Interpolate quaternions (..., 4) along the shortest arc (Shoemake 1985)."""
     cosine = (first * second).sum(-1, keepdims=True)
     second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine).clip(max=1)
     angle = np.maximum(np.arccos(cosine), 1e-6)  # below this, sines and angles agree
-    found = (np.sin((1 - part) * angle) * first + np.sin(part * angle) * second) / np.sin(angle)
-    return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True), first.dtype)
+    quaternions = (np.sin((1 - part) * angle) * first + np.sin(part * angle) * second) / np.sin(angle)
+    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True), first.dtype)
 
 
 def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
@@ -116,47 +118,47 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
         skeleton: skeleton that the clip should match.
         missing: whether joints may be NaN in some frames.
     """
-    where, positions = f"clip {clip.split}/{clip.name}", clip.positions
+    label, positions = f"clip {clip.split}/{clip.name}", clip.positions
     if positions.dtype.kind not in "fiu":
-        return f"{where} holds {positions.dtype}, expected numbers"
+        return f"{label} holds {positions.dtype}, expected numbers"
     if positions.ndim != 3 or positions.shape[2] != 3:
-        return f"{where} has shape {positions.shape}, expected (frames, joints, 3)"
+        return f"{label} has shape {positions.shape}, expected (frames, joints, 3)"
     if positions.shape[1] != skeleton.joints:
-        return f"{where} has {positions.shape[1]} joints, skeleton {skeleton.name!r} has {skeleton.joints}"
+        return f"{label} has {positions.shape[1]} joints, skeleton {skeleton.name!r} has {skeleton.joints}"
     if not len(positions):
-        return f"{where} has no frames"
+        return f"{label} has no frames"
     count = frames = 0
-    first, seen = (0, 0), False
+    first, any_observed = (0, 0), False
     for rows in ranges(positions):
         with np.errstate(over="ignore"):
-            some = positions[rows].astype(np.float32, copy=False)
-        lacking = ~np.isfinite(some).all(axis=2)
-        seen |= not lacking.all()
-        bad = np.asarray(np.isinf(some).any(axis=2) if missing else lacking)
-        if bad.any():
-            frame, joint = np.argwhere(bad)[0]
+            values = positions[rows].astype(np.float32, copy=False)
+        is_missing = ~np.isfinite(values).all(axis=2)
+        any_observed |= not is_missing.all()
+        is_invalid = np.asarray(np.isinf(values).any(axis=2) if missing else is_missing)
+        if is_invalid.any():
+            frame, joint = np.argwhere(is_invalid)[0]
             first = first if count else (rows.start + frame, joint)
-            count, frames = count + bad.sum(), frames + bad.any(axis=1).sum()
+            count, frames = count + is_invalid.sum(), frames + is_invalid.any(axis=1).sum()
     if count:
-        what = "infinite" if missing else "NaN or infinite"
-        kept = not missing and not defect(clip, skeleton, missing=True)
-        hint = "; missing=True (--missing) keeps the clip, with these joints missing" if kept else ""
+        kind = "infinite" if missing else "NaN or infinite"
+        can_keep = not missing and not defect(clip, skeleton, missing=True)
+        hint = "; missing=True (--missing) keeps the clip, with these joints missing" if can_keep else ""
         return (
-            f"{where} has {what} positions, or positions beyond float32: {count} joint positions in "
+            f"{label} has {kind} positions, or positions beyond float32: {count} joint positions in "
             f"{frames} of {clip.frames} frames, first {skeleton.names[first[1]]} at frame {first[0]}{hint}"
         )
-    if not seen:
-        return f"{where} has no joint that is observed in any of its {clip.frames} frames"
+    if not any_observed:
+        return f"{label} has no joint that is observed in any of its {clip.frames} frames"
     if clip.rotations is not None:
         if clip.rotations.shape != (*positions.shape[:2], 4) or clip.rotations.dtype.kind != "f":
-            return f"{where} has rotations {clip.rotations.shape}, expected quaternions {(*positions.shape[:2], 4)}"
-        if not all((np.abs(np.square(some).sum(-1) - 1) < 1e-3).all() for some in blocks(clip.rotations)):
-            return f"{where} has rotations that are not unit quaternions"
+            return f"{label} has rotations {clip.rotations.shape}, expected quaternions {(*positions.shape[:2], 4)}"
+        if not all((np.abs(np.square(values).sum(-1) - 1) < 1e-3).all() for values in blocks(clip.rotations)):
+            return f"{label} has rotations that are not unit quaternions"
     extent = float(np.median(extents(some_frames(positions)).max(axis=1)))
     if not SMALLEST <= extent <= TALLEST:
         unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
         return (
-            f"{where} shows a person of {extent:.4g} m (median over frames of the body's largest extent, "
+            f"{label} shows a person of {extent:.4g} m (median over frames of the body's largest extent, "
             f"expected {SMALLEST} to {TALLEST} m): it looks like {unit}; convert the positions to metres"
         )
     return None
@@ -167,30 +169,30 @@ def some_frames(positions: np.ndarray) -> np.ndarray:
 
     Return all frames if each of the chosen frames has missing joints.
     """
-    some = positions[:: -(-len(positions) // MOST_FRAMES)]
-    return positions if np.isnan(some).any(axis=2).all() else some
+    selected = positions[:: -(-len(positions) // MOST_FRAMES)]
+    return positions if np.isnan(selected).any(axis=2).all() else selected
 
 
 def extents(positions: np.ndarray) -> np.ndarray:
     """Return the extents (frames, 3) of the body along each axis, for the frames of (F, J, 3) with the most joints."""
     poses = fullest(positions)
-    found: np.ndarray = np.nanmax(poses, axis=1) - np.nanmin(poses, axis=1).astype(np.float64)
-    return found
+    extent: np.ndarray = np.nanmax(poses, axis=1) - np.nanmin(poses, axis=1).astype(np.float64)
+    return extent
 
 
 def fullest(positions: np.ndarray) -> np.ndarray:
     """Return the frames of (F, J, 3) that have the most observed joints."""
-    there = (~np.isnan(positions).any(axis=2)).sum(axis=1)
-    full: np.ndarray = there == there.max()
-    return positions if full.all() else positions[full]  # copy only if frames were dropped
+    counts = (~np.isnan(positions).any(axis=2)).sum(axis=1)
+    is_full: np.ndarray = counts == counts.max()
+    return positions if is_full.all() else positions[is_full]  # copy only if frames were dropped
 
 
-def _taken(values: np.ndarray, copy: bool = True) -> np.ndarray:
+def _as_float32(values: np.ndarray, copy: bool = True) -> np.ndarray:
     """Return values as float32 in C order, copied if `copy` is set and memory is shared; mapped arrays stay mapped."""
     if is_mapped(values) and values.dtype == np.float32 and values.flags.c_contiguous:
         return values
-    found = np.require(values, np.float32, ["C", "A", "W"])
-    return found.copy() if copy and np.may_share_memory(found, values) else found
+    array = np.require(values, np.float32, ["C", "A", "W"])
+    return array.copy() if copy and np.may_share_memory(array, values) else array
 
 
 @dataclass(init=False, frozen=True, eq=False)
@@ -234,37 +236,37 @@ class MotionSet:
         interpretation: str = "",
         missing: bool = False,
     ) -> None:
-        single, left_out, what = [], list(skipped), name or "motion set"
+        usable, left_out, label = [], list(skipped), name or "motion set"
         for clip in clips:  # lets an iterator free each clip after it was taken over
             if reason := defect(clip, skeleton, missing):
                 if not skip_bad:
-                    raise ValueError(f"{what}: {reason}")
+                    raise ValueError(f"{label}: {reason}")
                 left_out.append((*clip.key, reason))
                 del clip
                 continue
-            positions = _taken(clip.positions, copy)
-            if missing and any((np.isnan(some).sum(axis=2) % 3).any() for some in blocks(positions)):
+            positions = _as_float32(clip.positions, copy)
+            if missing and any((np.isnan(block).sum(axis=2) % 3).any() for block in blocks(positions)):
                 positions = positions.copy() if is_mapped(positions) else positions
                 positions[np.isnan(positions).any(axis=2)] = np.nan
-            turns = None if clip.rotations is None else _taken(clip.rotations)
-            single.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth, turns))
+            rotations = None if clip.rotations is None else _as_float32(clip.rotations)
+            usable.append(Clip(clip.split, clip.name, positions, clip.labels, clip.truth, rotations))
             del clip, positions
-        if not single:
+        if not usable:
             dropped = f"; {len(left_out)} were skipped, the first: {left_out[0][2]}" if left_out else ""
-            raise ValueError(f"{what}: no clips{dropped}")
-        twice = [key for key, count in Counter(clip.key for clip in single).items() if count > 1]
-        if twice:
-            raise ValueError(f"{what}: clip {'/'.join(twice[0])} occurs twice")
-        fields = {"clips": tuple(single), "skeleton": skeleton, "name": name, "skipped": tuple(left_out)}
+            raise ValueError(f"{label}: no clips{dropped}")
+        repeated = [key for key, count in Counter(clip.key for clip in usable).items() if count > 1]
+        if repeated:
+            raise ValueError(f"{label}: clip {'/'.join(repeated[0])} occurs twice")
+        fields = {"clips": tuple(usable), "skeleton": skeleton, "name": name, "skipped": tuple(left_out)}
         vars(self).update(
-            fields, interpretation=interpretation, missing=missing, _index={clip.key: clip for clip in single}
+            fields, interpretation=interpretation, missing=missing, _index={clip.key: clip for clip in usable}
         )
 
     @override
     def __repr__(self) -> str:
         frames, skeleton = sum(clip.frames for clip in self), self.skeleton
-        what = f"{len(self)} clips, {frames} frames of {skeleton.joints} joints at {skeleton.fps:g} a second"
-        return f"MotionSet({self.name or 'no name'}: {what})"
+        contents = f"{len(self)} clips, {frames} frames of {skeleton.joints} joints at {skeleton.fps:g} a second"
+        return f"MotionSet({self.name or 'no name'}: {contents})"
 
     def __len__(self) -> int:
         return len(self.clips)
@@ -292,36 +294,36 @@ class MotionSet:
         """
         if self.skeleton.rest and all(clip.rotations is not None for clip in self):
             return self
-        if lacking := [clip for clip in self if clip.rotations is None and np.isnan(clip.positions).any()]:
+        if incomplete := [clip for clip in self if clip.rotations is None and np.isnan(clip.positions).any()]:
             raise ValueError(
-                f"clip {'/'.join(lacking[0].key)} has missing joints, so its rotations are not known; remove the clip, "
+                f"clip {'/'.join(incomplete[0].key)} has missing joints, so its rotations are not known; remove it, "
                 "or fill its gaps first (`dvae impute RUN --filled FILE`)"
             )
-        found: MotionSet | None = self.__dict__.get("_turned")
-        if found is None:  # cached, because all splits use it
+        result: MotionSet | None = self.__dict__.get("_with_rotations")
+        if result is None:  # cached, because all splits use it
             skeleton = self.skeleton
             if not skeleton.rest:
-                every = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
-                some = torch.cat([tensor_of(clip.positions[::every]) for clip in self])
-                skeleton = replace(skeleton, rest=tuple(rest(skeleton, some.double()).flatten().tolist()))
+                step = -(-sum(clip.frames for clip in self) // MOST_FRAMES)
+                poses = torch.cat([tensor_of(clip.positions[::step]) for clip in self])
+                skeleton = replace(skeleton, rest=tuple(rest(skeleton, poses.double()).flatten().tolist()))
 
-            def turned() -> Iterator[Clip]:
+            def rotated_clips() -> Iterator[Clip]:
                 for clip in self:
                     if not self.skeleton.rest or clip.rotations is None:
-                        turns = inverse(skeleton, tensor_of(clip.positions).double(), skeleton.offsets)
-                        clip = replace(clip, rotations=continuous(from_matrix(turns, "quaternion")).numpy())
+                        rotations = inverse(skeleton, tensor_of(clip.positions).double(), skeleton.offsets)
+                        clip = replace(clip, rotations=continuous(from_matrix(rotations, "quaternion")).numpy())
                     yield clip
 
-            found = MotionSet(
-                turned(),
+            result = MotionSet(
+                rotated_clips(),
                 skeleton,
                 self.name,
                 skipped=self.skipped,
                 interpretation=self.interpretation,
                 missing=self.missing,
             )
-            object.__setattr__(self, "_turned", found)
-        return found
+            object.__setattr__(self, "_with_rotations", result)
+        return result
 
     def loosened(self) -> MotionSet:
         """Return the same positions with extra joints where bones that share a joint move relative to each other.
@@ -362,7 +364,7 @@ class MotionSet:
             ends = clip.positions[:, joints].astype(np.float64)
             varies = np.maximum(varies, np.linalg.norm(ends[:, :, None] - ends[:, None], axis=-1).std(0))
         groups = nx.connected_components(nx.from_numpy_array(varies < STIFF))
-        return sorted(([joints[place] for place in sorted(group)] for group in groups), key=len, reverse=True)
+        return sorted(([joints[index] for index in sorted(group)] for group in groups), key=len, reverse=True)
 
     def resampled(self, fps: float) -> MotionSet:
         """Return the same motion at another frame rate, as `Clip.resampled` does.
@@ -391,23 +393,23 @@ class MotionSet:
         """
         if not 0 < test < 1:
             raise ValueError(f"the share for test is {test}, expected more than 0 and less than 1")
-        found: list[Clip] = []
+        clips: list[Clip] = []
         for clip in self:
             name = clip.name if clip.split == "all" else f"{clip.split}-{clip.name}".replace("/", "-")
-            clip, held = replace(clip, split="train", name=name), round(test * clip.frames)
-            if min(held, clip.frames - held) >= shortest:
-                ends = [0, clip.frames - held]
-                if len(self) == 1 and ends[1] - held >= shortest:
-                    ends.insert(1, ends[1] - held)
+            clip, n_test = replace(clip, split="train", name=name), round(test * clip.frames)
+            if min(n_test, clip.frames - n_test) >= shortest:
+                ends = [0, clip.frames - n_test]
+                if len(self) == 1 and ends[1] - n_test >= shortest:
+                    ends.insert(1, ends[1] - n_test)
                 parts = [clip.between(*ends) for ends in pairwise(ends)]
-                found += [replace(part, name=f"{name}-{n}" if n else name) for n, part in enumerate(parts)]
-                found.append(replace(clip.between(clip.frames - held, clip.frames), split="test"))
+                clips += [replace(part, name=f"{name}-{n}" if n else name) for n, part in enumerate(parts)]
+                clips.append(replace(clip.between(clip.frames - n_test, clip.frames), split="test"))
             else:
-                found.append(clip)
-        if len(found) == len(self) > 1:
-            held = min(max(round(test * len(self)), 1), len(self) - 1)
-            found = [*found[:-held], *(replace(clip, split="test") for clip in found[-held:])]
-        return replace(self, clips=found)
+                clips.append(clip)
+        if len(clips) == len(self) > 1:
+            n_test = min(max(round(test * len(self)), 1), len(self) - 1)
+            clips = [*clips[:-n_test], *(replace(clip, split="test") for clip in clips[-n_test:])]
+        return replace(self, clips=clips)
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the skeleton and of every clip's key, shape and bytes, in order."""
@@ -449,16 +451,16 @@ class MotionSet:
         for row in rows:
             splits.add_row(*(f"{value:,}" if isinstance(value, int) else str(value) for value in row.values()))
 
-        found = (self.skeleton.bone_lengths(some_frames(clip.positions).astype(np.float64)) for clip in self.clips)
-        bones = map(np.ma.masked_invalid, found)
+        lengths = (self.skeleton.bone_lengths(some_frames(clip.positions).astype(np.float64)) for clip in self.clips)
+        bones = map(np.ma.masked_invalid, lengths)
         variation = [(b.std(axis=0) / np.maximum(b.mean(axis=0), 1e-9)).filled(0.0) for b in bones]
         worst = int(np.argmax([v.max() for v in variation]))
         bone = self.skeleton.names[self.skeleton.edges[int(np.argmax(variation[worst]))][1]]
         extent = np.median(
             [np.median(extents(some_frames(clip.positions))[:, self.skeleton.vertical]) for clip in self]
         )
-        lacking = [
-            sum(np.isnan(some).any(axis=2).mean(axis=1).sum() for some in blocks(clip.positions)) / clip.frames
+        missing_joints = [
+            sum(np.isnan(block).any(axis=2).mean(axis=1).sum() for block in blocks(clip.positions)) / clip.frames
             for clip in self
         ]
 
@@ -471,9 +473,9 @@ class MotionSet:
             fact("read as", self.interpretation)
         if sum(clip.rotations is not None for clip in self):
             fact("rotations", "of every joint")
-        if any(lacking):
-            share = np.average(lacking, weights=[clip.frames for clip in self])
-            fact("missing joints", f"{share:.2%} of all frames' joints, in {np.count_nonzero(lacking)} clips")
+        if any(missing_joints):
+            share = np.average(missing_joints, weights=[clip.frames for clip in self])
+            fact("missing joints", f"{share:.2%} of all frames' joints, in {np.count_nonzero(missing_joints)} clips")
         fact(
             "bone lengths",
             f"vary by at most {variation[worst].max():.2%} within a clip (sd / mean; {bone} in "

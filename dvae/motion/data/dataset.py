@@ -31,9 +31,9 @@ def default_protocol(motion: MotionSet) -> Protocol:
     windows start every sixth of a second, test windows every half second.
     """
     fps, splits = motion.skeleton.fps, set(motion.splits)
-    known = PROTOCOLS.get(DEFAULT_PROTOCOLS.get(motion.skeleton.name, ""))
-    if known and known.fps == fps and (known.split_by != "split" or splits & {*known.train, *known.test}):
-        return known
+    preset = PROTOCOLS.get(DEFAULT_PROTOCOLS.get(motion.skeleton.name, ""))
+    if preset and preset.fps == fps and (preset.split_by != "split" or splits & {*preset.train, *preset.test}):
+        return preset
 
     def frames(seconds: float) -> int:
         return max(round(seconds * fps), 1)
@@ -43,8 +43,10 @@ def default_protocol(motion: MotionSet) -> Protocol:
 
 def apply_splits(motion: MotionSet, protocol: Protocol) -> MotionSet:
     """Split undivided motion into "train" and "test" if the protocol needs these splits."""
-    asks = (protocol.split_by, protocol.train, protocol.test) == ("split", ("train",), ("test",))
-    return motion.divided(shortest=protocol.length) if asks and not {"train", "test"} & {*motion.splits} else motion
+    needs_splits = (protocol.split_by, protocol.train, protocol.test) == ("split", ("train",), ("test",))
+    if needs_splits and not {"train", "test"} & {*motion.splits}:
+        return motion.divided(shortest=protocol.length)
+    return motion
 
 
 @dataclass(frozen=True)
@@ -123,8 +125,8 @@ class MotionData:
         split = apply_splits(clips, protocol)
         tested = {clip.name for clip in split if clip.split == "test"}
         partly = len(split) > len(clips) > 1  # otherwise whole clips form the test split
-        whole = tuple(clip.name for clip in split if partly and clip.name not in tested)
-        return cls(name, split, protocol, skip_bad, undivided=whole)
+        undivided = tuple(clip.name for clip in split if partly and clip.name not in tested)
+        return cls(name, split, protocol, skip_bad, undivided=undivided)
 
     def windows(self, split: str) -> Windows:
         """Return the windows of "train", "validation", "test" or "train+validation"."""
@@ -132,21 +134,21 @@ class MotionData:
 
     def parts(self) -> dict[str, str]:
         """Return one sentence for each split: its number of windows, and the clips that are too short."""
-        found, protocol = {}, self.protocol
+        sentences, protocol = {}, self.protocol
         for split in ("train", "validation", "test"):
             try:
-                cut = self.windows(split)
+                split_windows = self.windows(split)
             except ValueError as error:
-                found[split] = str(error)
+                sentences[split] = str(error)
                 continue
-            short = [name for _, name, _ in cut.skipped] + [*(self.undivided if split == "test" else ())]
+            short = [name for _, name, _ in split_windows.skipped] + [*(self.undivided if split == "test" else ())]
             more = f" and {len(short) - 3} more" if len(short) > 3 else ""
-            found[split] = (
-                f"{len(cut)} {split} windows of {protocol.observed} + {protocol.predicted} frames, "
-                f"one every {cut.stride} frames of {len(cut.clips)} clips"
+            sentences[split] = (
+                f"{len(split_windows)} {split} windows of {protocol.observed} + {protocol.predicted} frames, "
+                f"one every {split_windows.stride} frames of {len(split_windows.clips)} clips"
                 + (f"; too short for one: {', '.join(short[:3])}{more}" if short else "")
             )
-        return found
+        return sentences
 
     @property
     def location(self) -> str:
@@ -161,8 +163,9 @@ class MotionData:
     @property
     def schema(self) -> Poses:
         """Schema of the windows."""
-        turned = self.protocol.representation != "positions"
-        return Poses.from_data(self.protocol, (self.motion.with_rotations() if turned else self.motion).skeleton)
+        uses_rotations = self.protocol.representation != "positions"
+        motion = self.motion.with_rotations() if uses_rotations else self.motion
+        return Poses.from_data(self.protocol, motion.skeleton)
 
     def recorded(self) -> Recordings:
         """Return the record of these data that `reopened` reads."""
@@ -183,28 +186,28 @@ class MotionData:
         Raises:
             FileNotFoundError, ValueError: same as `open`.
         """
-        found = cls.open(path or source.path, schema.protocol, source.skip_bad, source.missing)
-        if found.schema.skeleton == schema.skeleton:
-            return found
-        known, motion = schema.skeleton, found.motion
-        if found.fingerprint == source.fingerprint:
-            return found
-        if motion.skeleton.fps != known.fps:
+        data = cls.open(path or source.path, schema.protocol, source.skip_bad, source.missing)
+        if data.schema.skeleton == schema.skeleton:
+            return data
+        skeleton, motion = schema.skeleton, data.motion
+        if data.fingerprint == source.fingerprint:
+            return data
+        if motion.skeleton.fps != skeleton.fps:
             raise ValueError(
-                f"{found.path} has {motion.skeleton.fps:g} frames per second, but these windows have {known.fps:g}; "
-                f"`dvae data convert {found.path} --fps {known.fps:g} --out FILE` resamples it"
+                f"{data.path} has {motion.skeleton.fps:g} frames per second, but these windows have {skeleton.fps:g}; "
+                f"`dvae data convert {data.path} --fps {skeleton.fps:g} --out FILE` resamples it"
             )
         try:
-            put = select_joints(motion, onto=known)
+            mapped = select_joints(motion, onto=skeleton)
         except ValueError:  # the caller compares the schemas and reports the difference
-            return found
-        clips = [replace(clip, rotations=None) for clip in put]
-        put = MotionSet(
+            return data
+        clips = [replace(clip, rotations=None) for clip in mapped]
+        mapped = MotionSet(
             clips,
-            known,
+            skeleton,
             motion.name,
             skipped=motion.skipped,
             interpretation=motion.interpretation,
             missing=motion.missing,
         )
-        return replace(found, motion=put, onto=True)
+        return replace(data, motion=mapped, onto=True)

@@ -66,8 +66,8 @@ class ExchangedWindows:
         self.own, self.truth = own, truth
         self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints
         self.given_joints, self.positions = windows.given_joints, windows.positions
-        self._kept, partners = self._pairs()
-        self._partners = self._kept if own else partners
+        self._rows, partners = self._pairs()
+        self._partners = self._rows if own else partners
 
     def _pairs(self) -> tuple[Tensor, Tensor]:
         """Return the indices of windows with a partner, and of their partners."""
@@ -76,55 +76,55 @@ class ExchangedWindows:
         clips = [key[:2] for key in self.windows.keys]
         clip = torch.tensor([clips.index(key) for key in clips])
         generator = torch.Generator().manual_seed(self.seed)
-        kept, partners, nearest = [], [], inf
+        rows, partners, nearest = [], [], inf
         for n, joints in enumerate(first):
-            apart = (first - joints).norm(dim=-1).amax(-1).masked_fill(clip == clip[n], inf)
-            close = (apart < self.threshold).nonzero()[:, 0]
-            nearest = min(nearest, apart.min().item())
+            distances = (first - joints).norm(dim=-1).amax(-1).masked_fill(clip == clip[n], inf)
+            close = (distances < self.threshold).nonzero()[:, 0]
+            nearest = min(nearest, distances.min().item())
             if len(close):
-                kept.append(n)
+                rows.append(n)
                 partners.append(int(close[torch.randint(len(close), (), generator=generator)]))
-        if not kept:
+        if not rows:
             raise ValueError(
                 f"no two windows of different clips have {', '.join(self.given_joints or ())} within "
                 f"{self.threshold:g} m; the nearest two are {nearest:.3g} m apart"
             )
-        return torch.tensor(kept), torch.tensor(partners)
+        return torch.tensor(rows), torch.tensor(partners)
 
     references: ClassVar = Windows.references
 
     @property
     def description(self) -> dict[str, Any]:
         """Entries for a record: the description of the windows, and how poses were exchanged."""
-        said, partners = self.windows.description, len(self._partners.unique())
+        description, partners = self.windows.description, len(self._partners.unique())
         exchanged = {"threshold": self.threshold, "seed": self.seed, "partners": partners, "truth": self.truth}
-        title = [*said["title"], "with own poses" if self.own else f"first poses of {partners} other windows"]
-        return {**said, "exchanged": exchanged, "title": title}
+        title = [*description["title"], "with own poses" if self.own else f"first poses of {partners} other windows"]
+        return {**description, "exchanged": exchanged, "title": title}
 
     def __len__(self) -> int:
-        return len(self._kept)
+        return len(self._rows)
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
         """(split, clip, first frame) of the windows whose paths are used."""
         keys = self.windows.keys
-        return [keys[n] for n in self._kept.tolist()]
+        return [keys[n] for n in self._rows.tolist()]
 
     def all(self) -> dict[str, Tensor]:
         """Return all windows, in the format of `Windows.all`."""
-        whole = self.windows.all()
-        batch = {name: values[self._kept] for name, values in whole.items()}
-        poses = whole["x"][self._partners]
+        windows = self.windows.all()
+        batch = {name: values[self._rows] for name, values in windows.items()}
+        poses = windows["x"][self._partners]
         batch["x"] = poses if self.truth == "pose" else torch.cat([poses[:, :1], batch["x"][:, 1:]], 1)
         return batch
 
     def labels(self, name: str) -> list[str]:
         """Return the label of each window's clip."""
         labels = self.windows.labels(name)
-        return [labels[n] for n in self._kept.tolist()]
+        return [labels[n] for n in self._rows.tolist()]
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the windows and the partners."""
-        pairs = self._kept.tolist(), self._partners.tolist()
+        pairs = self._rows.tolist(), self._partners.tolist()
         return hashlib.sha256(f"{self.windows.fingerprint} {pairs}".encode()).hexdigest()

@@ -34,8 +34,8 @@ def occlude(motion: MotionSet, share: float = 0.2, length: float = 15.0, seed: i
         )
 
     clips, root = [], motion.skeleton.root
-    for place, clip in enumerate(motion):
-        draws = np.random.default_rng((seed, place)).random((clip.frames, motion.skeleton.joints))
+    for index, clip in enumerate(motion):
+        draws = np.random.default_rng((seed, index)).random((clip.frames, motion.skeleton.joints))
         hidden = np.empty(draws.shape, dtype=bool)
         hidden[0] = draws[0] < share
         for t in range(1, clip.frames):

@@ -178,13 +178,13 @@ class Poses(Schema):
         Raises:
             SchemaError: the data have no schema of poses, or another representation.
         """
-        found = super().of(data, who)
-        if (shown := found.protocol.representation) != representation:
+        schema = super().of(data, who)
+        if (actual := schema.protocol.representation) != representation:
             raise SchemaError(
-                f"{who} reads {_said(representation)}, but under this protocol models see {_said(shown)}; choose one "
-                f"whose representation is {representation} (--representation)"
+                f"{who} reads {_describe(representation)}, but under this protocol models see {_describe(actual)}; "
+                f"choose one whose representation is {representation} (--representation)"
             )
-        return found
+        return schema
 
     @staticmethod
     def _view(protocol: Protocol, skeleton: Skeleton) -> View:
@@ -224,8 +224,8 @@ class Poses(Schema):
         return cls.from_data(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
 
 
-def _said(representation: str) -> str:
-    return "positions of joints" if representation == "positions" else f"turns of joints as {representation}"
+def _describe(representation: str) -> str:
+    return "positions of joints" if representation == "positions" else f"rotations of joints as {representation}"
 
 
 def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int | None = None) -> Windows:
@@ -254,8 +254,8 @@ def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int
         raise ValueError(
             f"no split {unknown[0]!r}{nearest(unknown[0], parts)}: expected train, validation, test or train+validation"
         )
-    chosen = {clip.key for name in split.split("+") for clip in parts[name]}
-    return Windows([clip for clip in motion if clip.key in chosen], motion, protocol, split, length or protocol.length)
+    keys = {clip.key for name in split.split("+") for clip in parts[name]}
+    return Windows([clip for clip in motion if clip.key in keys], motion, protocol, split, length or protocol.length)
 
 
 def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
@@ -270,18 +270,18 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
         return clip.labels[protocol.split_by]
 
     values = [(clip, value(clip)) for clip in motion]
-    train = [clip for clip, found in values if found in protocol.train]
-    test = [clip for clip, found in values if found in protocol.test]
+    train = [clip for clip, group in values if group in protocol.train]
+    test = [clip for clip, group in values if group in protocol.test]
     if not train and not test:
-        found = ", ".join(dict.fromkeys(found for _, found in values))
+        groups = ", ".join(dict.fromkeys(group for _, group in values))
         raise ValueError(
             f"protocol {protocol.name} needs {protocol.split_by} {'/'.join(protocol.train)} for training and "
-            f"{'/'.join(protocol.test)} for test; {motion.name!r} has {found}"
+            f"{'/'.join(protocol.test)} for test; {motion.name!r} has {groups}"
         )
-    aside = held_out(len(train), protocol.validation)
+    validation = held_out(len(train), protocol.validation)
     return {
-        "train": [clip for i, clip in enumerate(train) if i not in aside],
-        "validation": [clip for i, clip in enumerate(train) if i in aside],
+        "train": [clip for i, clip in enumerate(train) if i not in validation],
+        "validation": [clip for i, clip in enumerate(train) if i in validation],
         "test": test,
     }
 
@@ -315,8 +315,8 @@ class Windows:
     def __init__(self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int) -> None:
         if length < 1 or (protocol.heading and length < protocol.observed):
             raise ValueError(f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)")
-        turned = motion if protocol.representation == "positions" else motion.with_rotations()
-        self.protocol, self.skeleton, self.split, self.length = protocol, turned.skeleton, split, length
+        source = motion if protocol.representation == "positions" else motion.with_rotations()
+        self.protocol, self.skeleton, self.split, self.length = protocol, source.skeleton, split, length
         self.missing, self._rest = motion.missing, motion.skeleton.rest
         self.clips = [clip for clip in clips if clip.frames >= length]
         self.skipped = [(*clip.key, clip.frames) for clip in clips if clip.frames < length]
@@ -330,19 +330,19 @@ class Windows:
             self.skeleton.heading(torch.zeros(self.skeleton.joints, 3))  # raises early without left and right
 
         self._frames = [clip.positions for clip in self.clips]
-        self._turns: list[Any] | None = None
+        self._rotations: list[Any] | None = None
         if protocol.representation != "positions":
-            self._turns = [turned[clip.key].rotations for clip in self.clips]
+            self._rotations = [source[clip.key].rotations for clip in self.clips]
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
         self._classes: dict[str, Tensor] = {}  # variable -> class of every clip
         self._given: Tensor | float | None = None  # set by `given`
         self._starts = frames - length + 1
         if self.missing:
-            seen = (np.isfinite(block).all(-1) for frames in self._frames for block in blocks(frames))
-            told = (each[:, self.skeleton.root] & (each.sum(-1) > 1) for each in seen)
-            before = np.concatenate([[False], *told]).cumsum(dtype=np.int32)
-            self._told = torch.from_numpy(before)  # number of usable frames before each frame
+            is_known = (np.isfinite(block).all(-1) for frames in self._frames for block in blocks(frames))
+            is_usable = (joints[:, self.skeleton.root] & (joints.sum(-1) > 1) for joints in is_known)
+            before = np.concatenate([[False], *is_usable]).cumsum(dtype=np.int32)
+            self._usable_before = torch.from_numpy(before)  # number of usable frames before each frame
             if not len(self):
                 raise ValueError(
                     f"{split} split of {motion.name!r} has no window with the root and another joint present in some "
@@ -397,17 +397,19 @@ class Windows:
         If joints may be missing, the batch also contains "mask", as in `all`. The same generator state gives the same
         windows.
         """
-        which, where, turn = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
-        clips = torch.searchsorted(self._weights, which * self._weights[-1], right=True)
-        starts = (where * self._starts[clips]).long()
+        clip_draws, start_draws, angle_draws = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
+        clips = torch.searchsorted(self._weights, clip_draws * self._weights[-1], right=True)
+        starts = (start_draws * self._starts[clips]).long()
         x = self._cut(clips, starts)
         if self.protocol.rotate:
             joints = x.unflatten(-1, (-1, 3))
-            angle = (2 * pi * turn).float()[:, None, None]
+            angle = (2 * pi * angle_draws).float()[:, None, None]
             x = rotate_about_up(joints, angle, self.skeleton.up).flatten(-2)
         batch = self._batch(x, clips, generator)
-        if self._turns is not None:
-            batch["view_inputs"] = {ROTATIONS: self._turned(clips, starts, angle if self.protocol.rotate else None)}
+        if self._rotations is not None:
+            batch["view_inputs"] = {
+                ROTATIONS: self._cut_rotations(clips, starts, angle if self.protocol.rotate else None)
+            }
         return batch
 
     def all(self, stride: int | None = None) -> Batch:
@@ -418,22 +420,22 @@ class Windows:
         values are missing only if the root is missing throughout the window. Listed are windows with observed values
         both in the observed and in the predicted frames.
         """
-        return self._listed(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
+        return self._cut_batch(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
 
     def batches(self, batch_size: int) -> Iterator[Batch]:
         """Yield the windows that `all()` lists, in batches of `batch_size`."""
         clips, starts = self._list(self.stride)
         generator = torch.Generator().manual_seed(0)
-        for some in torch.arange(len(clips)).split(batch_size):
-            yield self._listed(clips[some], starts[some], generator)
+        for rows in torch.arange(len(clips)).split(batch_size):
+            yield self._cut_batch(clips[rows], starts[rows], generator)
 
-    def _listed(self, clips: Tensor, starts: Tensor, generator: torch.Generator) -> Batch:
+    def _cut_batch(self, clips: Tensor, starts: Tensor, generator: torch.Generator) -> Batch:
         x = torch.empty(len(clips), self.length, self.size)
         for block in torch.arange(len(clips)).split(512):  # in blocks: limits peak memory to little more than one copy
             x[block] = self._cut(clips[block], starts[block])
         batch = self._batch(x, clips, generator)
-        if self._turns is not None:
-            batch["view_inputs"] = {ROTATIONS: self._turned(clips, starts)}
+        if self._rotations is not None:
+            batch["view_inputs"] = {ROTATIONS: self._cut_rotations(clips, starts)}
         return batch
 
     def poses(self) -> Tensor:
@@ -442,7 +444,7 @@ class Windows:
         Frames with missing joints are left out.
         """
         parts = (tensor_of(block) for frames in self._frames for block in blocks(frames))
-        poses = torch.cat([self._represented(part[:, None], 0)[:, 0] for part in parts])
+        poses = torch.cat([self._represent(part[:, None], 0)[:, 0] for part in parts])
         return poses[poses.isfinite().all(-1)] if self.missing else poses
 
     def labels(self, name: str) -> list[str]:
@@ -452,8 +454,8 @@ class Windows:
             KeyError: no clip has such a label.
         """
         if not any(name in clip.labels for clip in self.clips):
-            known = sorted({label for clip in self.clips for label in clip.labels})
-            raise KeyError(f"no label {name!r}; there are {', '.join(known) or 'none'}")
+            names = sorted({label for clip in self.clips for label in clip.labels})
+            raise KeyError(f"no label {name!r}; there are {', '.join(names) or 'none'}")
         return [self.clips[c].labels.get(name, "") for c in self._list(self.stride)[0].tolist()]
 
     def classified(self, variable: str, label: str, classes: Sequence[str]) -> Windows:
@@ -468,15 +470,15 @@ class Windows:
             ValueError: a clip does not have the label, or its value is not one of the classes.
         """
         for clip in self.clips:
-            if (found := clip.labels.get(label)) not in classes:
-                has = "has no label" if found is None else f"has {found!r} for"
+            if (value := clip.labels.get(label)) not in classes:
+                has = "has no label" if value is None else f"has {value!r} for"
                 raise ValueError(
                     f"clip {'/'.join(clip.key)} ({self.split}) {has} {label!r}, expected one of {', '.join(classes)}: "
                     "is labels.csv next to the file, does it list every clip, and do training clips have every class?"
                 )
         windows = copy(self)
-        found_in = [classes.index(clip.labels[label]) for clip in self.clips]
-        windows._classes = {**self._classes, variable: torch.tensor(found_in)}
+        indices = [classes.index(clip.labels[label]) for clip in self.clips]
+        windows._classes = {**self._classes, variable: torch.tensor(indices)}
         return windows
 
     def positions(self, x: Tensor) -> Tensor:
@@ -502,12 +504,17 @@ class Windows:
         """
         clips, starts = self._list(self.stride)
         frames = (self._first[clips] + starts)[:, None] + torch.arange(self.length)
-        found = torch.from_numpy(np.concatenate(self._frames))
-        for where, made in zip(frames, self.to_world(positions), strict=True):
-            found[where] = torch.where(found[where].isfinite(), found[where], made.to(found))
-        whole = found.split([clip.frames for clip in self.clips])
-        made_whole = [replace(clip, positions=each.numpy()) for clip, each in zip(self.clips, whole, strict=True)]
-        return MotionSet(made_whole, self.skeleton, missing=bool(found.isnan().any()))
+        positions_of_clips = torch.from_numpy(np.concatenate(self._frames))
+        for rows, filled in zip(frames, self.to_world(positions), strict=True):
+            positions_of_clips[rows] = torch.where(
+                positions_of_clips[rows].isfinite(), positions_of_clips[rows], filled.to(positions_of_clips)
+            )
+        by_clip = positions_of_clips.split([clip.frames for clip in self.clips])
+        filled_clips = [
+            replace(clip, positions=positions_of_clip.numpy())
+            for clip, positions_of_clip in zip(self.clips, by_clip, strict=True)
+        ]
+        return MotionSet(filled_clips, self.skeleton, missing=bool(positions_of_clips.isnan().any()))
 
     def to_world(self, positions: Tensor, chosen: Sequence[int] | slice = slice(None)) -> Tensor:
         """Return positions (..., N, T, J, 3) of listed windows in the coordinates of their clips.
@@ -517,16 +524,16 @@ class Windows:
                 number of frames.
             chosen: indices of the N windows in `keys`; default: all.
         """
-        clips, starts = (each[chosen] for each in self._list(self.stride))
+        clips, starts = (values[chosen] for values in self._list(self.stride))
         joints, root = cut_windows(self._frames, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, self.protocol.observed - 1)[:, None, None]
             positions = rotate_about_up(positions, heading, self.skeleton.up)
-        places = joints[:, :, root : root + 1]
-        seen = places.isfinite()
+        roots = joints[:, :, root : root + 1]
+        is_known = roots.isfinite()
         if self.protocol.root == "drop":
-            return positions + interpolate_missing(places.flatten(2), seen.flatten(2))[:, :, None]
-        return positions + places.take_along_dim(seen.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
+            return positions + interpolate_missing(roots.flatten(2), is_known.flatten(2))[:, :, None]
+        return positions + roots.take_along_dim(is_known.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
 
     def given(self, joints: Sequence[str] | float) -> Windows:
         """Return these windows with trajectories in their batches: {"y": (B, T, D)}, x at given joints and 0 at others.
@@ -546,10 +553,10 @@ class Windows:
             return windows
         if isinstance(joints, str):
             raise ValueError(f"joints must be a list of names, such as [{joints!r}]")
-        found = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
-        if dropped := found - set(self.joints):
+        names = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
+        if dropped := names - set(self.joints):
             raise ValueError(f"the protocol {self.protocol.name} drops {dropped.pop()}")
-        windows._given = torch.tensor([float(name in found) for name in self.joints])
+        windows._given = torch.tensor([float(name in names) for name in self.joints])
         return windows
 
     @property
@@ -563,7 +570,7 @@ class Windows:
         """Names of the joints whose trajectories are in the batches; None if they differ between windows."""
         if not isinstance(self._given, Tensor):
             return None
-        return tuple(name for name, given in zip(self.joints, self._given.tolist(), strict=True) if given)
+        return tuple(name for name, is_given in zip(self.joints, self._given.tolist(), strict=True) if is_given)
 
     references: ClassVar = {"zero velocity": "last value", "nearest neighbours": "nearest neighbours"}
     """Reference forecasts, by their names in motion papers (`inference.evaluation.references`)."""
@@ -571,10 +578,10 @@ class Windows:
     @property
     def description(self) -> dict[str, Any]:
         """Entries for a record: the joints, and those whose paths are given."""
-        said = {"joints": list(self.skeleton.names), "title": []}
+        description = {"joints": list(self.skeleton.names), "title": []}
         if (given := self.given_joints) is not None:
-            said |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
-        return said
+            description |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
+        return description
 
     def with_protocol(self, protocol: Protocol) -> Windows:
         """Return these windows, cut by another protocol that splits clips and counts frames in the same way."""
@@ -584,10 +591,10 @@ class Windows:
 
     def _batch(self, x: Tensor, clips: Tensor, generator: torch.Generator) -> Batch:
         """Return the batch of windows, with classes, mask and trajectories."""
-        seen, x = x.isfinite(), x.nan_to_num(0.0)
+        mask_of_x, x = x.isfinite(), x.nan_to_num(0.0)
         batch = Batch({"x": x, **{variable: classes[clips] for variable, classes in self._classes.items()}})
         if self.missing:
-            batch["mask"] = seen
+            batch["mask"] = mask_of_x
         if self._given is not None:
             mask = self._given
             if not isinstance(mask, Tensor):
@@ -600,7 +607,7 @@ class Windows:
     def fingerprint(self) -> str:
         """SHA-256 of the protocol, the skeleton, the keys of the listed windows and the data that are read."""
         protocol = astuple(self.protocol)  # omits `representation` for positions: keeps older fingerprints valid
-        protocol = protocol if self._turns is not None else protocol[:-1]
+        protocol = protocol if self._rotations is not None else protocol[:-1]
         digest = hashlib.sha256(repr((protocol, self.split, self.length)).encode())
         names, parents, up = self.skeleton.names, self.skeleton.parents, self.skeleton.up
         digest.update(f"({names!r}, {parents!r}, {up!r}, ".encode())
@@ -608,7 +615,7 @@ class Windows:
         digest.update(b")")
         for frames in self._frames:
             hash_values(digest, frames, "<f4")
-        if self._turns is not None and self._rest:  # only rotations from files: estimates differ between machines
+        if self._rotations is not None and self._rest:  # only rotations from files: estimates differ between machines
             digest.update(repr(self._rest).encode())
             for clip in self.clips:
                 if clip.rotations is not None:
@@ -623,9 +630,9 @@ class Windows:
     def _keys(self, stride: int) -> Iterator[tuple[str, str, int]]:
         """Yield the keys of the listed windows one at a time, because there may be as many as frames."""
         for clip, first, count in zip(self.clips, self._first.tolist(), self._starts.tolist(), strict=True):
-            for some in torch.arange(0, count, _at_least_one(stride)).split(4096):
-                kept = some[self._tells(first + some)] if self.missing else some
-                yield from ((*clip.key, start) for start in kept.tolist())
+            for starts in torch.arange(0, count, _at_least_one(stride)).split(4096):
+                kept_starts = starts[self._has_usable_frames(first + starts)] if self.missing else starts
+                yield from ((*clip.key, start) for start in kept_starts.tolist())
 
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:
         """Return the clip index and first frame of every listed window."""
@@ -635,19 +642,21 @@ class Windows:
         starts = stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
         if not self.missing:
             return clips, starts
-        kept = self._tells(self._first[clips] + starts)
-        return clips[kept], starts[kept]
+        is_usable = self._has_usable_frames(self._first[clips] + starts)
+        return clips[is_usable], starts[is_usable]
 
-    def _tells(self, first: Tensor) -> Tensor:
+    def _has_usable_frames(self, first: Tensor) -> Tensor:
         """Return whether windows have usable frames in both parts; `first` counts frames over all clips."""
-        before, now, after = (self._told[first + n] for n in (0, min(self.protocol.observed, self.length), self.length))
+        before, now, after = (
+            self._usable_before[first + n] for n in (0, min(self.protocol.observed, self.length), self.length)
+        )
         return (before < now) & ((now < after) | (self.length <= self.protocol.observed))
 
     def _cut(self, clips: Tensor, starts: Tensor) -> Tensor:
         """Return copied windows (B, T, D) in the protocol's representation, for clips (B,) and first frames (B,)."""
-        return self._represented(cut_windows(self._frames, clips, starts, self.length), self.protocol.observed - 1)
+        return self._represent(cut_windows(self._frames, clips, starts, self.length), self.protocol.observed - 1)
 
-    def _represented(self, joints: Tensor, now: int) -> Tensor:
+    def _represent(self, joints: Tensor, now: int) -> Tensor:
         """Return frames (B, T, D) of joints (B, T, J, 3); a fixed heading is zero in frame `now`."""
         root = self.skeleton.root
         if self.protocol.heading:
@@ -661,19 +670,19 @@ class Windows:
             joints = rotate_about_up(joints, -heading, self.skeleton.up)
         return joints.flatten(-2)
 
-    def _turned(self, clips: Tensor, starts: Tensor, angle: Tensor | None = None) -> Tensor:
+    def _cut_rotations(self, clips: Tensor, starts: Tensor, angle: Tensor | None = None) -> Tensor:
         """Return rotations (B, T, 4 J) of the joints in windows; the root is rotated together with its window."""
-        assert self._turns is not None
-        turns, root = cut_windows(self._turns, clips, starts, self.length), self.skeleton.root
+        assert self._rotations is not None
+        rotations, root = cut_windows(self._rotations, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
             angle = -self.skeleton.heading(
                 cut_windows(self._frames, clips, starts + self.protocol.observed - 1, 1)[:, 0]
             )
         if angle is not None:
-            axes = rotate_about_up(torch.eye(3).expand(len(turns), 3, 3), angle.reshape(-1, 1), self.skeleton.up).mT
-            world = to_matrix(turns[:, :, root], "quaternion")
-            turns[:, :, root] = continuous(from_matrix(axes[:, None] @ world, "quaternion"), dim=1)
-        return turns.flatten(-2)
+            axes = rotate_about_up(torch.eye(3).expand(len(rotations), 3, 3), angle.reshape(-1, 1), self.skeleton.up).mT
+            world = to_matrix(rotations[:, :, root], "quaternion")
+            rotations[:, :, root] = continuous(from_matrix(axes[:, None] @ world, "quaternion"), dim=1)
+        return rotations.flatten(-2)
 
 
 def _at_least_one(stride: int) -> int:

@@ -84,9 +84,9 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
     lengths = np.linalg.norm(offsets, axis=-1)[:, 1:]
     trunk = offsets[:, [_J[j] for j in ("Spine", "Thorax", "Neck", "Head")], 1].sum(axis=1)
     height = _ANKLE_HEIGHT + trunk - offsets[:, [_J[j] for j in ("LHip", "LKnee", "LFoot")], 1].sum(axis=1)
-    known = {"activity": activity, "weights": weights, "phase": phase, "heading": heading}
-    known |= {"bone_lengths": lengths, "style": style}
-    made = []
+    truths = {"activity": activity, "weights": weights, "phase": phase, "heading": heading}
+    truths |= {"bone_lengths": lengths, "style": style}
+    motions = []
     for i in range(clips):
         switches = [0, *(np.flatnonzero(np.diff(activity[i])) + 1)]
         labels = {
@@ -95,10 +95,10 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
             "height_m": f"{height[i]:.3f}",
             "cadence_hz": f"{style[i, 0]:.3f}",
         }
-        truth = {name: values[i] for name, values in known.items()}
+        truth = {name: values[i] for name, values in truths.items()}
         split = "test" if i >= round(clips * (1 - test)) else "train"
-        made.append(Clip(split, f"person_{i:04d}", positions[i], labels, truth))
-    return MotionSet(made, WALKER, "simulated")
+        motions.append(Clip(split, f"person_{i:04d}", positions[i], labels, truth))
+    return MotionSet(motions, WALKER, "simulated")
 
 
 def _morphology(random: np.random.Generator, clips: int) -> np.ndarray:
@@ -199,11 +199,11 @@ def _angles(
         "Neck": [("x", -0.7 * lean + 0.04 * drift[3]), ("y", 0.12 * drift[2] + 0.05 * drift[1])],
     }
     for side, sign in (("L", 1.0), ("R", -1.0)):
-        own = phase if side == "L" else phase + np.pi
-        step = np.clip(np.sin(own), 0, None) ** 2  # marching on the spot while turning
-        gait = np.cos(own) + 0.09 * np.cos(3 * own)  # nearly a triangle wave: nearly constant speed
+        leg_phase = phase if side == "L" else phase + np.pi
+        step = np.clip(np.sin(leg_phase), 0, None) ** 2  # marching on the spot while turning
+        gait = np.cos(leg_phase) + 0.09 * np.cos(3 * leg_phase)  # nearly a triangle wave: nearly constant speed
         flex = stride * walk * (gait + 0.1) + 0.45 * turn * step + 0.03
-        knee = 0.06 + walk * (0.08 + lift * ((1 + np.cos(own - 1.45 * np.pi)) / 2) ** 2) + 0.9 * turn * step
+        knee = 0.06 + walk * (0.08 + lift * ((1 + np.cos(leg_phase - 1.45 * np.pi)) / 2) ** 2) + 0.9 * turn * step
         rotations[f"{side}Hip"] = [("x", -flex), ("z", sign * 0.03 - sway)]
         rotations[f"{side}Knee"] = [("x", knee)]
 
@@ -211,11 +211,11 @@ def _angles(
         resting = 1 - waving
         rotations[f"{side}Shoulder"] = [
             ("z", sign * (0.12 * resting + (raised + 0.12 * wave) * waving)),
-            ("x", resting * (swing * (walk + 0.25 * turn) * np.cos(own) + 0.05 * drift[1]) - 0.25 * waving),
+            ("x", resting * (swing * (walk + 0.25 * turn) * np.cos(leg_phase) + 0.05 * drift[1]) - 0.25 * waving),
         ]
         rotations[f"{side}Elbow"] = [
             ("z", sign * waving * (0.35 + 0.5 * wave)),
-            ("x", -resting * (bend - 0.3 * swing * walk * np.cos(own))),
+            ("x", -resting * (bend - 0.3 * swing * walk * np.cos(leg_phase))),
         ]
     return rotations
 

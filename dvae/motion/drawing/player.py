@@ -49,7 +49,7 @@ _OPTION = Markup('<option value="{}">{}</option>')
 def player(scenes: Mapping[str, Scene]) -> Markup:
     """Return the HTML of scenes by title, shown one at a time; the page must contain `SCRIPT` once."""
     motion = json.dumps(list(map(_scene, scenes.values())), separators=(",", ":"), allow_nan=False)
-    windows = Markup().join(_OPTION.format(place, title) for place, title in enumerate(scenes))
+    windows = Markup().join(_OPTION.format(index, title) for index, title in enumerate(scenes))
     return _PLAYER.format(motion=motion, windows=windows)
 
 
@@ -82,11 +82,11 @@ def _scene(stage: Scene) -> dict[str, Any]:
         "reach": float(np.nanmax(np.linalg.norm(motion[..., :2] - middle[:2], axis=-1))),
         "low": float(low[2]),
         "high": float(high[2]),
-        "packed": _packed(np.concatenate([piece.ravel() for piece in pieces])),
+        "packed": _pack(np.concatenate([piece.ravel() for piece in pieces])),
     }
 
 
-def _packed(steps: np.ndarray) -> str:
+def _pack(steps: np.ndarray) -> str:
     """Encode integers modulo 2^16; sums of differences are still correct."""
     planes = steps.astype(np.int64).astype("<u2").view(np.uint8).reshape(-1, 2).T
     return base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()

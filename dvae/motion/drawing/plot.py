@@ -49,8 +49,8 @@ def pose(
         **line: options of matplotlib's LineCollection, such as colors, linewidths, alpha.
     """
     poses = torch.as_tensor(np.asarray(positions), dtype=torch.float64).reshape(-1, skeleton.joints, 3)
-    turned = rotate_about_up(poses, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
-    drawing = np.stack([turned[..., 0] + at[0], turned[..., skeleton.vertical] + at[1]], axis=-1)
+    rotated = rotate_about_up(poses, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
+    drawing = np.stack([rotated[..., 0] + at[0], rotated[..., skeleton.vertical] + at[1]], axis=-1)
     bones = list(drawing[:, skeleton.edges].reshape(-1, 2, 2))
     ax.add_collection(LineCollection(bones, **{"capstyle": "round", **line}))
 
@@ -97,25 +97,25 @@ def futures(
     Raises:
         ValueError: the shapes do not match each other or the skeleton, or are empty.
     """
-    past, future, real = _checked(skeleton, observed, samples, truth)
-    crosses = _given(paths or {}, skeleton, future.shape[1])
+    past, future, real = _as_arrays(skeleton, observed, samples, truth)
+    crosses = _path_array(paths or {}, skeleton, future.shape[1])
     azimuth = view - final_heading(skeleton, torch.from_numpy(past))
     now, horizon = len(past) - 1, future.shape[1]
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
-    shown = [*sorted({0, now}), *(now + ahead)]
+    columns = [*sorted({0, now}), *(now + ahead)]
     if ax is None:
-        ax = plt.subplots(figsize=(max(1.15 * len(shown), 4.6), 2.3), layout="constrained")[1]
+        ax = plt.subplots(figsize=(max(1.15 * len(columns), 4.6), 2.3), layout="constrained")[1]
 
     middle = future[:, :, skeleton.root].mean(0)
 
     def draw(poses: np.ndarray, column: int, **line: Any) -> None:
-        shared = len(crosses) and shown[column] > now
-        origin = middle[shown[column] - now - 1] if shared else poses[..., skeleton.root : skeleton.root + 1, :]
+        is_shared = len(crosses) and columns[column] > now
+        origin = middle[columns[column] - now - 1] if is_shared else poses[..., skeleton.root : skeleton.root + 1, :]
         pose(ax, poses - origin, skeleton, at=(column * SPACING, 0.0), azimuth=azimuth, **line)
 
     colours = _colours(len(future)).repeat(len(skeleton.edges), axis=0)
     opacity = float(np.clip(6 / len(future), 0.15, 0.9))
-    for column, frame in enumerate(shown):
+    for column, frame in enumerate(columns):
         if frame <= now:
             draw(past[frame], column, colors=PAST, linewidths=1.8)
             continue
@@ -123,14 +123,14 @@ def futures(
         if real is not None and frame - now <= len(real):
             draw(real[frame - now - 1], column, colors=TRUTH, linewidths=1.8)
         if len(crosses):
-            places = torch.from_numpy(crosses[:, frame - now - 1] - middle[frame - now - 1])
-            seen = rotate_about_up(places, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
-            ax.plot(column * SPACING + seen[:, 0], seen[:, skeleton.vertical], "x", color=GIVEN, zorder=3)
+            offsets = torch.from_numpy(crosses[:, frame - now - 1] - middle[frame - now - 1])
+            rotated = rotate_about_up(offsets, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
+            ax.plot(column * SPACING + rotated[:, 0], rotated[:, skeleton.vertical], "x", color=GIVEN, zorder=3)
 
     hide_axes(ax)
-    seconds = [(frame - now) / skeleton.fps for frame in shown]
-    ax.set_xticks(SPACING * np.arange(len(shown)), [f"{s:+.1f} s" if s else "0 s" for s in seconds])
-    _key(ax, len(future), real is not None, len(crosses) > 0)
+    seconds = [(frame - now) / skeleton.fps for frame in columns]
+    ax.set_xticks(SPACING * np.arange(len(columns)), [f"{s:+.1f} s" if s else "0 s" for s in seconds])
+    _add_legend(ax, len(future), real is not None, len(crosses) > 0)
     return ax
 
 
@@ -144,7 +144,7 @@ class Scene:
         colours: colour of each, from `now` on.
         motion: (P, O + H, J, 3), each about its own origin; NaN after the end of a truth that ends early.
         now: index of the last observed frame.
-        shown: indices of the frames to show, including `now`.
+        frames: indices of the frames to show, including `now`.
         fixed: joints that move in the same way in all samples.
         truth: whether the truth is included.
     """
@@ -199,34 +199,34 @@ def make_scene(
     view: float = pi / 5,
 ) -> Scene:
     """Return the scene of an animation; arguments and errors are the same as in `player.animate`."""
-    alone = samples is None
-    if alone:
+    only_observed = samples is None
+    if only_observed:
         motion = np.asarray(observed)
         observed, samples, names = motion[:1], motion[None, 1:], names or [""]
-    past, future, real = _checked(skeleton, observed, samples, truth)
-    alike = frozenset(map(int, fixed))
+    past, future, real = _as_arrays(skeleton, observed, samples, truth)
+    fixed_joints = frozenset(map(int, fixed))
     names = names or [f"sample {k + 1}" for k in range(len(future))]
     every = max(1, round(skeleton.fps / 25)) if every is None else every
     if len(names) != len(future):
         raise ValueError(f"{len(names)} names for {len(future)} samples; give one name for each")
-    if strangers := alike - set(range(skeleton.joints)):
-        raise ValueError(f"fixed has joints {sorted(strangers)}; expected indices from 0 to {skeleton.joints - 1}")
+    if unknown := fixed_joints - set(range(skeleton.joints)):
+        raise ValueError(f"fixed has joints {sorted(unknown)}; expected indices from 0 to {skeleton.joints - 1}")
     if every < 1:
         raise ValueError(f"every is {every}; expected 1 to draw each frame, 2 to draw every second one, and so on")
-    known = [each for each in (past, real, future if alone else None) if each is not None]
-    if not (alone or np.isfinite(future).all()) or any(np.isinf(positions).any() for positions in known):
+    arrays = [array for array in (past, real, future if only_observed else None) if array is not None]
+    if not (only_observed or np.isfinite(future).all()) or any(np.isinf(positions).any() for positions in arrays):
         raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
     people = list(zip(names, map(to_hex, _colours(len(future))), future, strict=True))
     if real is not None:
         people.insert(0, ("truth", TRUTH, real))
-    called, colours, aheads = map(list, zip(*people, strict=True))
-    motion = _seen(skeleton, past, aheads, future.shape[1], view)
+    labels, colours, aheads = map(list, zip(*people, strict=True))
+    motion = _to_viewer(skeleton, past, aheads, future.shape[1], view)
     now = len(past) - 1
-    shown = range(now % every, motion.shape[1], every)
-    return Scene(skeleton, called, colours, motion, now, shown, alike, real is not None)
+    shown_frames = range(now % every, motion.shape[1], every)
+    return Scene(skeleton, labels, colours, motion, now, shown_frames, fixed_joints, real is not None)
 
 
-def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
+def _add_legend(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
     """Add a legend of the colours of `futures`, below the times."""
     sampled = tuple(Line2D([], [], color=colour) for colour in _colours(min(samples, 5)))
     key: dict[str, Any] = {"observed": Line2D([], [], color=PAST)}
@@ -248,7 +248,9 @@ def _key(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
     )
 
 
-def _seen(skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], horizon: int, view: float) -> np.ndarray:
+def _to_viewer(
+    skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], horizon: int, view: float
+) -> np.ndarray:
     """Return motions (P, O + H, J, 3) in the viewer's coordinates, with z up."""
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
     for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which is not drawn
@@ -276,26 +278,26 @@ def final_heading(skeleton: Skeleton, positions: Tensor) -> float:
     return float(skeleton.heading_near(positions, len(positions) - 1)) if skeleton.left and skeleton.right else 0.0
 
 
-def _given(paths: Mapping[str, Any], skeleton: Skeleton, horizon: int) -> np.ndarray:
+def _path_array(paths: Mapping[str, Any], skeleton: Skeleton, horizon: int) -> np.ndarray:
     """Return the paths of some joints (paths, H, 3)."""
-    found = {joint: np.asarray(path, np.float64) for joint, path in paths.items()}
-    for joint, path in found.items():
+    arrays = {joint: np.asarray(path, np.float64) for joint, path in paths.items()}
+    for joint, path in arrays.items():
         skeleton.find(joint)  # raises an error for an unknown joint
         if path.shape != (horizon, 3):
             raise ValueError(f"expected a path ({horizon}, 3) of {joint}, as long as the samples; got {path.shape}")
-    return np.array([*found.values()]).reshape(-1, horizon, 3)
+    return np.array([*arrays.values()]).reshape(-1, horizon, 3)
 
 
-def _checked(
+def _as_arrays(
     skeleton: Skeleton, observed: Any, samples: Any, truth: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return observed motion, samples and truth as arrays of matching shapes."""
     past, future = np.asarray(observed, np.float64), np.asarray(samples, np.float64)
     real = None if truth is None else np.asarray(truth, np.float64)
     joint = (skeleton.joints, 3)
-    fits = past.ndim == 3 and past.shape[1:] == joint and future.ndim == 4 and future.shape[2:] == joint
-    knows = real is None or (real.ndim == 3 and real.shape[1:] == joint and len(real) <= future.shape[1])
-    if not (fits and knows and past.size and future.size):
+    samples_fit = past.ndim == 3 and past.shape[1:] == joint and future.ndim == 4 and future.shape[2:] == joint
+    truth_fits = real is None or (real.ndim == 3 and real.shape[1:] == joint and len(real) <= future.shape[1])
+    if not (samples_fit and truth_fits and past.size and future.size):
         raise ValueError(
             f"expected observed (O, J, 3), samples (K, H, J, 3) and truth (up to H, J, 3) with J = {joint[0]}, "
             f"got {past.shape}, {future.shape} and {None if real is None else real.shape}"
@@ -339,7 +341,7 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
     figure = Figure(figsize=(width, min(9.0, width * rows * size[2] / (columns * size[0]))), layout="constrained")
     ax = figure.subplots()
     for name, body, place in zip(names, people, places, strict=True):
-        ax.add_collection(_shaded(corners, body + place))
+        ax.add_collection(_mesh(corners, body + place))
         ax.text(place[0], place[2] + people[..., 2].max() + 0.05, name, ha="center", parse_math=False)
     ax.autoscale_view()
     ax.set_aspect("equal")
@@ -348,15 +350,15 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
     return figure
 
 
-def _shaded(faces: np.ndarray, places: np.ndarray) -> PolyCollection:
+def _mesh(faces: np.ndarray, places: np.ndarray) -> PolyCollection:
     """Return the triangles of a mesh (V, 3) that face the viewer, shaded by the light, the nearest last."""
     first, second, third = places[faces].swapaxes(0, 1)
     normals = np.cross(second - first, third - first)
     smooth = np.zeros_like(places)
     np.add.at(smooth, faces, normals[:, None])
     smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True).clip(1e-12)
-    seen = np.flatnonzero(normals[:, 1] < 0)  # y points away from the viewer
-    seen = seen[np.argsort(-places[faces[seen], 1].mean(-1))]
-    bright = 0.6 + 0.4 * (smooth[faces[seen]].mean(1) @ LIGHT).clip(0)
-    colours = bright.round(2)[:, None] * to_rgb(SKIN)
-    return PolyCollection(places[faces[seen]][..., [0, 2]], facecolors=colours, edgecolors=colours, linewidths=0.4)
+    visible = np.flatnonzero(normals[:, 1] < 0)  # y points away from the viewer
+    visible = visible[np.argsort(-places[faces[visible], 1].mean(-1))]
+    brightness = 0.6 + 0.4 * (smooth[faces[visible]].mean(1) @ LIGHT).clip(0)
+    colours = brightness.round(2)[:, None] * to_rgb(SKIN)
+    return PolyCollection(places[faces[visible]][..., [0, 2]], facecolors=colours, edgecolors=colours, linewidths=0.4)

@@ -51,13 +51,13 @@ def joints_of(bones: Mapping[str, Bone]) -> tuple[list[str], list[int], np.ndarr
     waiting: list[tuple[str, int, Vector]] = [("root", -1, (0.0, 0.0, 0.0))]
     while waiting:
         name, parent, offset = waiting.pop()
-        place = len(names)
+        index = len(names)
         names.append(name)
         parents.append(parent)
         offsets.append(offset)
         if name in below:
             vector = bones[name].vector if name in bones else (0.0, 0.0, 0.0)
-            waiting += [(child, place, vector) for child in reversed(below[name] or [name + END])]
+            waiting += [(child, index, vector) for child in reversed(below[name] or [name + END])]
     return names, parents, np.array(offsets)
 
 
@@ -69,11 +69,11 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
         ValueError: the file is not ASF, or damaged.
     """
     path = Path(path)
-    found: dict[str, dict[str, list[str]]] = {}
+    sections: dict[str, dict[str, list[str]]] = {}
     parent_of: dict[str, str] = {}
     section = ""
     bone: dict[str, list[str]] = {}
-    said: dict[str, list[str]] = {}
+    settings: dict[str, list[str]] = {}
     for number, line in enumerate(read_lines(path), 1):
         words = line.split("#")[0].split()
         if not words:
@@ -81,47 +81,51 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
         if words[0].startswith(":"):
             section, bone = words[0].lower(), {}
         elif section in (":units", ":root"):
-            said[words[0].lower()] = words[1:]
+            settings[words[0].lower()] = words[1:]
         elif section == ":bonedata":
             if words[0] == "begin":
                 bone = {}
             elif words[0] == "end":
                 if not {"name", "direction", "length"} <= bone.keys() or not bone["name"]:
                     raise ValueError(f"{path}: line {number} ends a bone without name, direction and length")
-                found[bone["name"][0]] = bone
-                check_joints(path, 2 * len(found))
+                sections[bone["name"][0]] = bone
+                check_joints(path, 2 * len(sections))
             else:
                 bone[words[0].lower()] = words[1:]
         elif section == ":hierarchy" and words[0] not in ("begin", "end"):
             parent_of |= dict.fromkeys(words[1:], words[0])
-    if not found:
+    if not sections:
         raise ValueError(f"{path}: not an ASF file: it has no :bonedata")
-    degrees = said.get("angle", ["deg"])[:1] != ["rad"]
+    degrees = settings.get("angle", ["deg"])[:1] != ["rad"]
 
-    def values(words: Sequence[str], count: int, what: str) -> np.ndarray:
-        read = numbers(" ".join(words[:count]), f"{path}: {what}")
-        if len(read) != count:
-            raise ValueError(f"{path}: {what} has {len(read)} numbers, expected {count}")
-        return read
+    def values(words: Sequence[str], count: int, label: str) -> np.ndarray:
+        values_read = numbers(" ".join(words[:count]), f"{path}: {label}")
+        if len(values_read) != count:
+            raise ValueError(f"{path}: {label} has {len(values_read)} numbers, expected {count}")
+        return values_read
 
     bones = {}
-    for name in _ordered(path, parent_of):
-        if name not in found:
+    for name in _bones_in_order(path, parent_of):
+        if name not in sections:
             raise ValueError(f"{path}: the hierarchy has {name[:60]!r}, which is not a bone")
-        bone = found[name]
+        bone = sections[name]
         length = values(bone["length"], 1, f"length of {name}")[0]
         direction = length * values(bone["direction"], 3, f"direction of {name}")
         axis = bone.get("axis", ["0", "0", "0", "XYZ"])
         angles, order = values(axis, 3, f"axis of {name}"), "".join(axis[3:4]).lower() or "xyz"
-        turns = "".join(channel[1].lower() for channel in bone.get("dof", []) if channel.lower() in ("rx", "ry", "rz"))
-        if len(turns) != len(bone.get("dof", [])) or sorted(order) != ["x", "y", "z"]:
-            raise ValueError(f"{path}: {name} has axes {order!r} and turns {bone.get('dof')}, expected rx, ry or rz")
-        axes = _turned(torch.from_numpy(np.deg2rad(angles) if degrees else angles), order)
-        bones[name] = Bone(parent_of[name], tuple(direction.tolist()), axes, turns)
-    unit = values(said.get("length", ["1"]), 1, "length")[0]
+        free_axes = "".join(
+            channel[1].lower() for channel in bone.get("dof", []) if channel.lower() in ("rx", "ry", "rz")
+        )
+        if len(free_axes) != len(bone.get("dof", [])) or sorted(order) != ["x", "y", "z"]:
+            raise ValueError(
+                f"{path}: {name} has axes {order!r} and rotations {bone.get('dof')}, expected rx, ry or rz"
+            )
+        axes = _rotation(torch.from_numpy(np.deg2rad(angles) if degrees else angles), order)
+        bones[name] = Bone(parent_of[name], tuple(direction.tolist()), axes, free_axes)
+    unit = values(settings.get("length", ["1"]), 1, "length")[0]
     if not 1e-6 < unit < 1e6:
         raise ValueError(f"{path}: length {unit:g}, expected a positive ratio of the unit to an inch")
-    order = " ".join(said.get("order", ["TX", "TY", "TZ", "RX", "RY", "RZ"])).lower()
+    order = " ".join(settings.get("order", ["TX", "TY", "TZ", "RX", "RY", "RZ"])).lower()
     if sorted(order.split()) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
         raise ValueError(f"{path}: the root's order is {order[:60]!r}, expected TX to RZ once each")
     return bones, INCH / unit, degrees, order
@@ -159,31 +163,31 @@ def read_amc(path: str | Path) -> Recording:
         elif len(words) - 1 != columns.get(words[0]) or len(values[words[0]]) != (frames - 1) * columns[words[0]]:
             raise ValueError(
                 f"{path}: line {number} is {line.strip()[:60]!r}, expected one row a frame for each bone of "
-                f"{skeleton}, with an angle for each of its turns"
+                f"{skeleton}, with an angle for each of its rotation axes"
             )
         else:
             values[words[0]] += words[1:]
-    read = {}
+    angles_of = {}
     for name, count in columns.items():
         if not frames or len(values[name]) != frames * count:
             raise ValueError(f"{path}: frame {frames} has no row for {name}, of {skeleton}")
-        read[name] = torch.from_numpy(numbers(" ".join(values[name]), f"{path}: {name}").reshape(frames, count))
+        angles_of[name] = torch.from_numpy(numbers(" ".join(values[name]), f"{path}: {name}").reshape(frames, count))
     channels = order.split()
-    root = read["root"]
-    place = root[:, [channels.index(f"t{axis}") for axis in "xyz"]]
+    root = angles_of["root"]
+    root_position = root[:, [channels.index(f"t{axis}") for axis in "xyz"]]
     turning = [column for column, channel in enumerate(channels) if channel[0] == "r"]
-    turns = torch.eye(3, dtype=torch.float64).repeat(frames, len(names), 1, 1)
+    rotations = torch.eye(3, dtype=torch.float64).repeat(frames, len(names), 1, 1)
 
     def radians(angles: Tensor) -> Tensor:
         return torch.deg2rad(angles) if degrees else angles
 
-    turns[:, 0] = _turned(radians(root[:, turning]), "".join(channels[column][1] for column in turning))
+    rotations[:, 0] = _rotation(radians(root[:, turning]), "".join(channels[column][1] for column in turning))
     for name, bone in bones.items():
         if bone.turns:
-            turns[:, names.index(name)] = bone.axes @ _turned(radians(read[name]), bone.turns) @ bone.axes.mT
+            rotations[:, names.index(name)] = bone.axes @ _rotation(radians(angles_of[name]), bone.turns) @ bone.axes.mT
     places = torch.from_numpy(offsets).repeat(frames, 1, 1)
-    places[:, 0] = place
-    return Recording.turned(names, parents, places, turns, fps=FPS, metres=metres, up="y")
+    places[:, 0] = root_position
+    return Recording.turned(names, parents, places, rotations, fps=FPS, metres=metres, up="y")
 
 
 SUBJECT_02 = {
@@ -237,30 +241,30 @@ def read_expmap(path: str | Path) -> Recording:
     values = numbers(text, str(path))
     bones = {name: Bone(parent, (x, y, z), torch.eye(3), "") for name, (parent, x, y, z) in SUBJECT_02.items()}
     names, parents, offsets = joints_of(bones)
-    rows, rest = divmod(len(values), 3 + 3 * len(names))
-    if rest or rows < 2:
+    rows, remainder = divmod(len(values), 3 + 3 * len(names))
+    if remainder or rows < 2:
         raise ValueError(
             f"{path}: got {len(values):,} numbers, expected rows of {3 + 3 * len(names)}, the first row a pose at rest"
         )
     check_size(path, rows, len(names))
-    read = torch.from_numpy(values).reshape(rows, -1, 3)[1:]
-    turns = to_matrix(-read[:, 1:], "vector")
-    z, x, y = from_matrix(turns[:, 0], "euler-zxy").unbind(-1)
+    vectors = torch.from_numpy(values).reshape(rows, -1, 3)[1:]
+    rotations = to_matrix(-vectors[:, 1:], "vector")
+    z, x, y = from_matrix(rotations[:, 0], "euler-zxy").unbind(-1)
     # of the two equivalent triples of angles, AMC files use the one with a small middle angle y
-    other = y.abs() > pi / 2
-    z, x, y = torch.where(other, pi + z, z), torch.where(other, pi - x, x), torch.where(other, pi + y, y)
-    turns[:, 0] = to_matrix(torch.stack([z, y, x], -1), "euler-zyx")
+    is_other = y.abs() > pi / 2
+    z, x, y = torch.where(is_other, pi + z, z), torch.where(is_other, pi - x, x), torch.where(is_other, pi + y, y)
+    rotations[:, 0] = to_matrix(torch.stack([z, y, x], -1), "euler-zyx")
     places = torch.from_numpy(offsets).repeat(rows - 1, 1, 1)
-    places[:, 0] = read[:, 0]
-    return Recording.turned(names, parents, places, turns, fps=FPS, metres=INCH / 0.45, up="y")
+    places[:, 0] = vectors[:, 0]
+    return Recording.turned(names, parents, places, rotations, fps=FPS, metres=INCH / 0.45, up="y")
 
 
-def _turned(angles: Tensor, axes: str) -> Tensor:
+def _rotation(angles: Tensor, axes: str) -> Tensor:
     """Return rotations (..., 3, 3) about fixed axes in this order, by angles (..., n) in radians."""
     return to_matrix(angles.flip(-1), f"euler-{axes[::-1]}")
 
 
-def _ordered(path: Path, parent_of: Mapping[str, str]) -> Iterator[str]:
+def _bones_in_order(path: Path, parent_of: Mapping[str, str]) -> Iterator[str]:
     """Yield the bones in the order of the file.
 
     Raises:
@@ -277,10 +281,10 @@ def _ordered(path: Path, parent_of: Mapping[str, str]) -> Iterator[str]:
 
 
 def _skeleton_of(path: Path) -> Path:
-    beside = sorted(path.parent.glob("*.asf"))
-    own = [file for file in beside if path.stem.startswith(file.stem)]
-    if len(own or beside) != 1:
+    candidates = sorted(path.parent.glob("*.asf"))
+    matching = [file for file in candidates if path.stem.startswith(file.stem)]
+    if len(matching or candidates) != 1:
         raise FileNotFoundError(
             f"{path}: which skeleton? Expected its ASF file in the same folder, such as 02.asf for 02_01.amc"
         )
-    return (own or beside)[0]
+    return (matching or candidates)[0]

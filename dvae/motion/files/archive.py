@@ -85,8 +85,8 @@ def _damage() -> Iterator[None]:
     except (NpyError, MemoryError, FileNotFoundError, PermissionError):
         raise
     except Exception as error:
-        what = str(error)[:200] or type(error).__name__
-        raise NpyError(f"damaged, truncated or not an npz archive ({what})") from error
+        message = str(error)[:200] or type(error).__name__
+        raise NpyError(f"damaged, truncated or not an npz archive ({message})") from error
 
 
 def _limit(size: int) -> int:
@@ -123,15 +123,15 @@ def write_arrays(file: BinaryIO, arrays: Iterable[tuple[str, np.ndarray]]) -> No
 
 def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Member]:
     infos = [info for info in file.infolist() if not info.is_dir()]
-    placed: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     if mapping and size > MAPPED:
         content = np.memmap(file.fp, np.uint8, "r").view(np.ndarray)  # type: ignore[call-overload]
-        found = {info.filename: _placed(content, info) for info in infos}
-        placed = {name: array for name, array in found.items() if array is not None}
-    unpacked, limit = sum(info.file_size for info in infos if info.filename not in placed), _limit(size)
+        views = {info.filename: _view(content, info) for info in infos}
+        arrays = {name: array for name, array in views.items() if array is not None}
+    unpacked, limit = sum(info.file_size for info in infos if info.filename not in arrays), _limit(size)
     if unpacked > limit:
-        mapped = f" in addition to {len(placed)} arrays that are mapped" if placed else ""
-        raise NpyError(f"it would unpack to {unpacked:,} bytes{mapped}, at most {limit:,} are read from {size:,}")
+        addition = f" in addition to {len(arrays)} arrays that are mapped" if arrays else ""
+        raise NpyError(f"it would unpack to {unpacked:,} bytes{addition}, at most {limit:,} are read from {size:,}")
     if sum(info.compress_size for info in infos) > size:
         raise NpyError("damaged: its members take more bytes than it has")
     members = {}
@@ -150,11 +150,11 @@ def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Membe
             raise NpyError(f"{name[:40]!r} is not a name of a split and a clip")
         if name in members:
             raise NpyError(f"{name} occurs twice")
-        members[name] = Member(name, file, info, placed.get(info.filename))
+        members[name] = Member(name, file, info, arrays.get(info.filename))
     return members
 
 
-def _placed(content: np.ndarray, info: zipfile.ZipInfo) -> np.ndarray | None:
+def _view(content: np.ndarray, info: zipfile.ZipInfo) -> np.ndarray | None:
     """Return the array of a member as a view of the archive's bytes, or None if it has to be read."""
     if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1 or info.header_offset < 0:
         return None
@@ -162,15 +162,15 @@ def _placed(content: np.ndarray, info: zipfile.ZipInfo) -> np.ndarray | None:
     if len(local) < 30 or local[:4] != b"PK\x03\x04":
         return None
     start = info.header_offset + 30 + sum(struct.unpack("<HH", local[26:]))
-    own = content[start : start + info.file_size]
-    head = io.BytesIO(own[: LONGEST + 12].tobytes())
+    data = content[start : start + info.file_size]
+    head = io.BytesIO(data[: LONGEST + 12].tobytes())
     try:
         dtype, shape, order = header(head.read)
-        own = own[head.tell() :]
-        check_bytes(dtype, shape, len(own))
+        data = data[head.tell() :]
+        check_bytes(dtype, shape, len(data))
     except NpyError:
         return None
-    return own.view(dtype).reshape(shape) if dtype.str == "<f4" and order == "C" and len(own) else None
+    return data.view(dtype).reshape(shape) if dtype.str == "<f4" and order == "C" and len(data) else None
 
 
 class _Stream:
@@ -194,14 +194,14 @@ class _Stream:
     def read(self, size: int) -> bytes:
         if size > self.left:
             raise EOFError(f"{size:,} bytes are announced, but {self.left:,} are left")
-        return self._taken(self._buffered.read(size))
+        return self._count(self._buffered.read(size))
 
     def some(self, size: int) -> bytes:
         """Return `size` bytes, or all remaining ones."""
         return self.read(min(size, self.left))
 
     def readline(self) -> bytes:
-        return self._taken(self._buffered.readline())
+        return self._count(self._buffered.readline())
 
     def readinto(self, array: np.ndarray) -> None:
         flat = array.reshape(-1, order="A").view(np.uint8)
@@ -211,7 +211,7 @@ class _Stream:
                 raise EOFError(f"it ends {len(flat):,} bytes early")
             flat, self.left = flat[size:], self.left - size
 
-    def _taken(self, data: bytes) -> bytes:
+    def _count(self, data: bytes) -> bytes:
         self.left -= len(data)
         return data
 
@@ -274,16 +274,16 @@ class Member:
             nested = nested.item()
         if not isinstance(nested, dict) or not all(isinstance(clips, dict) for clips in nested.values()):
             raise NpyError(f"{self.name} is not a dictionary of dictionaries (split -> clip -> positions)")
-        found, room = [], self._info.file_size + SMALL
+        clips_read, room = [], self._info.file_size + SMALL
         for split, clips in nested.items():
             for name, array in clips.items():
                 if not isinstance(array, _Array):
-                    raise NpyError(f"clip {split}/{name} is a {_said(array)}, expected a numpy array")
-                found.append((split, name, array.numbers()))
+                    raise NpyError(f"clip {split}/{name} is a {_type_name(array)}, expected a numpy array")
+                clips_read.append((split, name, array.numbers()))
                 room -= array.numbers().nbytes
                 if room < 0:
                     raise NpyError(f"{self.name}: its clips repeat one array, and have more bytes than the file")
-        return found
+        return clips_read
 
     @contextmanager
     def _open(self) -> Iterator[_Stream]:
@@ -328,7 +328,7 @@ class _Array:
             raise NpyError("refused an array that is not made as numpy makes it")
         _, shape, kind, fortran, content = state
         if not isinstance(kind, _Type):
-            raise NpyError(f"refused an array whose dtype is a {_said(kind)}")
+            raise NpyError(f"refused an array whose dtype is a {_type_name(kind)}")
         if not kind.dtype.hasobject:
             self._array = _of_bytes(content, kind.dtype, shape, "F" if fortran is True or fortran == 1 else "C")
             return
@@ -347,7 +347,7 @@ class _Array:
         return self._array
 
 
-def _said(value: Any) -> str:
+def _type_name(value: Any) -> str:
     names = {_Array: "numpy array", _Type: "dtype", _Global: "function"}
     return names.get(type(value), type(value).__name__)
 
@@ -366,7 +366,7 @@ def _bytes(content: Any) -> bytes | bytearray:
     if isinstance(content, str):  # bytes of Python 2
         return content.encode("latin1")
     if not isinstance(content, bytes | bytearray):
-        raise NpyError(f"refused an array of a {_said(content)}: expected bytes")
+        raise NpyError(f"refused an array of a {_type_name(content)}: expected bytes")
     return content
 
 
@@ -423,8 +423,8 @@ class _Interpreter:
 
     def items(self) -> list[Any]:
         """Remove and return the values above the last mark."""
-        found, self.stack = self.stack, self.below.pop()
-        return found
+        values, self.stack = self.stack, self.below.pop()
+        return values
 
     def last(self, count: int) -> tuple[Any, ...]:
         return tuple([self.stack.pop() for _ in range(count)][::-1])
@@ -441,16 +441,16 @@ class _Interpreter:
     def extend(self, values: list[Any]) -> None:
         target = self.stack[-1]
         if not isinstance(target, list):
-            raise NpyError(f"refused to append to a {_said(target)}")
+            raise NpyError(f"refused to append to a {_type_name(target)}")
         target.extend(values)
 
     def fill(self, items: list[Any]) -> None:
         target = self.stack[-1]
         if not isinstance(target, dict):
-            raise NpyError(f"refused to set items of a {_said(target)}")
+            raise NpyError(f"refused to set items of a {_type_name(target)}")
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, str):  # only text is hashed or compared; other values could take forever
-                raise NpyError(f"refused a {_said(key)} as a key: splits and clips have names")
+                raise NpyError(f"refused a {_type_name(key)} as a key: splits and clips have names")
             if not is_name(key):
                 raise NpyError(f"refused the key {key[:40]!r}: splits and clips have names")
             target[key] = value
@@ -475,27 +475,27 @@ class _Interpreter:
     def reduce(self, _: Any) -> None:
         function, arguments = self.last(2)
         if not isinstance(function, _Global) or function.call is None or not isinstance(arguments, tuple):
-            raise NpyError(f"refused to call a {_said(function)}")
+            raise NpyError(f"refused to call a {_type_name(function)}")
         self.spend(arguments)
         self.push(function.call(*arguments))
 
-    def spend(self, given: Any) -> None:
-        if isinstance(given, tuple) and len(given) <= 8:
-            self.room -= sum(len(value) for value in given if isinstance(value, str | bytes | bytearray))
-        if self.room < 0 or not isinstance(given, tuple) or len(given) > 8:
+    def spend(self, arguments: Any) -> None:
+        if isinstance(arguments, tuple) and len(arguments) <= 8:
+            self.room -= sum(len(value) for value in arguments if isinstance(value, str | bytes | bytearray))
+        if self.room < 0 or not isinstance(arguments, tuple) or len(arguments) > 8:
             raise NpyError("refused an array that is not made as numpy makes it")
 
     def build(self, _: Any) -> None:
         state, target = self.stack.pop(), self.stack[-1]
         if not isinstance(target, _Array | _Type):
-            raise NpyError(f"refused to set the state of a {_said(target)}")
+            raise NpyError(f"refused to set the state of a {_type_name(target)}")
         self.spend(state)
         target.build(state)
 
 
 def _reconstruct(subtype: Any, shape: Any, _code: Any) -> _Array:
     if not isinstance(subtype, _Global) or subtype.name != "numpy.ndarray":
-        raise NpyError(f"refused an array of the class {_said(subtype)}")
+        raise NpyError(f"refused an array of the class {_type_name(subtype)}")
     if _shape(shape) != (0,):  # numpy creates every array empty and fills it afterwards
         raise NpyError(f"refused an array declared with shape {shape} before its content")
     return _Array()
@@ -529,7 +529,9 @@ _ALLOWED = (
 
 _GLOBALS: dict[str, Callable[..., Any] | None] = {
     "numpy.ndarray": None,
-    "numpy.dtype": lambda code, align=False, copy=True: _Type(dtype_of(code if isinstance(code, str) else _said(code))),
+    "numpy.dtype": lambda code, align=False, copy=True: _Type(
+        dtype_of(code if isinstance(code, str) else _type_name(code))
+    ),
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy.core.multiarray.scalar": _scalar,
     "numpy.core.numeric._frombuffer": _from_buffer,

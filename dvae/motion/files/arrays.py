@@ -62,31 +62,31 @@ def read_archive(
     Args:
         joints: indices of the skeleton's joints in a file with more joints, such as `HUMAN36M_KEPT`.
     """
-    found = _read_clips(path)
+    unread = _read_clips(path)
     if skeleton is None:
-        skeleton, kept = _skeleton_of(path, found, joints)
-        joints = kept if joints is None else joints
+        skeleton, indices = _skeleton_of(path, unread, joints)
+        joints = indices if joints is None else joints
     skeleton = replace(skeleton, up=up or skeleton.up, fps=fps or skeleton.fps)
     file = Path(labels) if labels else companion(path, LABELS)
-    known = read_labels(file, labels)
-    if known and not any((split, name) in known or (None, name) in known for split, name, _, _ in found):
+    labels_of = read_labels(file, labels)
+    if labels_of and not any((split, name) in labels_of or (None, name) in labels_of for split, name, _, _ in unread):
         raise ValueError(f"{file}: no row names a clip of {path} by (split, clip)")
-    found.reverse()
+    unread.reverse()
 
     def clips() -> Iterator[Clip]:
         size = 0
-        while found:  # frees each array as soon as its clip is taken over
-            split, name, positions, turns = found.pop()
+        while unread:  # frees each array as soon as its clip is taken over
+            split, name, positions, rotations = unread.pop()
             if joints is not None and positions.ndim == 3 and positions.shape[1] > max(joints):
-                positions, turns = positions[:, list(joints)], None
+                positions, rotations = positions[:, list(joints)], None
             if metres is not None and positions.dtype.kind in "fiu":
                 positions = metres * positions
             size += 0 if is_mapped(positions) else positions.nbytes
             if size > LARGEST:  # in a large mapped file, some arrays may have to be copied
                 raise ValueError(f"it has more than {LARGEST:,} bytes of motion that is not mapped as float32")
-            labelled = known.get((split, name), known.get((None, name), {}))
-            yield Clip(split, name, positions, labelled, rotations=turns if skeleton.rest else None)
-            del positions, turns
+            labelled = labels_of.get((split, name), labels_of.get((None, name), {}))
+            yield Clip(split, name, positions, labelled, rotations=rotations if skeleton.rest else None)
+            del positions, rotations
 
     try:
         motion = MotionSet(clips(), skeleton, path.stem, copy=False, skip_bad=skip_bad, missing=missing)
@@ -139,10 +139,10 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
     with files.atomic_write(path) as file:
         write_arrays(file, members())
     skeleton().to_json(own_companion(path, SKELETON))
-    own = own_companion(path, LABELS)
+    label_file = own_companion(path, LABELS)
     # labels.csv of the folder belongs to other clips
-    if not write_labels(own, labelled, always=path.with_name(LABELS).is_file()):
-        own.unlink(missing_ok=True)
+    if not write_labels(label_file, labelled, always=path.with_name(LABELS).is_file()):
+        label_file.unlink(missing_ok=True)
 
 
 def own_companion(path: Path, name: str) -> Path:
@@ -152,8 +152,8 @@ def own_companion(path: Path, name: str) -> Path:
 
 def companion(path: Path, name: str) -> Path:
     """Return the path of the skeleton or labels of a motion file: its own if there is one, or else the folder's."""
-    own = own_companion(path, name)
-    return own if own.is_file() else path.with_name(name)
+    path_of_own = own_companion(path, name)
+    return path_of_own if path_of_own.is_file() else path.with_name(name)
 
 
 def write_labels(path: Path, clips: Iterable[Clip], older: Path | None = None, always: bool = False) -> bool:
@@ -173,10 +173,10 @@ def write_labels(path: Path, clips: Iterable[Clip], older: Path | None = None, a
         return False
     if older is not None:
         new = {key for row in rows for key in ((row["split"], row["clip"]), (None, row["clip"]))}
-        kept = {key: row for key, row in read_labels(older, None).items() if key not in new}
-        if any(split is None for split, _ in kept):
+        kept_rows = {key: row for key, row in read_labels(older, None).items() if key not in new}
+        if any(split is None for split, _ in kept_rows):
             raise ValueError(f"{older}: other clips have labels in it, by name alone; add a column named split")
-        rows = [*kept.values(), *rows]
+        rows = [*kept_rows.values(), *rows]
     columns = list(dict.fromkeys(name for row in rows for name in row))
     table = io.StringIO(newline="")
     writer = csv.DictWriter(table, ["split", "clip", *(c for c in columns if c not in ("split", "clip"))])
@@ -197,7 +197,7 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
 
 
 def _skeleton_of(
-    path: Path, clips: Sequence[_Read], chosen: Sequence[int] | None
+    path: Path, clips: Sequence[_Read], selected: Sequence[int] | None
 ) -> tuple[Skeleton, tuple[int, ...] | None]:
     """Return the skeleton of a file, read or known by its subjects, and the indices of its joints in the file.
 
@@ -208,37 +208,37 @@ def _skeleton_of(
     file = companion(path, SKELETON)
     if file.is_file():
         skeleton = Skeleton.from_json(file)
-        if chosen is None and counts and skeleton.joints not in counts:
+        if selected is None and counts and skeleton.joints not in counts:
             raise ValueError(
                 f"{path} has {max(counts)} joints and {file} has {skeleton.joints}, so they do not belong together; "
                 f"put the archive's own skeleton into {own_companion(path, SKELETON).name}, or pass skeleton="
             )
         return skeleton, None
     splits = {split for split, *_ in clips}
-    for subjects, joints, skeleton, kept in _ARCHIVES:
+    for subjects, joints, skeleton, indices in _ARCHIVES:
         if splits and splits <= subjects and joints in counts:
-            return skeleton, kept
+            return skeleton, indices
     raise ValueError(f"{path}: {WHICH}")
 
 
-def read_labels(beside: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
-    """Return rows by (split, clip), or by (None, clip) without a split column; `beside` is the default file."""
-    file = Path(labels) if labels else beside
+def read_labels(default: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
+    """Return rows by (split, clip), or by (None, clip) without a split column; `default` replaces absent `labels`."""
+    file = Path(labels) if labels else default
     if not file.is_file():
         if labels:
             raise FileNotFoundError(f"{labels}: no such labels file")
         return {}
-    found = {}
+    rows_by_key = {}
     with _table(file) as (header, rows):
         if "clip" not in header:
             raise ValueError(f"{file}: expected a column named clip, found {', '.join(header)[:200] or 'nothing'}")
-        if twice := [name for name, count in Counter(header).items() if count > 1 and name]:
-            raise ValueError(f"{file}: column {twice[0]!r} occurs twice")
+        if repeated := [name for name, count in Counter(header).items() if count > 1 and name]:
+            raise ValueError(f"{file}: column {repeated[0]!r} occurs twice")
         for _, cells in rows:
             if cells:
                 row = {name: cell for name, cell in zip(header, cells, strict=True) if name}
-                found[row.get("split"), row["clip"]] = row
-    return found
+                rows_by_key[row.get("split"), row["clip"]] = row
+    return rows_by_key
 
 
 @contextmanager
@@ -259,7 +259,7 @@ def _table(path: Path, *most: int) -> Iterator[tuple[list[str], Iterator[tuple[i
         reader = csv.reader(text, strict=True)
         try:
             header = next(reader, [])
-            if unnamed := [place for place, name in enumerate(header, 1) if not is_name(name)]:
+            if unnamed := [position for position, name in enumerate(header, 1) if not is_name(name)]:
                 raise ValueError(f"{path}: column {unnamed[0]} is {brief(header[unnamed[0] - 1])}, expected a name")
             yield header, numbered()
         except csv.Error as error:
@@ -291,10 +291,10 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
     path = Path(path)
     if path.suffix.lower() not in (".npz", ".csv"):
         raise ValueError(f"{path}: paths of joints must be in an npz or a csv file")
-    found = read_arrays(path) if path.suffix.lower() == ".npz" else _read_columns(path)
-    if not found:
+    paths = read_arrays(path) if path.suffix.lower() == ".npz" else _read_columns(path)
+    if not paths:
         raise ValueError(f"{path}: the file has no path of a joint")
-    for joint, values in found.items():
+    for joint, values in paths.items():
         if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
             raise ValueError(
                 f"{path}: the path of {joint} is {values.dtype} {values.shape}, expected numbers (frames, 3)"
@@ -305,23 +305,23 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
                 f"{path}: the path of {joint} has {values[far][0]} in frame {np.argwhere(far)[0][0]}; expected metres, "
                 "or nan where it is not known"
             )
-    return found
+    return paths
 
 
 def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[str, np.ndarray]:
     """Read three columns per joint from a csv file with at most `numbers` values, and optionally a limit in bytes."""
     with _table(path, *most) as (header, rows):
         columns: dict[str, list[int]] = {}
-        for place, name in enumerate(header):
+        for column, name in enumerate(header):
             joint, _, axis = name.strip().rpartition("_")
-            places = columns.setdefault(joint, [-1, -1, -1])
-            if axis not in ("x", "y", "z") or not joint or places["xyz".index(axis)] >= 0:
+            axes = columns.setdefault(joint, [-1, -1, -1])
+            if axis not in ("x", "y", "z") or not joint or axes["xyz".index(axis)] >= 0:
                 raise ValueError(
-                    f"{path}: column {place + 1} is {name[:100]!r}; expected a header of columns such as LWrist_x, "
+                    f"{path}: column {column + 1} is {name[:100]!r}; expected a header of columns such as LWrist_x, "
                     "LWrist_y and LWrist_z, each once"
                 )
-            places["xyz".index(axis)] = place
-        if short := [joint for joint, places in columns.items() if min(places) < 0]:
+            axes["xyz".index(axis)] = column
+        if short := [joint for joint, axes in columns.items() if min(axes) < 0]:
             raise ValueError(f"{path}: a column of {short[0]} is missing")
         values: list[np.ndarray] = []
         blank = 0
@@ -334,16 +334,18 @@ def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[s
             values += [np.full(len(header), np.nan)] * blank
             blank = 0
             row = np.full(len(header), np.nan)
-            for place, cell in enumerate(cells):
+            for column, cell in enumerate(cells):
                 try:
-                    row[place] = float(cell if cell.strip() else "nan")
+                    row[column] = float(cell if cell.strip() else "nan")
                 except ValueError:
-                    raise ValueError(f"{path}: row {number}, {header[place]}: {cell[:100]!r} is not a number") from None
+                    raise ValueError(
+                        f"{path}: row {number}, {header[column]}: {cell[:100]!r} is not a number"
+                    ) from None
             values.append(row)
     if not columns or not values:
         raise ValueError(f"{path}: expected a header and one row for each frame")
     table = np.stack(values)
-    return {joint: table[:, places] for joint, places in columns.items()}
+    return {joint: table[:, axes] for joint, axes in columns.items()}
 
 
 def read_table(path: Path) -> Recording:
@@ -386,10 +388,12 @@ def _read_clips(path: Path) -> list[_Read]:
         if list(members) == ["positions_3d"]:
             return [(*clip, None) for clip in members["positions_3d"].clips()]
         clips = []
-        turns = {name for name in members if name.endswith(ROTATIONS) and name.removesuffix(ROTATIONS) in members}
+        rotation_names = {
+            name for name in members if name.endswith(ROTATIONS) and name.removesuffix(ROTATIONS) in members
+        }
         for name, member in members.items():
             split, slash, clip = name.rpartition("/")
-            if name not in turns:
-                turned = members[name + ROTATIONS].array() if name + ROTATIONS in turns else None
-                clips.append((split if slash else "all", clip, member.array(), turned))
+            if name not in rotation_names:
+                rotations = members[name + ROTATIONS].array() if name + ROTATIONS in rotation_names else None
+                clips.append((split if slash else "all", clip, member.array(), rotations))
         return clips

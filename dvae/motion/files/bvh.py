@@ -47,35 +47,35 @@ def read_bvh(path: str | Path) -> Recording:
     frames, seconds, line = _header(path, lines, line)
     channels = sum(len(joint.channels) for joint in joints)
     values = numbers(" ".join(lines[line:]), f"{path}: the frames from line {line + 1}")
-    rows, rest = divmod(len(values), channels) if channels else (0, 0)
-    if rest or abs(rows - frames) > 1 or not rows:
+    rows, remainder = divmod(len(values), channels) if channels else (0, 0)
+    if remainder or abs(rows - frames) > 1 or not rows:
         raise ValueError(
             f"{path}: {len(values):,} numbers follow, expected {frames:,} frames of {channels} channels each"
         )
     check_size(path, rows, len(joints))
     values = values.reshape(rows, channels)
-    places = torch.empty(rows, len(joints), 3, dtype=torch.float64)
-    turns = torch.eye(3, dtype=torch.float64).repeat(rows, len(joints), 1, 1)
+    offsets = torch.empty(rows, len(joints), 3, dtype=torch.float64)
+    rotations = torch.eye(3, dtype=torch.float64).repeat(rows, len(joints), 1, 1)
     orders: dict[str, list[tuple[int, list[int]]]] = {}
     first = 0
-    for place, joint in enumerate(joints):
-        places[:, place] = torch.from_numpy(joint.offset)
+    for index, joint in enumerate(joints):
+        offsets[:, index] = torch.from_numpy(joint.offset)
         for channel, axis in enumerate(joint.channels, first):
             if axis < 3:
-                places[:, place, axis] = torch.from_numpy(values[:, channel])
+                offsets[:, index, axis] = torch.from_numpy(values[:, channel])
         turning = [(channel, axis - 3) for channel, axis in enumerate(joint.channels, first) if axis >= 3]
         order = "".join("xyz"[axis] for _, axis in turning)
-        orders.setdefault(order, []).append((place, [channel for channel, _ in turning]))
+        orders.setdefault(order, []).append((index, [channel for channel, _ in turning]))
         first += len(joint.channels)
-    for order, found in orders.items():
+    for order, channels_of in orders.items():
         if order:
-            which, columns = [place for place, _ in found], [columns for _, columns in found]
+            indices, columns = [index for index, _ in channels_of], [columns for _, columns in channels_of]
             angles = torch.from_numpy(np.deg2rad(values[:, columns]))
-            turns[:, which] = to_matrix(angles, f"euler-{order}")
+            rotations[:, indices] = to_matrix(angles, f"euler-{order}")
     names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
     fps = 1 / seconds
     fps = float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps
-    return Recording.turned(names, parents, places, turns, fps=fps)
+    return Recording.turned(names, parents, offsets, rotations, fps=fps)
 
 
 def write_bvh(
@@ -114,7 +114,7 @@ def write_bvh(
         if parent >= 0:
             children[parent].append(joint)
     lines, turning = ["HIERARCHY"], []
-    turns = " ".join(f"{axis.upper()}rotation" for axis in order)
+    axis_names = " ".join(f"{axis.upper()}rotation" for axis in order)
 
     waiting = [(parents.index(-1), 0)]
     while waiting:
@@ -126,7 +126,7 @@ def write_bvh(
         offset = " ".join(f"{100 * value:.6f}" for value in (offsets[joint] if depth else np.zeros(3)))
         turning.append(joint)
         lines += [f"{tab}{'JOINT' if depth else 'ROOT'} {names[joint]}", f"{tab}{{", f"{tab}\tOFFSET {offset}"]
-        lines.append(f"{tab}\tCHANNELS {'3 ' if depth else '6 Xposition Yposition Zposition '}{turns}")
+        lines.append(f"{tab}\tCHANNELS {'3 ' if depth else '6 Xposition Yposition Zposition '}{axis_names}")
         if not children[joint]:
             lines += [f"{tab}\t{line}" for line in ("End Site", "{", "\tOFFSET 0.000000 0.000000 0.000000", "}")]
         waiting += [(-1, depth), *((child, depth + 1) for child in reversed(children[joint]))]
@@ -146,21 +146,21 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
     """
     joints: list[_Joint] = []
     open_: list[int] = []  # joints with open braces, the innermost last
-    named = False  # a joint was named, and its opening brace must follow
+    awaits_brace = False  # a joint was named, and its opening brace must follow
     words = ((word, number) for number, line in enumerate(lines, 1) for word in _WORD.findall(line))
     ahead = next(words, None)
 
-    def wrong(number: int, expected: str) -> ValueError:
+    def error(number: int, expected: str) -> ValueError:
         return ValueError(f"{path}: line {number} is {lines[number - 1].strip()[:60]!r}, expected {expected}")
 
     def following(belongs: Callable[[str, int], bool]) -> list[str]:
         """Return the next words that belong to the current keyword."""
         nonlocal ahead
-        found = []
+        following_words = []
         while ahead is not None and belongs(*ahead):
-            found.append(ahead[0])
+            following_words.append(ahead[0])
             ahead = next(words, None)
-        return found
+        return following_words
 
     while ahead is not None:
         (word, number), ahead = ahead, next(words, None)
@@ -168,49 +168,49 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
         if kind == "HIERARCHY" and not joints:
             continue
         if kind == "MOTION":
-            if open_ or named or not joints:
-                raise wrong(number, "the hierarchy to be whole before")
+            if open_ or awaits_brace or not joints:
+                raise error(number, "MOTION after a complete hierarchy")
             lines[number - 1] = lines[number - 1][lines[number - 1].upper().rindex(kind) + len(kind) :]
             return joints, number - 1
         if kind in ("ROOT", "JOINT", "END"):
-            if named or (kind == "ROOT") == bool(joints) or (kind != "ROOT" and not open_):
-                raise wrong(number, "one ROOT, and JOINT or End Site within its braces")
+            if awaits_brace or (kind == "ROOT") == bool(joints) or (kind != "ROOT" and not open_):
+                raise error(number, "one ROOT, and JOINT or End Site within its braces")
             line = number if ahead is None else ahead[1]  # line of the name
-            rest = " ".join(following(lambda word, at: at == line and word != "{"))  # noqa: B023
+            label = " ".join(following(lambda word, at: at == line and word != "{"))  # noqa: B023
             parent = open_[-1] if open_ else -1
-            name = rest if kind != "END" else joints[parent].name + END
+            name = label if kind != "END" else joints[parent].name + END
             if any(joint.name == name for joint in joints):
                 same = sum(joint.name.startswith(name) for joint in joints)
                 if kind != "END":
-                    raise wrong(number, f"a name of its own; there is another joint {name!r}")
+                    raise error(number, f"a unique name; there is another joint {name!r}")
                 name += str(same + 1)
             joints.append(_Joint(name, parent, ends=kind == "END"))
             check_joints(path, len(joints))
-            named = True
+            awaits_brace = True
         elif kind == "{":
-            if not named:
-                raise wrong(number, "ROOT, JOINT or End Site before a brace")
+            if not awaits_brace:
+                raise error(number, "ROOT, JOINT or End Site before a brace")
             open_.append(len(joints) - 1)
-            named = False
+            awaits_brace = False
         elif kind == "}":
-            if not open_ or named:
-                raise wrong(number, "a brace that was opened")
+            if not open_ or awaits_brace:
+                raise error(number, "a brace that was opened")
             closed = joints[open_.pop()]
             if closed.ends and closed is joints[-1] and not (closed.offset.any() or closed.channels):
                 joints.pop()  # the end coincides with its parent
-        elif kind == "OFFSET" and open_ and not named:
-            found = numbers(" ".join(following(_is_value)), f"{path}: line {number}")
-            if len(found) != 3:
-                raise wrong(number, "three numbers")
-            joints[open_[-1]].offset = found
-        elif kind == "CHANNELS" and open_ and not named:
+        elif kind == "OFFSET" and open_ and not awaits_brace:
+            offset = numbers(" ".join(following(_is_value)), f"{path}: line {number}")
+            if len(offset) != 3:
+                raise error(number, "three numbers")
+            joints[open_[-1]].offset = offset
+        elif kind == "CHANNELS" and open_ and not awaits_brace:
             count, *channels = [word.lower() for word in following(_is_value)] or [""]
             unknown = [channel for channel in channels if channel not in _AXES]
             if unknown or not count.isdecimal() or len(channels) != len(set(channels)) or str(len(channels)) != count:
-                raise wrong(number, "their number and as many of Xposition ... Zrotation, each once")
+                raise error(number, "the number of channels, then Xposition ... Zrotation, each once")
             joints[open_[-1]].channels = [_AXES.index(channel) for channel in channels]
         else:
-            raise wrong(number, "ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION or a brace")
+            raise error(number, "ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION or a brace")
     raise ValueError(f"{path}: not a BVH file: it has no line MOTION")
 
 
@@ -220,18 +220,18 @@ def _is_value(word: str, _: int) -> bool:
 
 def _header(path: Path, lines: list[str], line: int) -> tuple[int, float, int]:
     """Return the number of frames, the frame time in seconds, and the line where the frames begin."""
-    found: list[float] = []
+    values: list[float] = []
     for expected in ("frames:", "frame time:"):
         text = ""
         while line < len(lines) and len(text) <= len(expected):
             text = " ".join((text + " " + lines[line].lower()).split())
             line += 1
-        said = text.removeprefix(expected) if text.startswith(expected) else ""
-        value = numbers(said, f"{path}: line {line}")
-        if len(value) != 1:
+        number_text = text.removeprefix(expected) if text.startswith(expected) else ""
+        numbers_read = numbers(number_text, f"{path}: line {line}")
+        if len(numbers_read) != 1:
             raise ValueError(f"{path}: line {line} is {text[:60]!r}, expected {expected.capitalize()} and a number")
-        found.append(value[0])
-    frames, seconds = found
+        values.append(numbers_read[0])
+    frames, seconds = values
     if frames != int(frames) or frames < 1 or not 1e-6 < seconds < 1e3:
         raise ValueError(f"{path}: {frames:g} frames of {seconds:g} s each are not a recording")
     return int(frames), seconds, line

@@ -47,12 +47,12 @@ def get(name: str, out: str | Path, url: str | None = None) -> list[Path]:
     address = (url or address).rstrip("/") + "/"
     fetcher = pooch.create(path=out, base_url=address, registry={f: f"sha256:{digest}" for f, digest in files.items()})
     pooch.get_logger().setLevel("WARNING")
-    found = []
+    paths = []
     for file in files:
         try:
-            found.append(Path(fetcher.fetch(file)))
+            paths.append(Path(fetcher.fetch(file)))
         except ValueError as error:
             raise ValueError(f"{address}{file}: the file differs from the known one ({error})") from None
         except OSError as error:
             raise OSError(f"{address}{file} cannot be downloaded: {error}") from None
-    return found
+    return paths

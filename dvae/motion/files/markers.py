@@ -55,10 +55,10 @@ def read_c3d(path: str | Path) -> Recording:
     check_joints(path, markers)
     kind = np.dtype(f"{order}f4" if scale < 0 else f"{order}i2")
     row = 4 * markers + analog
-    there = max(len(content) - _BLOCK * (start - 1), 0) // (kind.itemsize * row) if row and start else 0
-    frames = there if last == 0xFFFF else last - first + 1  # the number of frames exceeds two bytes
-    if not 0 < frames <= there or not markers:
-        raise ValueError(f"{path}: it announces {markers} markers in {frames} frames, but has room for {there}")
+    room = max(len(content) - _BLOCK * (start - 1), 0) // (kind.itemsize * row) if row and start else 0
+    frames = room if last == 0xFFFF else last - first + 1  # the number of frames exceeds two bytes
+    if not 0 < frames <= room or not markers:
+        raise ValueError(f"{path}: it announces {markers} markers in {frames} frames, but has room for {room}")
     check_size(path, frames, markers)
     unit = "".join(parameters.get("UNITS", [])[:1]).lower()
     if unit not in METRES or not 0 < fps < 1e6 or not np.isfinite(scale):
@@ -69,30 +69,34 @@ def read_c3d(path: str | Path) -> Recording:
     zero = np.asarray((values == 0).all(-1))
     places[(values[..., 3] < 0) | zero | ~(np.abs(places) < 1e9).all(-1)] = np.nan
     names = _numbered(parameters, "LABELS")[:markers]
-    listed = {name.upper() for name in _numbered(parameters, "TYPE_GROUPS")} - {"LABELS"}
-    groups = {*_OUTPUTS, *(name for name in listed if "MARKER" not in name and not name.endswith("_UNITS"))}
+    group_names = {name.upper() for name in _numbered(parameters, "TYPE_GROUPS")} - {"LABELS"}
+    groups = {*_OUTPUTS, *(name for name in group_names if "MARKER" not in name and not name.endswith("_UNITS"))}
     outputs = {name for group in groups for name in _numbered(parameters, group)}
-    named = [n for n, name in enumerate(names) if name and name[0] != "*"]
-    seen = np.asarray(np.isfinite(places).all(2).any(0))
-    kept = [n for n in named if names[n] not in outputs and seen[n]]
-    if not kept:
+    named_points = [n for n, name in enumerate(names) if name and name[0] != "*"]
+    is_observed = np.asarray(np.isfinite(places).all(2).any(0))
+    marker_columns = [n for n in named_points if names[n] not in outputs and is_observed[n]]
+    if not marker_columns:
         raise ValueError(f"{path}: it has no named markers with observations")
     left_out = {
-        "computed by a model of the body": [names[n] for n in named if names[n] in outputs],
-        "never seen": [names[n] for n in named if names[n] not in outputs and not seen[n]],
-        "without a name": [f"point {n + 1}" for n in sorted({*range(markers)} - {*named}) if seen[n]],
+        "computed by a model of the body": [names[n] for n in named_points if names[n] in outputs],
+        "never observed": [names[n] for n in named_points if names[n] not in outputs and not is_observed[n]],
+        "without a name": [f"point {n + 1}" for n in sorted({*range(markers)} - {*named_points}) if is_observed[n]],
     }
-    notes = [f"{len(points)} points {why} are left out ({_some(points)})" for why, points in left_out.items() if points]
-    if (count := int(zero[:, kept].sum())) > 0:
-        notes.append(f"{count:,} places that are exactly 0, 0, 0 with residual 0 are read as not seen")
-    for n in kept:
+    notes = [
+        f"{len(points)} points {reason} are left out ({_join_names(points)})"
+        for reason, points in left_out.items()
+        if points
+    ]
+    if (count := int(zero[:, marker_columns].sum())) > 0:
+        notes.append(f"{count:,} positions that are exactly 0, 0, 0 with residual 0 are read as missing")
+    for n in marker_columns:
         if (name := names[n]) in names[:n]:
-            names[n] = next(new for again in itertools.count(2) if (new := f"{name}_{again}") not in names)
+            names[n] = next(new for number in itertools.count(2) if (new := f"{name}_{number}") not in names)
             notes.append(f"another marker {name} is read as {names[n]}")
-    order_of, parents = tree(places[:, kept])
-    chosen = [kept[place] for place in order_of]
-    found = [names[n] for n in chosen]
-    return Recording(found, parents, places[:, chosen], fps=fps, metres=METRES[unit], notes=notes)
+    order_of, parents = tree(places[:, marker_columns])
+    ordered = [marker_columns[index] for index in order_of]
+    ordered_names = [names[n] for n in ordered]
+    return Recording(ordered_names, parents, places[:, ordered], fps=fps, metres=METRES[unit], notes=notes)
 
 
 def _numbered(parameters: dict[str, list[str]], name: str) -> list[str]:
@@ -101,7 +105,7 @@ def _numbered(parameters: dict[str, list[str]], name: str) -> list[str]:
     return [text for part in parts for text in parameters[part]]
 
 
-def _some(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     return ", ".join(names[:6]) + ", …" * (len(names) > 6)
 
 
@@ -110,26 +114,26 @@ def _parameters(content: bytes) -> tuple[dict[str, list[str]], str]:
     start = _BLOCK * (content[0] - 1)
     content = content[start : start + _BLOCK * _MOST_BLOCKS]
     content = content[: _BLOCK * content[2] or None]  # some programs write 0
-    order, at, point = _ORDERS[content[3]], 4, None
-    found: dict[int, dict[str, list[str]]] = {}
-    while at < len(content) and content[at]:
-        size, group = struct.unpack_from("bb", content, at)
-        name = content[at + 2 : at + 2 + abs(size)].decode("latin1").strip().upper()
-        here = at + 2 + abs(size)
-        further = struct.unpack_from(f"{order}H", content, here)[0]
+    order, position, point = _ORDERS[content[3]], 4, None
+    texts_by_group: dict[int, dict[str, list[str]]] = {}
+    while position < len(content) and content[position]:
+        size, group = struct.unpack_from("bb", content, position)
+        name = content[position + 2 : position + 2 + abs(size)].decode("latin1").strip().upper()
+        start_of_content = position + 2 + abs(size)
+        offset = struct.unpack_from(f"{order}H", content, start_of_content)[0]
         if group < 0:
             point = -group if name == "POINT" else point
-        elif struct.unpack_from("b", content, here + 2)[0] == -1:  # a text parameter
-            sizes = list(content[here + 4 : here + 4 + content[here + 3]])
+        elif struct.unpack_from("b", content, start_of_content + 2)[0] == -1:  # a text parameter
+            sizes = list(content[start_of_content + 4 : start_of_content + 4 + content[start_of_content + 3]])
             width = sizes[0] if sizes else 1
-            begin = here + 4 + len(sizes)
+            begin = start_of_content + 4 + len(sizes)
             text = content[begin : begin + width * prod(sizes[1:])].decode("latin1")
             texts = [text[n : n + width].strip(" \0") for n in range(0, len(text), max(width, 1))]
-            found.setdefault(group, {})[name] = texts
-        if not further:
+            texts_by_group.setdefault(group, {})[name] = texts
+        if not offset:
             break
-        at = here + further
-    return found[point or 0], order
+        position = start_of_content + offset
+    return texts_by_group[point or 0], order
 
 
 def tree(places: np.ndarray) -> tuple[list[int], list[int]]:
@@ -138,18 +142,20 @@ def tree(places: np.ndarray) -> tuple[list[int], list[int]]:
     Args:
         places: (F, M, 3), NaN where a marker was not observed.
     """
-    some = places[:: -(-len(places) * places.shape[1] ** 2 // MOST_DISTANCES)]
-    pairs = np.stack([np.linalg.norm(some - some[:, marker, None], axis=-1) for marker in range(some.shape[1])], 1)
-    known = np.isfinite(pairs)
-    count = np.maximum(known.sum(0), 1)
-    mean = np.where(known, pairs, 0).sum(0) / count
-    spread = np.sqrt(np.square(np.where(known, pairs - mean, 0)).sum(0) / count)
-    never = known.sum(0) < 2
-    mean, spread = np.where(never, mean.max() + 1, mean), np.where(never, spread.max() + 1, spread)
+    subset = places[:: -(-len(places) * places.shape[1] ** 2 // MOST_DISTANCES)]
+    pairs = np.stack(
+        [np.linalg.norm(subset - subset[:, marker, None], axis=-1) for marker in range(subset.shape[1])], 1
+    )
+    is_known = np.isfinite(pairs)
+    count = np.maximum(is_known.sum(0), 1)
+    mean = np.where(is_known, pairs, 0).sum(0) / count
+    spread = np.sqrt(np.square(np.where(is_known, pairs - mean, 0)).sum(0) / count)
+    is_unknown = is_known.sum(0) < 2
+    mean, spread = np.where(is_unknown, mean.max() + 1, mean), np.where(is_unknown, spread.max() + 1, spread)
     weights = spread + 1e-3 * mean + 1e-12  # prefers near markers on the same bone; csgraph ignores edges of weight 0
     np.fill_diagonal(weights, 0)
     middle = int(mean.sum(1).argmin())
     graphs = scipy.sparse.csgraph
     order, above = graphs.breadth_first_order(graphs.minimum_spanning_tree(weights), middle, directed=False)
-    at = {int(marker): place for place, marker in enumerate(order)}
-    return order.tolist(), [at.get(int(above[marker]), -1) for marker in order]
+    position_of = {int(marker): position for position, marker in enumerate(order)}
+    return order.tolist(), [position_of.get(int(above[marker]), -1) for marker in order]

@@ -41,7 +41,7 @@ SAMPLE = 9
 SAME = 1e-3
 """Tolerance in metres within which two files have the same rest pose."""
 
-BENDS = "rotations are left out, as a joint moves against the one that it hangs from"
+BENDS = "rotations are left out, because a joint moves relative to its parent"
 
 LIKE = 1.6
 """Maximum ratio of body sizes in one folder; smaller than 2.54, so that it detects inches among centimetres."""
@@ -95,7 +95,7 @@ def read_motion(
     recognised by their subjects and joints.
 
     Units and axes are read from the file, or else inferred: a person has a plausible size, and the head is above the
-    feet. `MotionSet.said` describes the result.
+    feet. `MotionSet.interpretation` describes the result.
 
     Args:
         path: file or folder.
@@ -122,18 +122,18 @@ def read_motion(
     path = Path(path)
     files = find_files(path, labels)
     if not files:
-        places = [joint for joint in joints or () if isinstance(joint, int)] if onto is None else []
-        found = read_archive(path, skeleton, labels, skip_bad, places or None, metres, up, fps, missing)
-        return found if places or (joints is None and onto is None) else select_joints(found, joints, onto)
-    some = sampled(files, skip_bad)
-    given = metres is not None, up is not None
-    reader = FileReader(infer_world(some, metres, up), *given, fps, skeleton, joints, onto, missing=missing)
+        indices = [joint for joint in joints or () if isinstance(joint, int)] if onto is None else []
+        motion = read_archive(path, skeleton, labels, skip_bad, indices or None, metres, up, fps, missing)
+        return motion if indices or (joints is None and onto is None) else select_joints(motion, joints, onto)
+    samples = sampled(files, skip_bad)
+    overrides = metres is not None, up is not None
+    reader = FileReader(infer_world(samples, metres, up), *overrides, fps, skeleton, joints, onto, missing=missing)
     collected = Collected(path.stem)
     clips, unread, size = [], [], 0
     for file in files:
         try:
-            clip, own, notes = reader(file, some.pop(str(file.path), None))
-            if reason := collected.add(file.path, clip, own, notes):
+            clip, skeleton_of_clip, notes = reader(file, samples.pop(str(file.path), None))
+            if reason := collected.add(file.path, clip, skeleton_of_clip, notes):
                 raise ValueError(reason)
         except ValueError as error:
             if not skip_bad:
@@ -173,7 +173,7 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
             )
         if suffix not in READERS or (suffix == ".npz" and not holds(path, "poses", "trans")):
             return []
-        return _known([File("all", path.stem, path)], companion(path, LABELS), labels)
+        return _with_labels([File("all", path.stem, path)], companion(path, LABELS), labels)
     kinds: dict[str, list[File]] = {suffix: [] for suffix in READERS}
     count = 0
     for folder, inner, names in os.walk(path, followlinks=False):
@@ -188,39 +188,40 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
                 count += 1
                 if count > MOST_FILES:
                     raise ValueError(f"{path}: it has more than {MOST_FILES:,} files; give its folders one by one")
-    there = {suffix: files for suffix, files in kinds.items() if files}
-    sure = [suffix for suffix in there if suffix not in (".csv", ".txt")]  # many csv and txt files are not motion
-    if len(sure) > 1:
-        counts = " and ".join(f"{len(there[suffix])} {suffix[1:]}" for suffix in sure)
+    present = {suffix: files for suffix, files in kinds.items() if files}
+    certain = [suffix for suffix in present if suffix not in (".csv", ".txt")]  # many csv and txt files are not motion
+    if len(certain) > 1:
+        counts = " and ".join(f"{len(present[suffix])} {suffix[1:]}" for suffix in certain)
         raise ValueError(f"{path}: it has {counts} files; put each kind into a folder of its own")
-    if not there:
+    if not present:
         raise FileNotFoundError(f"{path}: no file in it is one of {', '.join(READERS)}")
-    return _known(there[next(iter(there))], path / LABELS, labels)
+    return _with_labels(present[next(iter(present))], path / LABELS, labels)
 
 
-def _known(files: list[File], beside: Path, labels: str | Path | None) -> list[File]:
+def _with_labels(files: list[File], default: Path, labels: str | Path | None) -> list[File]:
     """Return the files with their labels."""
     for file in files:
         check_key((file.split, file.name), file.path)
-    known = read_labels(beside, labels)
+    labels_by_key = read_labels(default, labels)
     return [
-        replace(file, labels=known.get((file.split, file.name), known.get((None, file.name), {}))) for file in files
+        replace(file, labels=labels_by_key.get((file.split, file.name), labels_by_key.get((None, file.name), {})))
+        for file in files
     ]
 
 
 def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recording]:
     """Read some recordings of a folder, evenly spaced from its first file to its last."""
-    found, wrong = {}, None
-    for place in sorted({round(at) for at in np.linspace(0, len(files) - 1, min(SAMPLE, len(files)))}):
+    recordings, first_error = {}, None
+    for index in sorted({round(position) for position in np.linspace(0, len(files) - 1, min(SAMPLE, len(files)))}):
         try:
-            found[str(files[place].path)] = files[place].read()
+            recordings[str(files[index].path)] = files[index].read()
         except ValueError as error:
             if not skip_bad:
                 raise
-            wrong = error
-    if wrong is not None and not found:
-        raise wrong
-    return found
+            first_error = error
+    if first_error is not None and not recordings:
+        raise first_error
+    return recordings
 
 
 @dataclass(frozen=True)
@@ -267,28 +268,30 @@ class FileReader:
             world = replace(world, unit="as the file says", metres=recording.metres)
         if recording.up is not None and not self.up:
             world = replace(world, axis=recording.up, upwards=True)
-        settled = to_world(recording, world)
-        if settled.up != self.world.up:
-            settled = rotate_up(settled, self.world.up)
-        fps = self.fps or settled.fps
+        normalised = to_world(recording, world)
+        if normalised.up != self.world.up:
+            normalised = rotate_up(normalised, self.world.up)
+        fps = self.fps or normalised.fps
         if fps is None:
             raise ValueError("it does not state its frames per second; give fps=")
-        known = self.skeleton or settled.skeleton
-        if known and known.joints != len(settled.names):
-            raise ValueError(f"it has {len(settled.names)} joints, skeleton {known.name!r} has {known.joints}")
-        if known:
-            alike = list(known.parents) == list(settled.parents)
-            settled = replace(settled, names=known.names, parents=known.parents)
-            settled = settled if alike else replace(settled, rotations=None, offsets=None)
+        skeleton = self.skeleton or normalised.skeleton
+        if skeleton and skeleton.joints != len(normalised.names):
+            raise ValueError(f"it has {len(normalised.names)} joints, skeleton {skeleton.name!r} has {skeleton.joints}")
+        if skeleton:
+            same_tree = list(skeleton.parents) == list(normalised.parents)
+            normalised = replace(normalised, names=skeleton.names, parents=skeleton.parents)
+            normalised = normalised if same_tree else replace(normalised, rotations=None, offsets=None)
         empty = Clip(file.split, file.name, np.empty((0, 0, 3)), file.labels)
-        clip, own = clip_of(settled, empty, fps, known, self.joints, self.onto)
+        clip, tree = clip_of(normalised, empty, fps, skeleton, self.joints, self.onto)
         if self.resampled and self.resampled != fps:
-            clip, own = clip.resampled(fps / self.resampled), replace(own, fps=float(self.resampled))
-        if reason := defect(clip, own, self.missing):
+            clip, tree = clip.resampled(fps / self.resampled), replace(tree, fps=float(self.resampled))
+        if reason := defect(clip, tree, self.missing):
             raise ValueError(reason)
-        notes = [*recording.notes, *([BENDS] if settled.rotations is not None and clip.rotations is None else [])]
-        notes += [lying] if (lying := orientation_warning(settled.names, settled.positions, self.world.up)) else []
-        return clip, own, notes
+        notes = [*recording.notes, *([BENDS] if normalised.rotations is not None and clip.rotations is None else [])]
+        notes += (
+            [warning] if (warning := orientation_warning(normalised.names, normalised.positions, self.world.up)) else []
+        )
+        return clip, tree, notes
 
 
 def clip_of(
@@ -316,9 +319,9 @@ def clip_of(
     if recording.rotations is not None and recording.offsets is not None:
         rotations, rest = recording.rotations.astype(np.float32), tuple(recording.offsets.flatten().tolist())
     tree = tuple(recording.names), tuple(recording.parents), left, right
-    own = Skeleton(*tree, recording.up or "y", float(fps), known.name if known else clip.name, rest=rest)
+    clip_tree = Skeleton(*tree, recording.up or "y", float(fps), known.name if known else clip.name, rest=rest)
     labels = {**recording.labels, **clip.labels}
-    return replace(clip, positions=positions, labels=labels, rotations=rotations), own
+    return replace(clip, positions=positions, labels=labels, rotations=rotations), clip_tree
 
 
 def select_recording_joints(
@@ -329,14 +332,14 @@ def select_recording_joints(
         return recording if recording.loose <= RIGID else replace(recording, rotations=None, offsets=None)
     names, parents = recording.names, recording.parents
     if onto is None:
-        found = Kept.of(names, parents, joints or ())
+        subset = Kept.of(names, parents, joints or ())
     else:
-        found = Kept.onto(names, onto, joints if isinstance(joints, Mapping) else None)
-    positions, rotations, offsets = found.motion(parents, recording.positions, recording.rotations)
-    made = replace(
-        recording, names=found.names, parents=found.parents, positions=positions, rotations=rotations, offsets=offsets
+        subset = Kept.onto(names, onto, joints if isinstance(joints, Mapping) else None)
+    positions, rotations, offsets = subset.motion(parents, recording.positions, recording.rotations)
+    selected = replace(
+        recording, names=subset.names, parents=subset.parents, positions=positions, rotations=rotations, offsets=offsets
     )
-    return rotate_up(made, onto.up) if onto is not None and onto.up != recording.up else made
+    return rotate_up(selected, onto.up) if onto is not None and onto.up != recording.up else selected
 
 
 def rotate_up(recording: Recording, up: str) -> Recording:
@@ -355,23 +358,29 @@ class Collected:
     def __init__(self, name: str):
         self._name, self._first = name, Path()
         self._skeleton: Skeleton | None = None
-        self._bones, self._alike, self._extents = np.zeros(0), True, [0.0]
+        self._bones, self._same_rest, self._extents = np.zeros(0), True, [0.0]
         self._notes: dict[str, list[Path]] = {}
 
     def add(self, path: Path, clip: Clip, skeleton: Skeleton, notes: Sequence[str] = ()) -> str | None:
         """Add a clip, or return the reason why it does not match the earlier ones."""
         bones = skeleton.bone_lengths(fullest(clip.positions)[0].astype(np.float64))
-        own = float(np.median(extents(clip.positions).max(1)))
+        extent = float(np.median(extents(clip.positions).max(1)))
         if self._skeleton is None:
-            self._first, self._skeleton, self._bones, self._extents = path, skeleton, bones, [own]
+            self._first, self._skeleton, self._bones, self._extents = path, skeleton, bones, [extent]
             self._note(path, notes)
             return None
         first = self._skeleton
         if set(first.names) != set(skeleton.names):
-            lacking = [name for name in first.names if name not in skeleton.names]
-            strange = [name for name in skeleton.names if name not in first.names]
-            said = [f"{verb} {', '.join(names[:8])}" for verb, names in (("lacks", lacking), ("has", strange)) if names]
-            return f"{path}: {' and '.join(said)}, other than {self._first}; joints= or onto= takes what they share"
+            missing = [name for name in first.names if name not in skeleton.names]
+            additional = [name for name in skeleton.names if name not in first.names]
+            differences = [
+                f"{verb} {', '.join(names[:8])}"
+                for verb, names in (("does not have", missing), ("has", additional))
+                if names
+            ]
+            return (
+                f"{path}: {' and '.join(differences)}, unlike {self._first}; select common joints with joints= or onto="
+            )
         if first.names != skeleton.names or (first.parents != skeleton.parents and clip.rotations is not None):
             return f"{path}: its joints have another order or tree than in {self._first}; give onto="
         if first.fps != skeleton.fps:
@@ -379,16 +388,16 @@ class Collected:
                 f"{path}: {skeleton.fps:g} frames per second, {self._first} has {first.fps:g}; give fps= if their "
                 "headers are wrong, or resample with `dvae data convert --fps`"
             )
-        there = np.isfinite(bones + self._bones)  # known in both
-        size = bones[there].sum() / max(self._bones[there].sum(), 1e-9)
-        if there.any() and not 1 / LIKE < size < LIKE:
+        is_known = np.isfinite(bones + self._bones)  # known in both
+        size = bones[is_known].sum() / max(self._bones[is_known].sum(), 1e-9)
+        if is_known.any() and not 1 / LIKE < size < LIKE:
             return (
                 f"{path}: its body is {size:.2g} times as large as in {self._first}; if it is in "
                 "another unit, read it separately with metres="
             )
         other, rest = np.array(first.rest), np.array(skeleton.rest)
-        self._alike &= other.shape == rest.shape and not (np.abs(other - rest) > SAME).any()
-        self._extents.append(own)
+        self._same_rest &= other.shape == rest.shape and not (np.abs(other - rest) > SAME).any()
+        self._extents.append(extent)
         self._note(path, notes)
         return None
 
@@ -402,7 +411,7 @@ class Collected:
         assert self._skeleton is not None
         single = len(self._extents) == 1
         name = self._skeleton.name if single or self._skeleton.name != self._first.stem else self._name
-        return replace(self._skeleton, name=name, rest=self._skeleton.rest if self._alike else ())
+        return replace(self._skeleton, name=name, rest=self._skeleton.rest if self._same_rest else ())
 
     def motion(self, clips: Sequence[Clip], **known: Any) -> MotionSet:
         """Return the clips as one set, without rotations if the rest poses differ."""
@@ -411,13 +420,13 @@ class Collected:
 
     def interpretation(self, world: World) -> str:
         """Return a description of how the files were interpreted."""
-        found = [f"{world}, a person of {np.median(self._extents):.2f} m"]
-        if not self._alike and BENDS not in self._notes:
-            found.append("rotations are left out, as rest poses differ")
+        sentences = [f"{world}, a person of {np.median(self._extents):.2f} m"]
+        if not self._same_rest and BENDS not in self._notes:
+            sentences.append("rotations are left out, because rest poses differ")
         for note, paths in self._notes.items():
             several = f" in {len(paths)} of {len(self._extents)} files, the first {paths[0].name}"
-            found.append(note + several * (len(self._extents) > 1))
-        return "; ".join(found)
+            sentences.append(note + several * (len(self._extents) > 1))
+        return "; ".join(sentences)
 
 
 def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSet:
@@ -447,10 +456,10 @@ def select_joints(
     skeleton, collected, clips = motion.skeleton, Collected(motion.name), []
     offsets = skeleton.offsets.numpy() if skeleton.rest else None
     for clip in motion:
-        turns = clip.rotations if skeleton.rest else None
-        whole = Recording(skeleton.names, skeleton.parents, clip.positions, turns, offsets, up=skeleton.up)
-        made, own = clip_of(whole, clip, skeleton.fps, skeleton, joints, onto)
-        if reason := collected.add(Path("/".join(clip.key)), made, own):
+        rotations = clip.rotations if skeleton.rest else None
+        recording = Recording(skeleton.names, skeleton.parents, clip.positions, rotations, offsets, up=skeleton.up)
+        selected, clip_skeleton = clip_of(recording, clip, skeleton.fps, skeleton, joints, onto)
+        if reason := collected.add(Path("/".join(clip.key)), selected, clip_skeleton):
             raise ValueError(f"{motion.name}: {reason}")
-        clips.append(made)
+        clips.append(selected)
     return collected.motion(clips, skipped=motion.skipped, interpretation=motion.interpretation, missing=motion.missing)

@@ -99,13 +99,13 @@ def numbers(text: str, where: str) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # raised if the text contains anything else
         try:
-            found = np.fromstring(text, sep=" ")
+            values = np.fromstring(text, sep=" ")
         except (DeprecationWarning, ValueError):
-            found = np.array([np.nan])
-    if not np.isfinite(found).all():
-        wrong = next((word for word in text.split() if not _is_finite(word)), "")
-        raise ValueError(f"{where}: {wrong[:40]!r} is not a number")
-    return found
+            values = np.array([np.nan])
+    if not np.isfinite(values).all():
+        invalid = next((word for word in text.split() if not _is_finite(word)), "")
+        raise ValueError(f"{where}: {invalid[:40]!r} is not a number")
+    return values
 
 
 def _is_finite(word: str) -> bool:

@@ -78,33 +78,33 @@ def read_amass(path: str | Path) -> Recording:
                 "other npz files of clips are read one by one, not as a folder; "
                 f"`dvae data convert {path.parent}/*.npz --out ALL.npz` joins those that it wrote"
             )
-        wanted = ("poses", "trans", "offsets", "betas", *_FPS)
-        found = {name: members[name].array() for name in wanted if name in members}
-    poses, places = found["poses"], found["trans"]
+        names = ("poses", "trans", "offsets", "betas", *_FPS)
+        arrays = {name: members[name].array() for name in names if name in members}
+    poses, places = arrays["poses"], arrays["trans"]
     frames, numbers = len(places) if places.ndim else 0, 3 * len(JOINTS)
     if not (poses.ndim == 2 and len(poses) == frames > 0 and poses.shape[1] >= numbers and places.shape == (frames, 3)):
         raise ValueError(
             f"{path}: poses {poses.shape}, trans {places.shape}, expected (frames, {numbers} or more) and (frames, 3)"
         )
     check_size(path, frames, len(JOINTS))
-    if "offsets" in found and found["offsets"].shape != (len(JOINTS), 3):
-        raise ValueError(f"{path}: offsets {found['offsets'].shape}, expected {(len(JOINTS), 3)}")
-    for name, values in found.items():
+    if "offsets" in arrays and arrays["offsets"].shape != (len(JOINTS), 3):
+        raise ValueError(f"{path}: offsets {arrays['offsets'].shape}, expected {(len(JOINTS), 3)}")
+    for name, values in arrays.items():
         if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
             raise ValueError(f"{path}: {name} holds {values.dtype}, expected numbers, none NaN or infinite")
         if (np.abs(values.astype(np.float64)) > 1e6).any():
             raise ValueError(f"{path}: {name} holds {np.abs(values).max():g}, which is not a metre, radian or rate")
-    rate = next((found[name] for name in _FPS if name in found), np.zeros(0))
+    rate = next((arrays[name] for name in _FPS if name in arrays), np.zeros(0))
     fps = float(rate.reshape(-1)[0]) if rate.size == 1 else 0.0
     if not fps > 0:
         raise ValueError(f"{path}: it needs mocap_framerate, frames per second")
-    offsets = found.get("offsets", OFFSETS).astype(np.float64)
+    offsets = arrays.get("offsets", OFFSETS).astype(np.float64)
     vectors = torch.from_numpy(poses[:, :numbers].astype(np.float64)).unflatten(-1, (-1, 3))
     rest = torch.from_numpy(offsets).repeat(frames, 1, 1)
     rest[:, 0] = torch.from_numpy(places.astype(np.float64))
-    read = Recording.turned(JOINTS, PARENTS, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
-    betas = found.get("betas", np.zeros(0)).reshape(-1)[:MOST_BETAS]
-    return replace(read, labels={"betas": " ".join(map(str, betas.tolist()))} if betas.size else {})
+    recording = Recording.turned(JOINTS, PARENTS, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
+    betas = arrays.get("betas", np.zeros(0)).reshape(-1)[:MOST_BETAS]
+    return replace(recording, labels={"betas": " ".join(map(str, betas.tolist()))} if betas.size else {})
 
 
 def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
@@ -122,17 +122,17 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     Raises:
         ValueError: no joint is the pelvis.
     """
-    there = parts(skeleton.names)
-    meant = {name: there[part] for part, name in _named().items() if part in there}
-    if "Pelvis" not in meant:
+    joint_of_part = parts(skeleton.names)
+    joint_of_name = {name: joint_of_part[part] for part, name in _part_names().items() if part in joint_of_part}
+    if "Pelvis" not in joint_of_name:
         raise ValueError(f"{path}: no joint is the pelvis; there are {', '.join(skeleton.names)[:600]}")
-    names = [name for name in JOINTS if name in meant]
-    above = [_above(name, names) for name in names]
-    parents = [names.index(parent) if parent else -1 for parent in above]
-    kept = Kept(tuple(meant[name] for name in names), tuple(names), tuple(parents))
-    positions, rotations, offsets = kept.motion(skeleton.parents, clip.positions.astype(np.float64), clip.rotations)
+    names = [name for name in JOINTS if name in joint_of_name]
+    parents_of_names = [_above(name, names) for name in names]
+    parents = [names.index(parent) if parent else -1 for parent in parents_of_names]
+    subset = Kept(tuple(joint_of_name[name] for name in names), tuple(names), tuple(parents))
+    positions, rotations, offsets = subset.motion(skeleton.parents, clip.positions.astype(np.float64), clip.rotations)
     if rotations is None or offsets is None:  # a bone between these joints is not rigid, usually in the back
-        tree = Skeleton(kept.names, kept.parents, *sides(names), skeleton.up, skeleton.fps)
+        tree = Skeleton(subset.names, subset.parents, *sides(names), skeleton.up, skeleton.fps)
         single = MotionSet([Clip("", "", positions)], tree).with_rotations()
         rotations, offsets = np.asarray(single.clips[0].rotations, np.float64), single.skeleton.offsets.numpy()
     offsets[0] = 0
@@ -141,19 +141,19 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     raised = inverse(tree, torch.from_numpy(stood)[None], torch.from_numpy(offsets))
     raised = against_world(parents, raised)  # of each joint, from the rest pose to arms at the sides
     world = against_world(parents, to_matrix(torch.from_numpy(rotations), "quaternion"))
-    places = torch.from_numpy(clip.positions[:, meant["Pelvis"]].astype(np.float64))
+    places = torch.from_numpy(clip.positions[:, joint_of_name["Pelvis"]].astype(np.float64))
     if skeleton.up == "y":
         up = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
         world, places = up @ world, places @ up.T
     world = world @ raised.mT
     bones = (raised[:, [max(parent, 0) for parent in parents]] @ torch.from_numpy(offsets)[..., None])[0, ..., 0]
-    turns = torch.eye(3, dtype=torch.float64).repeat(len(world), len(JOINTS), 1, 1)
+    smpl_rotations = torch.eye(3, dtype=torch.float64).repeat(len(world), len(JOINTS), 1, 1)
     all_offsets = np.zeros_like(OFFSETS)
-    for place, (name, parent) in enumerate(zip(names, parents, strict=True)):
-        turns[:, JOINTS.index(name)] = world[:, place] if parent < 0 else world[:, parent].mT @ world[:, place]
-        all_offsets[JOINTS.index(name)] = bones[place]
+    for index, (name, parent) in enumerate(zip(names, parents, strict=True)):
+        smpl_rotations[:, JOINTS.index(name)] = world[:, index] if parent < 0 else world[:, parent].mT @ world[:, index]
+        all_offsets[JOINTS.index(name)] = bones[index]
     poses = np.zeros((len(world), 156))
-    poses[:, : 3 * len(JOINTS)] = from_matrix(turns, "vector").flatten(1).numpy()
+    poses[:, : 3 * len(JOINTS)] = from_matrix(smpl_rotations, "vector").flatten(1).numpy()
     betas = np.array([float(value) for value in clip.labels.get("betas", "").split()] or [0.0] * 16)
     arrays = {"poses": poses, "trans": places.numpy(), "betas": betas, "offsets": all_offsets}
     arrays |= {"mocap_framerate": np.array(skeleton.fps), "gender": np.array("neutral")}
@@ -161,7 +161,7 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
         write_arrays(file, arrays.items())
 
 
-def _named() -> dict[str, str]:
+def _part_names() -> dict[str, str]:
     return {part: JOINTS[joint] for part, joint in parts(JOINTS).items()}
 
 

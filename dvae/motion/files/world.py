@@ -59,19 +59,19 @@ def orientation_warning(names: Sequence[str], positions: np.ndarray, up: str) ->
     axis = int(np.abs(along).argmax())
     if np.abs(along[axis]) < STANDING or ("xyz"[axis] == up and along[axis] > 0):
         return ""
-    return f"heads are above feet along {'' if along[axis] > 0 else '-'}{'xyz'[axis]}, not {up}, which was taken for up"
+    return f"heads are above feet along {'' if along[axis] > 0 else '-'}{'xyz'[axis]}, but {up} is assumed to be up"
 
 
 def _from_feet_to_head(names: Sequence[str], positions: np.ndarray) -> np.ndarray | None:
     """Return vectors (frames, 3) from feet to head in up to about 2000 frames; None if no names match."""
-    ends = [[place for place, name in enumerate(names) if kind.search(name)] for kind in (_TOP, _BOTTOM)]
+    ends = [[index for index, name in enumerate(names) if kind.search(name)] for kind in (_TOP, _BOTTOM)]
     if not all(ends):
         return None
     positions = positions[:: max(len(positions) // 1000, 1)]
-    head, foot = (np.ma.masked_invalid(positions[:, places]).mean(1) for places in ends)
+    head, foot = (np.ma.masked_invalid(positions[:, indices]).mean(1) for indices in ends)
     bodies = head - foot
-    found: np.ndarray = bodies.data[~np.ma.getmaskarray(bodies).any(1)].astype(np.float64)
-    return found
+    vectors: np.ndarray = bodies.data[~np.ma.getmaskarray(bodies).any(1)].astype(np.float64)
+    return vectors
 
 
 def height_of(recording: Recording) -> float:
@@ -85,9 +85,12 @@ def height_of(recording: Recording) -> float:
     for joint, parent in enumerate(parents):
         chains.append({joint} | (chains[parent] if parent >= 0 else set()))
     bones = np.median(np.linalg.norm(places - places[:, [max(parent, 0) for parent in parents]], axis=2), axis=0)
-    ends = [[chains[joint] for joint, name in enumerate(recording.names) if of.search(name)] for of in (_TOP, _BOTTOM)]
-    ways = [sum(bones[joint] for joint in head ^ foot) for head in ends[0] for foot in ends[1]]
-    return float(np.median(ways or extents(places).max(1)))
+    ends = [
+        [chains[joint] for joint, name in enumerate(recording.names) if pattern.search(name)]
+        for pattern in (_TOP, _BOTTOM)
+    ]
+    lengths = [sum(bones[joint] for joint in head ^ foot) for head in ends[0] for foot in ends[1]]
+    return float(np.median(lengths or extents(places).max(1)))
 
 
 def unit(recording: Recording) -> tuple[str, float]:
@@ -131,8 +134,8 @@ class World:
         return self.axis if self.upwards and self.axis != "x" else "y"
 
     def __str__(self) -> str:
-        turned = "" if self.up == self.axis and self.upwards else f", turned from {'' if self.upwards else '-'}"
-        return f"unit {self.unit} ({self.metres:.4g} m), {self.up} up{turned}{self.axis if turned else ''}"
+        rotation = "" if self.up == self.axis and self.upwards else f", rotated from {'' if self.upwards else '-'}"
+        return f"unit {self.unit} ({self.metres:.4g} m), {self.up} up{rotation}{self.axis if rotation else ''}"
 
 
 def infer_world(recordings: Mapping[str, Recording], metres: float | None = None, up: str | None = None) -> World:
@@ -150,20 +153,22 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
         raise ValueError(f"the up axis is {up!r}, expected 'y' or 'z'")
     if metres is not None and not 1e-6 < metres < 1e6:
         raise ValueError(f"the unit is {metres} m, expected a length such as 0.01 for centimetres")
-    found: dict[tuple[str, float], str] = {} if metres is None else {("as given", metres): ""}
+    units: dict[tuple[str, float], str] = {} if metres is None else {("as given", metres): ""}
     unknown = []
     for name, recording in recordings.items() if metres is None else ():
         try:
-            found.setdefault(unit(recording), name)
+            units.setdefault(unit(recording), name)
         except ValueError as error:
             unknown.append(f"{name}: {error}")
-    if not found:
+    if not units:
         raise ValueError(unknown[0])
-    if len({known for _, known in found}) > 1:
-        ((first, _), here), ((other, _), there), *_ = found.items()
-        raise ValueError(f"{here} seems to be in {first}, {there} in {other}; give the metres of the unit of all")
+    if len({length for _, length in units}) > 1:
+        ((first, _), first_name), ((other, _), other_name), *_ = units.items()
+        raise ValueError(
+            f"{first_name} seems to be in {first}, {other_name} in {other}; give the metres of the unit of all"
+        )
     axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
-    return World(*next(iter(found)), axis, upwards)
+    return World(*next(iter(units)), axis, upwards)
 
 
 def to_world(recording: Recording, world: World) -> Recording:

@@ -79,10 +79,10 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
         )
     with _staged(path) as stage:
         for clip in motion:
-            write_clip(_place(stage, clip, format), replace(motion, clips=[clip]), format)
+            write_clip(_path_of(stage, clip, format), replace(motion, clips=[clip]), format)
         if not path.suffix:
             write_labels(stage / LABELS, motion, path / LABELS)
-    return [_place(path, clip, format) for clip in motion]
+    return [_path_of(path, clip, format) for clip in motion]
 
 
 @contextmanager
@@ -96,9 +96,9 @@ def _staged(out: Path) -> Iterator[Path]:
             with files.with_path(folder, stage):
                 yield stage / out.name if out.suffix else stage
                 for file in [file for file in stage.rglob("*") if file.is_file()]:
-                    place = folder / file.relative_to(stage)
-                    place.parent.mkdir(parents=True, exist_ok=True)
-                    file.replace(place)
+                    target = folder / file.relative_to(stage)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    file.replace(target)
 
 
 def write_clip(path: Path, motion: MotionSet, format: str) -> None:
@@ -113,8 +113,8 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
             f"clip {brief('/'.join(clip.key))} has missing joints, but {format} has no gaps; fill them first "
             "(`dvae impute RUN --filled FILE`), or write npz or csv, where they are NaN"
         )
-    turning = motion.with_rotations()
-    clip, skeleton = turning.clips[0], turning.skeleton
+    rotated = motion.with_rotations()
+    clip, skeleton = rotated.clips[0], rotated.skeleton
     if format == "amass":
         write_amass(path, clip, skeleton)
         return
@@ -124,14 +124,14 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
     assert recording.rotations is not None
     names: list[str] = []
     for name in skeleton.names:
-        plain = re.sub(r"[\s{}]+", "_", name)
-        names.append(plain + "_" * next(n for n in count() if plain + "_" * n not in names))
+        cleaned = re.sub(r"[\s{}]+", "_", name)
+        names.append(cleaned + "_" * next(n for n in count() if cleaned + "_" * n not in names))
     root = recording.positions[:, skeleton.root]
     offsets = skeleton.offsets.numpy()
     write_bvh(path, names, list(skeleton.parents), offsets, recording.rotations, root, skeleton.fps)
 
 
-def _place(path: Path, clip: Clip, format: str) -> Path:
+def _path_of(path: Path, clip: Clip, format: str) -> Path:
     """Return the file of a clip: the path itself, or a file in this folder."""
     if path.suffix:
         return path
@@ -177,33 +177,33 @@ def convert(
     from joblib import Parallel, delayed
 
     format = format_of(out, format)
-    found = [_told(source, len(sources) > 1) for source in sources]
-    files = list(chain.from_iterable(found))
-    if archives := [source for source, inner in zip(sources, found, strict=True) if not inner]:
+    files_of_sources = [_files_of(source, len(sources) > 1) for source in sources]
+    files = list(chain.from_iterable(files_of_sources))
+    if archives := [source for source, inner in zip(sources, files_of_sources, strict=True) if not inner]:
         if files:
             raise ValueError(
                 f"{archives[0]} is an archive of clips and {files[0].path} is a recording; give one kind at a time, "
                 "then join the archives"
             )
-        told: Any = {"metres": metres, "up": up, "fps": recorded, "missing": missing}
-        read = [read_motion(source, skip_bad=skip_bad, onto=onto, **told) for source in sources]
-        motion = read[0] if len(read) == 1 else joined_motion([*zip(sources, read, strict=True)], out.stem)
+        options: Any = {"metres": metres, "up": up, "fps": recorded, "missing": missing}
+        motions = [read_motion(source, skip_bad=skip_bad, onto=onto, **options) for source in sources]
+        motion = motions[0] if len(motions) == 1 else joined_motion([*zip(sources, motions, strict=True)], out.stem)
         motion = motion if fps is None else motion.resampled(fps)
-        written = write_motion(out, motion, format)
-        return f"{len(motion)} clips in {len(written)} files; {len(motion.skipped)} skipped"
+        paths = write_motion(out, motion, format)
+        return f"{len(motion)} clips in {len(paths)} files; {len(motion.skipped)} skipped"
     if out.suffix and format != "npz" and len(files) > 1:
         raise ValueError(f"{out}: {format} stores one clip per file, but there are {len(files)}; give a folder")
     keys = [(file.split, file.name) for file in files]
     if len(set(keys)) < len(keys):
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"two files have the clip name {'/'.join(twice)}; put them into folders of different names")
+        repeated = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"two files have the clip name {'/'.join(repeated)}; put them into folders of different names")
     world = infer_world(sampled(files, skip_bad), metres, up)
     reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, resampled=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
 
     def clips(stage: Path) -> Iterator[Clip]:
         work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
-        results = work(delayed(_converted)(reader, file, stage, format, skip_bad) for file in files)
+        results = work(delayed(_convert_file)(reader, file, stage, format, skip_bad) for file in files)
         with closing(results), progress_bar(True) as bar:
             for file, result in bar.track(zip(files, results, strict=True), len(files), description="clips"):
                 reason = result if isinstance(result, str) else collected.add(file.path, *result)
@@ -212,9 +212,9 @@ def convert(
                 if reason:
                     skipped.append(reason)
                     if not isinstance(result, str) and format != "npz":
-                        place = _place(stage, result[0], format)
-                        place.unlink()
-                        own_companion(place, SKELETON).unlink(missing_ok=True)
+                        path = _path_of(stage, result[0], format)
+                        path.unlink()
+                        own_companion(path, SKELETON).unlink(missing_ok=True)
                 else:
                     yield result[0]
         if len(skipped) == len(files):
@@ -224,14 +224,14 @@ def convert(
         save_clips(out, clips(out), lambda: collected.skeleton)
     else:
         with _staged(out) as stage:
-            known = list(clips(stage))
+            written_clips = list(clips(stage))
             if not out.suffix:
-                write_labels(stage / LABELS, known, out / LABELS)
-    left = f"; {len(skipped)} skipped, the first: {skipped[0]}" if skipped else ""
-    return f"{len(files) - len(skipped)} clips; read as {collected.interpretation(world)}{left}"
+                write_labels(stage / LABELS, written_clips, out / LABELS)
+    note = f"; {len(skipped)} skipped, the first: {skipped[0]}" if skipped else ""
+    return f"{len(files) - len(skipped)} clips; read as {collected.interpretation(world)}{note}"
 
 
-def _told(source: Path, several: bool) -> list[File]:
+def _files_of(source: Path, several: bool) -> list[File]:
     """Return the files of a source; with several sources, the folder name becomes part of the split."""
     files = find_files(source)
     if several and source.is_dir():
@@ -239,7 +239,7 @@ def _told(source: Path, several: bool) -> list[File]:
     return files
 
 
-def _converted(
+def _convert_file(
     reader: FileReader, file: File, out: Path, format: str, skip_bad: bool
 ) -> tuple[Clip, Skeleton, list[str]] | str:
     """Read one file, and write it if each clip has a file; return its content, or the reason why it is unusable."""
@@ -247,7 +247,7 @@ def _converted(
         clip, skeleton, notes = reader(file)
         if format == "npz":
             return clip, skeleton, notes
-        write_clip(_place(out, clip, format), MotionSet([clip], skeleton, copy=False, missing=reader.missing), format)
+        write_clip(_path_of(out, clip, format), MotionSet([clip], skeleton, copy=False, missing=reader.missing), format)
         fullest = int(np.isnan(clip.positions).any(2).sum(1).argmin())
         return clip.between(fullest, fullest + 1), skeleton, notes
     except ValueError as error:

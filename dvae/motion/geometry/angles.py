@@ -208,10 +208,10 @@ def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
     cosines = (units.index_select(0, plan.first) * units.index_select(0, plan.second)).sum(1)
     if len(plan.partial):
         absent = ((vectors[plan.u] * vectors[plan.v]).sum(1) < 0) != plan.negative[:, None]
-        lacking = torch.zeros_like(cosines, dtype=torch.bool).index_copy(0, plan.partial, absent)
-        cosines = cosines.masked_fill(lacking, torch.nan)
-    found: Tensor = cosines.T.reshape(*poses.shape[:-1], len(plan.first))
-    return found
+        is_absent = torch.zeros_like(cosines, dtype=torch.bool).index_copy(0, plan.partial, absent)
+        cosines = cosines.masked_fill(is_absent, torch.nan)
+    result: Tensor = cosines.T.reshape(*poses.shape[:-1], len(plan.first))
+    return result
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -245,9 +245,9 @@ def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0
     low, high = torch.full_like(cos[:1], -1.0)[0], torch.ones_like(cos[0])
     for name in set(names):
         same = [column for column, other in enumerate(names) if other == name]
-        found = cos[:, same][~cos[:, same].isnan()]
-        if len(found):
-            low[same], high[same] = (float(q) for q in np.quantile(found.cpu().numpy(), [quantile, 1 - quantile]))
+        values = cos[:, same][~cos[:, same].isnan()]
+        if len(values):
+            low[same], high[same] = (float(q) for q in np.quantile(values.cpu().numpy(), [quantile, 1 - quantile]))
     return AngleLimits(names, low, high)
 
 
@@ -262,8 +262,8 @@ def angle_names(skeleton: Skeleton) -> tuple[str, ...]:
 
 def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
     if skeleton.name not in ANGLES:
-        known = ", ".join(ANGLES)
-        raise ValueError(f"no joint angles for skeleton {skeleton.name!r}: there are some for {known}; use angles=0")
+        names = ", ".join(ANGLES)
+        raise ValueError(f"no joint angles for skeleton {skeleton.name!r}: there are some for {names}; use angles=0")
     return ANGLES[skeleton.name]
 
 
@@ -287,36 +287,39 @@ class _Plan(NamedTuple):
 @torch.inference_mode(False)  # for the same reason as `differences`
 def _plan(skeleton: Skeleton, device: torch.device) -> _Plan:
     angles = _angles(skeleton)
-    needed: dict[Vector, int] = {}  # vector -> nesting depth of its cross products
+    depths: dict[Vector, int] = {}  # vector -> nesting depth of its cross products
     for angle in angles:
         for vector in (angle.first, angle.second, *(angle.when or ())[:2]):
-            _depth(vector, needed)
-    vectors = sorted(needed, key=needed.__getitem__)
-    place = {vector: i for i, vector in enumerate(vectors)}
-    rounds = [[vector for vector in vectors if needed[vector] == depth] for depth in range(max(needed.values()) + 1)]
+            _depth(vector, depths)
+    vectors = sorted(depths, key=depths.__getitem__)
+    index = {vector: i for i, vector in enumerate(vectors)}
+    rounds = [[vector for vector in vectors if depths[vector] == depth] for depth in range(max(depths.values()) + 1)]
 
     def columns(rows: Sequence[tuple[int, ...]], count: int) -> Any:
         return torch.tensor(rows, dtype=torch.long, device=device).reshape(-1, count).T.contiguous().unbind(0)
 
-    crosses = [columns([(place[v[0]], place[v[2]]) for v in some if not isinstance(v, str)], 2) for some in rounds[1:]]
-    first, second = columns([(place[angle.first], place[angle.second]) for angle in angles], 2)
-    parts = [(i, place[a.when[0]], place[a.when[1]], a.when[2] < 0) for i, a in enumerate(angles) if a.when]
+    crosses = [
+        columns([(index[v[0]], index[v[2]]) for v in vectors_of_round if not isinstance(v, str)], 2)
+        for vectors_of_round in rounds[1:]
+    ]
+    first, second = columns([(index[angle.first], index[angle.second]) for angle in angles], 2)
+    parts = [(i, index[a.when[0]], index[a.when[1]], a.when[2] < 0) for i, a in enumerate(angles) if a.when]
     partial, u, v, negative = columns(parts, 4)
-    made = tuple(_joints(vector, skeleton) for vector in rounds[0])
-    return _Plan(made, crosses, first, second, partial, u, v, negative.bool())
+    pairs = tuple(_joints(vector, skeleton) for vector in rounds[0])
+    return _Plan(pairs, crosses, first, second, partial, u, v, negative.bool())
 
 
-def _depth(vector: Vector, needed: dict[Vector, int]) -> int:
-    if vector not in needed:
+def _depth(vector: Vector, depths: dict[Vector, int]) -> int:
+    if vector not in depths:
         crosses = not isinstance(vector, str) and vector[1] == "x"
-        needed[vector] = 1 + max(_depth(vector[0], needed), _depth(vector[2], needed)) if crosses else 0
-    return needed[vector]
+        depths[vector] = 1 + max(_depth(vector[0], depths), _depth(vector[2], depths)) if crosses else 0
+    return depths[vector]
 
 
 def _joints(vector: Vector, skeleton: Skeleton) -> tuple[int, int]:
     """Return (from, to) of a position or a difference."""
     start, end = (skeleton.names[skeleton.root], vector) if isinstance(vector, str) else (vector[2], vector[0])
-    lacking = [name for name in (start, end) if name not in skeleton.names]
-    if lacking:
-        raise ValueError(f"skeleton {skeleton.name!r} has no joint {lacking[0]!r}, which its angles read")
+    missing = [name for name in (start, end) if name not in skeleton.names]
+    if missing:
+        raise ValueError(f"skeleton {skeleton.name!r} has no joint {missing[0]!r}, which its angles read")
     return skeleton.names.index(start), skeleton.names.index(end)

@@ -156,14 +156,14 @@ class Angles:
         frames = [now, *(now + frame for frame in self.protocol.frames)]
         if self.protocol.inverse:
             return torch.cat([self.found(x[:, frames]) for x in self._batch[WHOLE].split(512)])
-        turns = self._batch.view_inputs[ROTATIONS][:, frames].unflatten(-1, (-1, 4))[..., self.joints, :]
-        return self.of(to_matrix(turns, "quaternion"))
+        rotations = self._batch.view_inputs[ROTATIONS][:, frames].unflatten(-1, (-1, 4))[..., self.joints, :]
+        return self.of(to_matrix(rotations, "quaternion"))
 
     def found(self, x: Tensor) -> Tensor:
         """Return angles (..., 3 J') of positions (..., D), by inverse kinematics."""
         positions = self.windows.positions(x)
-        turns = kinematics.inverse(self.windows.skeleton, positions, self.offsets.to(positions))
-        return self.of(turns[..., self.joints, :, :])
+        rotations = kinematics.inverse(self.windows.skeleton, positions, self.offsets.to(positions))
+        return self.of(rotations[..., self.joints, :, :])
 
     def of(self, turns: Tensor) -> Tensor:
         """Return angles (..., 3 J') of joint rotations (..., J', 3, 3)."""
@@ -189,7 +189,7 @@ class AngleModel(nn.Module):
         self.generative, self.inference = model.generative, model.inference
         view = model.view if isinstance(model, DynamicalVAE) else None
         views = view.views if isinstance(view, Views) else (view,)
-        self.turns = next((each for each in views if isinstance(each, Rotations)), None)
+        self.turns = next((view_of_part for view_of_part in views if isinstance(view_of_part, Rotations)), None)
         if self.turns is None and not angles.protocol.inverse:
             raise ValueError(
                 "a model of positions predicts no rotations; score it with inverse=True, which computes them from "
@@ -203,23 +203,23 @@ class AngleModel(nn.Module):
     def forecast(self, batch: Batch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
         """Return {"x": (S, B, times, A)}, the angles at all times; the horizon equals their number."""
         frames, inverse = self.angles.protocol.frames, self.angles.protocol.inverse
-        places, last, made = [frame - 1 for frame in frames], max(frames), _Made()
-        with serialized, made:  # in one chunk, so that `_Made` sees all draws
+        indices, last, recorder = [frame - 1 for frame in frames], max(frames), _Recorder()
+        with serialized, recorder:  # in one chunk, so that `_Recorder` sees all draws
             at_once = {} if inverse else {"chunk": 2**62}
             futures = self.model.forecast(batch[MOTION], last, samples, **options, **at_once)[WHOLE]
         if inverse:
-            found = self.angles.found(futures[:, :, places])
+            angles = self.angles.found(futures[:, :, indices])
         else:
             assert self.turns is not None
             turning = self.turns.turning
-            wanted = [turning.index(joint) for joint in self.angles.joints]
-            seen = made.value[:, -last:][:, places, 3 * self.turns.root :].unflatten(-1, (len(turning), -1))
-            turns = to_matrix(seen[..., wanted, :].unflatten(0, futures.shape[:2]), self.turns.form)
-            found = self.angles.of(turns)
-        return {WHOLE: found[..., self.angles.varying.to(found.device)]}
+            columns = [turning.index(joint) for joint in self.angles.joints]
+            rotations = recorder.value[:, -last:][:, indices, 3 * self.turns.root :].unflatten(-1, (len(turning), -1))
+            matrices = to_matrix(rotations[..., columns, :].unflatten(0, futures.shape[:2]), self.turns.form)
+            angles = self.angles.of(matrices)
+        return {WHOLE: angles[..., self.angles.varying.to(angles.device)]}
 
 
-class _Made(Messenger):
+class _Recorder(Messenger):
     """Record x as the model outputs it, (S B, T, D), before its conversion to positions."""
 
     value: Tensor
@@ -290,9 +290,9 @@ def _measures(angles: Angles, counts: Sequence[int]) -> list[Measure]:
             of_means=True,
         )
 
-    source = "found in positions" if angles.protocol.inverse else "of data and models"
+    source = "estimated from positions" if angles.protocol.inverse else "of data and models"
     note = (
         f"Euler angles z y x of {len(angles.joints)} joints without the root, {int(angles.varying.sum())} that vary, "
-        f"turns {source}; the best future is that over all times"
+        f"rotations {source}; the best future has the smallest mean error over all times"
     )
-    return [measure(count, *each) for count in counts for each in enumerate(angles.protocol.times)]
+    return [measure(count, *numbered_time) for count in counts for numbered_time in enumerate(angles.protocol.times)]

@@ -38,18 +38,18 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
         generations.append(below)
     order = [joint for joints in generations for joint in joints]
     first_to_last = indices(order, rotations)
-    many = [len(joints) for joints in generations]
+    counts = [len(joints) for joints in generations]
     # index_select has a cheaper gradient than indexing by a list
-    first, *turns = rotations.index_select(-3, first_to_last).split(many, -3)
-    _, *bones = offsets.index_select(-2, first_to_last)[..., None].split(many, -3)
-    turned, placed = [first], [root[..., None, :]]
-    for (before, joints), local, bone in zip(pairwise(generations), turns, bones, strict=True):
+    first, *local_rotations = rotations.index_select(-3, first_to_last).split(counts, -3)
+    _, *bones = offsets.index_select(-2, first_to_last)[..., None].split(counts, -3)
+    world_rotations, positions = [first], [root[..., None, :]]
+    for (before, joints), local, bone in zip(pairwise(generations), local_rotations, bones, strict=True):
         above = indices([before.index(parents[joint]) for joint in joints], rotations)
-        turn = turned[-1].index_select(-3, above)
-        placed.append(placed[-1].index_select(-2, above) + (turn @ bone).squeeze(-1))
-        turned.append(turn @ local)
+        turn = world_rotations[-1].index_select(-3, above)
+        positions.append(positions[-1].index_select(-2, above) + (turn @ bone).squeeze(-1))
+        world_rotations.append(turn @ local)
     back = indices([order.index(joint) for joint in range(len(order))], rotations)
-    return torch.cat(placed, -2).index_select(-2, back), torch.cat(turned, -3).index_select(-3, back)
+    return torch.cat(positions, -2).index_select(-2, back), torch.cat(world_rotations, -3).index_select(-3, back)
 
 
 def resting(parents: Sequence[int], offsets: Tensor) -> Tensor:
@@ -59,7 +59,7 @@ def resting(parents: Sequence[int], offsets: Tensor) -> Tensor:
 
 
 def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
-    """Return local rotations with which `forward` approximates poses as closely as the bone lengths allow.
+    """Return local rotations for which `forward` approximates poses as closely as the bone lengths allow.
 
     Each joint with several children is rotated by Procrustes analysis of the unit vectors to its children. A joint with
     one child is aligned with it exactly, by the smallest rotation relative to its parent. A joint without children
@@ -84,12 +84,12 @@ def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
         world[joint] = above
         if below:
             rest = torch.nn.functional.normalize(offsets[below], dim=-1)
-            seen = positions[..., below, :] - positions[..., joint, None, :]
-            seen = seen * inverse_lengths(seen)[..., None]
+            directions = positions[..., below, :] - positions[..., joint, None, :]
+            directions = directions * inverse_lengths(directions)[..., None]
             if len(below) == 1:
-                world[joint] = orthogonal(swing(above @ rest[0], seen[..., 0, :]) @ above)
+                world[joint] = orthogonal(swing(above @ rest[0], directions[..., 0, :]) @ above)
             else:
-                world[joint] = procrustes(seen.transpose(-1, -2) @ rest + TIE * above)
+                world[joint] = procrustes(directions.transpose(-1, -2) @ rest + TIE * above)
         local[joint] = above.transpose(-1, -2) @ world[joint]
     return torch.stack([local[joint] for joint in range(skeleton.joints)], -3)
 
@@ -140,15 +140,15 @@ def rest(skeleton: Skeleton, positions: Tensor, rounds: int = 10) -> Tensor:
     facing = positions
     if skeleton.left and skeleton.right:
         facing = rotate_about_up(positions, -skeleton.heading(positions)[..., None], skeleton.up)
-    found = torch.zeros_like(positions[0])
-    found[joints] = (facing[:, joints] - facing[:, parents]).mean(0)
+    offsets = torch.zeros_like(positions[0])
+    offsets[joints] = (facing[:, joints] - facing[:, parents]).mean(0)
     for joint in range(skeleton.joints):
         below = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
         if len(below) > 1:
-            seen = positions[:, below] - positions[:, joint, None]
+            bones = positions[:, below] - positions[:, joint, None]
             for _ in range(rounds):
-                turn = procrustes(seen.transpose(-1, -2) @ found[below])
-                found[below] = (seen @ turn).mean(0)
+                rotations = procrustes(bones.transpose(-1, -2) @ offsets[below])
+                offsets[below] = (bones @ rotations).mean(0)
     lengths = positions.new_zeros(skeleton.joints)
     lengths[joints] = skeleton.bone_lengths(positions).mean(0)
-    return torch.nn.functional.normalize(found, dim=-1) * lengths[:, None]
+    return torch.nn.functional.normalize(offsets, dim=-1) * lengths[:, None]

@@ -49,18 +49,18 @@ def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[in
     Raises:
         ValueError: a part is unknown, or a joint is in no part or in several.
     """
-    found: dict[str, tuple[int, ...]] = {}
+    joints_of: dict[str, tuple[int, ...]] = {}
     for text in parts:
         name, _, members = text.partition("=")
-        if not name.isidentifier() or name in found:
+        if not name.isidentifier() or name in joints_of:
             raise ValueError(f"parts must have different names, such as lower and upper; got {', '.join(parts)}")
-        found[name] = places_of(skeleton, (members or name).split("+"))
+        joints_of[name] = places_of(skeleton, (members or name).split("+"))
     joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
-    everything = sorted(place for places in found.values() for place in places)
+    everything = sorted(index for indices in joints_of.values() for index in indices)
     if everything != list(range(len(joints))):
-        wrong = [name for place, name in enumerate(joints) if everything.count(place) != 1]
-        raise ValueError(f"every joint but the root must be in one part; {', '.join(wrong)} are in none or in several")
-    return found
+        invalid = [name for index, name in enumerate(joints) if everything.count(index) != 1]
+        raise ValueError(f"every joint but the root must be in one part; {', '.join(invalid)} are in none or several")
+    return joints_of
 
 
 def places_of(skeleton: Skeleton, members: Iterable[str]) -> tuple[int, ...]:
@@ -80,9 +80,9 @@ def places_of(skeleton: Skeleton, members: Iterable[str]) -> tuple[int, ...]:
     joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
     names: list[str] = []
     for member in members:
-        for one in UNIONS.get(member, (member,)):
-            if one not in limbs and one not in joints:
-                known = ", ".join([*(UNIONS if limbs else ()), *limbs, *joints])
-                raise ValueError(f"skeleton {skeleton.name!r} has no part or joint {one!r}; it has {known}")
-            names += limbs.get(one, (one,))
-    return tuple(sorted(joints.index(one) for one in names))
+        for part in UNIONS.get(member, (member,)):
+            if part not in limbs and part not in joints:
+                choices = ", ".join([*(UNIONS if limbs else ()), *limbs, *joints])
+                raise ValueError(f"skeleton {skeleton.name!r} has no part or joint {part!r}; it has {choices}")
+            names += limbs.get(part, (part,))
+    return tuple(sorted(joints.index(part) for part in names))

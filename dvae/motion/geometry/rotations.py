@@ -76,10 +76,10 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
             first = torch.where(short, constant((1.0, 0.0, 0.0), values), first)
         with torch.no_grad():
             axis = torch.nn.functional.normalize(first, dim=-1)
-            apart = (second - (axis * second).sum(-1, keepdim=True) * axis).norm(dim=-1, keepdim=True)
-            along = apart <= (shortest**0.5 * second.norm(dim=-1, keepdim=True)).clamp(shortest)
-        if along.any():
-            second = torch.where(along, perpendicular(torch.nn.functional.normalize(first, dim=-1)), second)
+            distance = (second - (axis * second).sum(-1, keepdim=True) * axis).norm(dim=-1, keepdim=True)
+            is_parallel = distance <= (shortest**0.5 * second.norm(dim=-1, keepdim=True)).clamp(shortest)
+        if is_parallel.any():
+            second = torch.where(is_parallel, perpendicular(torch.nn.functional.normalize(first, dim=-1)), second)
         return roma.special_gramschmidt(torch.stack([first, second], -1))
     return roma.euler_to_rotmat(form.removeprefix("euler-").upper(), values)
 
@@ -148,29 +148,29 @@ def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
         values = from_matrix(rotations if given == "matrix" else to_matrix(rotations, given), form)
     if form == "quaternion":
         return continuous(torch.where(values[..., :1, :, :1] < 0, -values, values))
-    return _unwrapped(values) if form == "vector" else values
+    return _unwrap(values) if form == "vector" else values
 
 
-def _unwrapped(vectors: Tensor) -> Tensor:
+def _unwrap(vectors: Tensor) -> Tensor:
     """Add whole turns about the axis to vectors (..., T, J, 3), so that each is nearest to its predecessor.
 
     The loop is sequential, because the choice for a vector depends on the choice for its predecessor.
     """
     first, *others = vectors.unbind(-3)
-    found = [first]
+    unwrapped = [first]
     for vector in others:
         angle = vector.norm(dim=-1, keepdim=True)
-        unturned = angle < 100 * torch.finfo(angle.dtype).eps  # any axis would do: the vector is only rounding error
-        axis = torch.nn.functional.normalize(torch.where(unturned, found[-1], vector), dim=-1)
-        turns = ((found[-1] * axis).sum(-1, keepdim=True) - angle) / (2 * torch.pi)
-        found.append(vector + 2 * torch.pi * turns.round() * axis)
-    return torch.stack(found, -3)
+        is_zero = angle < 100 * torch.finfo(angle.dtype).eps  # any axis would do: the vector is only rounding error
+        axis = torch.nn.functional.normalize(torch.where(is_zero, unwrapped[-1], vector), dim=-1)
+        n_turns = ((unwrapped[-1] * axis).sum(-1, keepdim=True) - angle) / (2 * torch.pi)
+        unwrapped.append(vector + 2 * torch.pi * n_turns.round() * axis)
+    return torch.stack(unwrapped, -3)
 
 
 def perpendicular(vectors: Tensor) -> Tensor:
     """Return unit vectors perpendicular to unit vectors (..., 3), near the axis of their smallest component."""
-    least = torch.nn.functional.one_hot(vectors.abs().argmin(-1), 3).to(vectors)
-    return torch.nn.functional.normalize(least - (least * vectors).sum(-1, keepdim=True) * vectors, dim=-1)
+    axis = torch.nn.functional.one_hot(vectors.abs().argmin(-1), 3).to(vectors)
+    return torch.nn.functional.normalize(axis - (axis * vectors).sum(-1, keepdim=True) * vectors, dim=-1)
 
 
 def procrustes(products: Tensor) -> Tensor:
@@ -180,5 +180,5 @@ def procrustes(products: Tensor) -> Tensor:
     """
     roma = optional("roma", "motion")
 
-    found: Tensor = roma.special_procrustes(products)
-    return found
+    rotations: Tensor = roma.special_procrustes(products)
+    return rotations

@@ -64,7 +64,7 @@ def is_name(text: str) -> bool:
     return len(text) <= 1000 and not any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text)
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     return ", ".join([*(name if len(name) < 100 else brief(name) for name in names[:8]), *["..."][: len(names) > 8]])
 
 
@@ -72,16 +72,16 @@ def _is(value: Any, kind: type) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool)
 
 
-def _values(given: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]:
+def _values(items: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]:
     """Return the values of a list as a tuple, after a check of their type."""
-    if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable):
-        raise ValueError(f"{what} is {brief(given)}, expected a list of {expected}")
-    values = tuple(given)
-    for place, value in enumerate(values):
+    if isinstance(items, str | bytes | Mapping) or not isinstance(items, Iterable):
+        raise ValueError(f"{what} is {brief(items)}, expected a list of {expected}")
+    values = tuple(items)
+    for index, value in enumerate(values):
         if not _is(value, kind):
-            raise ValueError(f"{what} has {brief(value)} at place {place}, expected {expected}")
+            raise ValueError(f"{what} has {brief(value)} at place {index}, expected {expected}")
         if isinstance(value, str) and not is_name(value):
-            raise ValueError(f"{what} has {brief(value)} at place {place}, expected text that can be printed")
+            raise ValueError(f"{what} has {brief(value)} at place {index}, expected text that can be printed")
     return tuple(map(int, values)) if kind is Integral else values
 
 
@@ -127,9 +127,9 @@ class Skeleton:
     rest: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        what = f"skeleton {brief(self.name)}"
+        label = f"skeleton {brief(self.name)}"
         if not isinstance(self.name, str) or not is_name(self.name):
-            raise ValueError(f"{what}: its name is not text that can be printed")
+            raise ValueError(f"{label}: its name is not text that can be printed")
         for field, kind, expected in (
             ("names", str, "text"),
             ("parents", Integral, "whole numbers"),
@@ -138,45 +138,45 @@ class Skeleton:
             ("lengths", Real, "numbers"),
             ("rest", Real, "numbers"),
         ):
-            object.__setattr__(self, field, _values(getattr(self, field), kind, f"{what}: {field}", expected))
+            object.__setattr__(self, field, _values(getattr(self, field), kind, f"{label}: {field}", expected))
         joints = len(self.names)
         if joints > MOST_JOINTS:
-            raise ValueError(f"{what}: {joints:,} joints, expected at most {MOST_JOINTS:,}")
+            raise ValueError(f"{label}: {joints:,} joints, expected at most {MOST_JOINTS:,}")
         if len(self.parents) != joints:
-            raise ValueError(f"{what}: {joints} names but {len(self.parents)} parents")
+            raise ValueError(f"{label}: {joints} names but {len(self.parents)} parents")
         if repeated := sorted(name for name, count in Counter(self.names).items() if count > 1):
-            raise ValueError(f"{what}: joint names repeat: {_listed(repeated)}")
+            raise ValueError(f"{label}: joint names repeat: {_join_names(repeated)}")
         roots = [self.names[j] for j, parent in enumerate(self.parents) if parent == -1]
         if len(roots) != 1:
-            raise ValueError(f"{what}: expected one root (parent -1), found {_listed(roots) or 'none'}")
+            raise ValueError(f"{label}: expected one root (parent -1), found {_join_names(roots) or 'none'}")
         for joint, parent in enumerate(self.parents):
             if not -1 <= parent < joints:
                 raise ValueError(
-                    f"{what}: the parent of {self.names[joint]} is joint {brief(parent)}, "
+                    f"{label}: the parent of {self.names[joint]} is joint {brief(parent)}, "
                     f"but joints go from 0 to {joints - 1}"
                 )
-        if circling := set(range(joints)) - set(self.order):
-            raise ValueError(f"{what}: {self.names[min(circling)]} is in a cycle of joints")
+        if cyclic := set(range(joints)) - set(self.order):
+            raise ValueError(f"{label}: {self.names[min(cyclic)]} is in a cycle of joints")
         for side in ("left", "right"):
-            strangers = [j for j in getattr(self, side) if not 0 <= j < joints]
-            if strangers:
-                raise ValueError(f"{what}: {side} names joints {brief(strangers)} of {joints}")
-        if twice := [j for j, count in Counter(self.left + self.right).items() if count > 1]:
-            raise ValueError(f"{what}: left and right name {self.names[twice[0]]} twice")
+            unknown = [j for j in getattr(self, side) if not 0 <= j < joints]
+            if unknown:
+                raise ValueError(f"{label}: {side} names joints {brief(unknown)} of {joints}")
+        if repeated_joints := [j for j, count in Counter(self.left + self.right).items() if count > 1]:
+            raise ValueError(f"{label}: left and right name {self.names[repeated_joints[0]]} twice")
         if not isinstance(self.up, str) or self.up not in ("y", "z"):
-            raise ValueError(f"{what}: up axis is {brief(self.up)}, expected 'y' or 'z'")
+            raise ValueError(f"{label}: up axis is {brief(self.up)}, expected 'y' or 'z'")
         if not _is(self.fps, Real) or not 0 < self.fps < 1e6:
-            raise ValueError(f"{what}: {brief(self.fps)} frames per second, expected more than 0")
+            raise ValueError(f"{label}: {brief(self.fps)} frames per second, expected more than 0")
         if self.lengths and len(self.lengths) != joints - 1:
-            raise ValueError(f"{what}: {len(self.lengths)} bone lengths for {joints - 1} bones")
-        if wrong := [length for length in self.lengths if not 0 <= length < 1e6]:
-            raise ValueError(f"{what}: a bone is {brief(wrong[0])} m long")
+            raise ValueError(f"{label}: {len(self.lengths)} bone lengths for {joints - 1} bones")
+        if invalid := [length for length in self.lengths if not 0 <= length < 1e6]:
+            raise ValueError(f"{label}: a bone is {brief(invalid[0])} m long")
         if self.rest and len(self.rest) != 3 * joints:
             raise ValueError(
-                f"{what}: the rest pose has {len(self.rest)} numbers, expected 3 for each of {joints} joints"
+                f"{label}: the rest pose has {len(self.rest)} numbers, expected 3 for each of {joints} joints"
             )
-        if wrong := [place for place in self.rest if not abs(place) < 1e6]:
-            raise ValueError(f"{what}: in the rest pose a joint is {brief(wrong[0])} m from its parent")
+        if invalid := [offset for offset in self.rest if not abs(offset) < 1e6]:
+            raise ValueError(f"{label}: in the rest pose a joint is {brief(invalid[0])} m from its parent")
 
     @property
     def joints(self) -> int:
@@ -197,9 +197,9 @@ class Skeleton:
         joint = str(joint)
         if joint in self.names:
             return self.names.index(joint)
-        alike = [place for place, name in enumerate(self.names) if {*readings(name)} & {*readings(joint)}]
-        if len(alike) == 1:
-            return alike[0]
+        matches = [index for index, name in enumerate(self.names) if {*readings(name)} & {*readings(joint)}]
+        if len(matches) == 1:
+            return matches[0]
         names = ["".join(readings(name)[0]) for name in self.names]
         close = difflib.get_close_matches("".join(readings(joint)[0]), names, n=1)
         hint = f" (did you mean {self.names[names.index(close[0])]!r}?)" if close else ""
@@ -352,16 +352,16 @@ class Skeleton:
         time = torch.arange(positions.shape[-3], device=positions.device)
         level = positions[..., self.vertical - 1].isfinite()
         left, right = (level.index_select(-1, indices(side, level)).sum(-1) for side in self.sides)
-        chosen = torch.where((left > 0) & (right > 0), time + len(time) * (left + right), -1).argmax(-1)
-        pose = positions.take_along_dim(chosen[..., None, None, None], -3).squeeze(-3)
+        best_frame = torch.where((left > 0) & (right > 0), time + len(time) * (left + right), -1).argmax(-1)
+        pose = positions.take_along_dim(best_frame[..., None, None, None], -3).squeeze(-3)
         return self.heading(pose).nan_to_num(0.0)
 
     @staticmethod
     def _side(places: Tensor) -> Tensor:
         """Sum positions (..., n, 2) to (..., 2); NaN positions count as the mean of the others."""
-        there = places.isfinite().all(-1, keepdim=True)
-        found: Tensor = torch.where(there, places, 0.0).sum(-2) * (there.shape[-2] / there.sum(-2))
-        return found
+        is_known = places.isfinite().all(-1, keepdim=True)
+        total: Tensor = torch.where(is_known, places, 0.0).sum(-2) * (is_known.shape[-2] / is_known.sum(-2))
+        return total
 
     @classmethod
     def from_json(cls, path: str | Path) -> Skeleton:
@@ -383,9 +383,9 @@ class Skeleton:
             raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
         missing = [key for key in ("joint_names", "parents") if not isinstance(fields, dict) or key not in fields]
         if missing:
-            found = _listed(list(fields)) if isinstance(fields, dict) else brief(fields)
+            contents = _join_names(list(fields)) if isinstance(fields, dict) else brief(fields)
             raise ValueError(
-                f"{path}: expected JSON with joint_names and parents; {missing[0]} is missing, found {found}"
+                f"{path}: expected JSON with joint_names and parents; {missing[0]} is missing, found {contents}"
             )
         try:
             parents = _values(fields["parents"], Integral, "parents", "whole numbers")
@@ -394,12 +394,12 @@ class Skeleton:
                 raise ValueError(
                     f"bone_lengths_m has {len(lengths)} entries, expected one for each of {len(parents)} joints"
                 )
-            given = {field: fields[key] for field, key in FIELDS.items() if key in fields}
+            known_fields = {field: fields[key] for field, key in FIELDS.items() if key in fields}
             # the file has one entry per joint, zero for the root
             bones = tuple(length for length, parent in zip(lengths, parents, strict=bool(lengths)) if parent != -1)
             rest = fields.get("rest_m", ())
-            named = {"name": path.absolute().parent.name, **given}
-            return cls(**{**named, "parents": parents, "lengths": bones, "rest": rest})
+            arguments = {"name": path.absolute().parent.name, **known_fields}
+            return cls(**{**arguments, "parents": parents, "lengths": bones, "rest": rest})
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

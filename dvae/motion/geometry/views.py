@@ -55,30 +55,30 @@ class Heading(View):
     @override
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
         source = self.pose or WHOLE
-        found = None if view_inputs is None else view_inputs.get(HEADING)
-        if HEADING in data or (source not in data if view_inputs is None else found is None):
+        heading = None if view_inputs is None else view_inputs.get(HEADING)
+        if HEADING in data or (source not in data if view_inputs is None else heading is None):
             return data
-        seen = Batch(data)
+        values = Batch(data)
         for name, mask in data.masks().items():
             if name in self.turned and name in data:
                 self._check_mask(name, mask)
-                seen[name] = torch.where(mask, data[name], 0.0)
-        if found is None:
+                values[name] = torch.where(mask, data[name], 0.0)
+        if heading is None:
             if self.pose is None and data.lengths is not None:
-                shortest, needed = data.lengths.min(), min(self.frames, data[WHOLE].shape[-2])
-                if shortest < needed:
+                shortest, required = data.lengths.min(), min(self.frames, data[WHOLE].shape[-2])
+                if shortest < required:
                     raise ValueError(
-                        f"this model rotates every window by the heading in its frame {needed}, but a sequence has "
+                        f"this model rotates every window by the heading in its frame {required}, but a sequence has "
                         f"{shortest}; remove it, or fit with heading=False"
                     )
-            found = self._observed(seen)
-        return self._turn(seen, -found) | {HEADING: found}
+            heading = self._observed_heading(values)
+        return self._rotate_all(values, -heading) | {HEADING: heading}
 
     @override
     def inverse(self, seen: Batch) -> Batch:
         data = Batch(seen)
         heading = data.pop(HEADING, None)
-        return data if heading is None else self._turn(data, heading)
+        return data if heading is None else self._rotate_all(data, heading)
 
     def of(self, x: Tensor) -> Tensor:
         """Return headings (...) of windows (..., T, D), or of poses (..., D); unobserved joints are NaN."""
@@ -87,20 +87,20 @@ class Heading(View):
 
     def face(self, x: Tensor) -> Tensor:
         """Return windows (..., T, D), each rotated to heading zero."""
-        return self._rotated(x, -self.of(x), 2)
+        return self._rotate(x, -self.of(x), 2)
 
-    def _turn(self, values: Batch, angle: Tensor) -> Batch:
-        found = {n: self._rotated(values[n], angle, 2 - (n == self.pose)) for n in self.turned if n in values}
-        return values | found
+    def _rotate_all(self, values: Batch, angle: Tensor) -> Batch:
+        rotated = {n: self._rotate(values[n], angle, 2 - (n == self.pose)) for n in self.turned if n in values}
+        return values | rotated
 
-    def _rotated(self, x: Tensor, angle: Tensor, dims: int) -> Tensor:
+    def _rotate(self, x: Tensor, angle: Tensor, dims: int) -> Tensor:
         return rotate_about_up(x.unflatten(-1, (-1, 3)), angle[(..., *[None] * dims)], self.skeleton.up).flatten(-2)
 
-    def _observed(self, data: Batch) -> Tensor:
+    def _observed_heading(self, data: Batch) -> Tensor:
         """Return headings (B,) computed from observed values."""
         source = self.pose or WHOLE
-        x, seen = data[source], data.mask(source)
-        return self.of(x if seen is None else torch.where(seen, x, torch.nan))
+        x, mask = data[source], data.mask(source)
+        return self.of(x if mask is None else torch.where(mask, x, torch.nan))
 
     def _joints(self, poses: Tensor) -> Tensor:
         """Return joints (..., J, 3) of poses (..., D), adding a dropped root at the origin."""
@@ -119,9 +119,11 @@ class Heading(View):
         mixed = joints[..., across[0]] != joints[..., across[1]]
         if mixed.any():
             window, *_, joint = mixed.nonzero()[0].tolist()
-            held = [n for j, n in enumerate(skeleton.names) if j != skeleton.root or mixed.shape[-1] == skeleton.joints]
+            names = [
+                n for j, n in enumerate(skeleton.names) if j != skeleton.root or mixed.shape[-1] == skeleton.joints
+            ]
             raise ValueError(
-                f"window {window} is missing one horizontal coordinate of {held[joint]} and has the other, but this "
+                f"window {window} is missing one horizontal coordinate of {names[joint]} and has the other, but this "
                 "model rotates windows, which mixes them; hide both in 'mask', or fit with heading=False"
             )
 
@@ -152,17 +154,17 @@ class Bones(View):
 
     @override
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
-        held = {name: places for name, places in self.pieces.items() if name in data}
-        if LENGTHS in data or (WHOLE not in data and not held):
+        pieces = {name: places for name, places in self.pieces.items() if name in data}
+        if LENGTHS in data or (WHOLE not in data and not pieces):
             return data
         self._check_complete(data)
-        x = data[WHOLE] if WHOLE in data else self._joined(data, held)
+        x = data[WHOLE] if WHOLE in data else self._assemble(data, pieces)
         limbs = self.skeleton.limbs(x)
-        seen = self._rooted(limbs * inverse_lengths(limbs)[..., None], x)
-        found = self._named(data, seen)
+        directions = self._with_root(limbs * inverse_lengths(limbs)[..., None], x)
+        values = self._replace_x(data, directions)
         if view_inputs is not None:
-            return found
-        return found | {LENGTHS: self._mean(limbs[:, : self.frames].norm(dim=-1), data.lengths)}
+            return values
+        return values | {LENGTHS: self._mean_lengths(limbs[:, : self.frames].norm(dim=-1), data.lengths)}
 
     @override
     def inverse(self, seen: Batch) -> Batch:
@@ -170,14 +172,14 @@ class Bones(View):
         lengths = data.pop(LENGTHS, None)
         if lengths is None or WHOLE not in data:
             return data
-        made = data[WHOLE].unflatten(-1, (-1, 3))
-        kept = made.shape[-2] == self.skeleton.joints
-        bones = self.skeleton.without_root(made) if kept else made
+        directions = data[WHOLE].unflatten(-1, (-1, 3))
+        has_root = directions.shape[-2] == self.skeleton.joints
+        bones = self.skeleton.without_root(directions) if has_root else directions
         bones = bones * (inverse_lengths(bones) * lengths[:, None])[..., None]
         joints = self.skeleton.ends(bones).unflatten(-1, (-1, 3))
-        if kept:
-            joints = joints + made[..., self.skeleton.root, None, :]
-        return self._named(data, self._rooted(joints, data[WHOLE]))
+        if has_root:
+            joints = joints + directions[..., self.skeleton.root, None, :]
+        return self._replace_x(data, self._with_root(joints, data[WHOLE]))
 
     @override
     def log_det(self, data: Batch) -> Tensor:
@@ -187,44 +189,46 @@ class Bones(View):
             "distributions.Directions() and train by energies, or let the model see positions"
         )
 
-    def _rooted(self, joints: Tensor, x: Tensor) -> Tensor:
+    def _with_root(self, joints: Tensor, x: Tensor) -> Tensor:
         """Flatten values (..., J - 1, 3) of all joints except the root to (..., D), and insert the root of x if any."""
         if x.shape[-1] == 3 * self.skeleton.joints:
             root = self.skeleton.root
-            own = x.unflatten(-1, (-1, 3))[..., root : root + 1, :]
-            joints = torch.cat([joints[..., :root, :], own, joints[..., root:, :]], -2)
+            root_position = x.unflatten(-1, (-1, 3))[..., root : root + 1, :]
+            joints = torch.cat([joints[..., :root, :], root_position, joints[..., root:, :]], -2)
         return joints.flatten(-2)
 
-    def _named(self, values: Batch, x: Tensor) -> Batch:
+    def _replace_x(self, values: Batch, x: Tensor) -> Batch:
         """Return the values with x and its pieces replaced."""
         pieces = {name: x[..., list(places)] for name, places in self.pieces.items() if name in values}
         return values | pieces | ({WHOLE: x} if WHOLE in values else {})
 
-    def _joined(self, data: Batch, held: Mapping[str, Sequence[int]]) -> Tensor:
+    def _assemble(self, data: Batch, pieces: Mapping[str, Sequence[int]]) -> Tensor:
         """Return x assembled from pieces, 0 elsewhere; the start of each bone must be the root or in a piece."""
-        size = 1 + max(place for places in self.pieces.values() for place in places)
+        size = 1 + max(index for places in self.pieces.values() for index in places)
         joints = [j for j in range(self.skeleton.joints) if j != self.skeleton.root or size == 3 * self.skeleton.joints]
-        there = {joints[place // 3] for places in held.values() for place in places} | {self.skeleton.root}
-        if loose := [joint for joint in there - {self.skeleton.root} if self.skeleton.parents[joint] not in there]:
-            names, parent = self.skeleton.names, self.skeleton.parents[loose[0]]
+        known_joints = {joints[index // 3] for places in pieces.values() for index in places} | {self.skeleton.root}
+        if undetermined := [
+            joint for joint in known_joints - {self.skeleton.root} if self.skeleton.parents[joint] not in known_joints
+        ]:
+            names, parent = self.skeleton.names, self.skeleton.parents[undetermined[0]]
             raise ValueError(
-                f"this model sees the directions of bones, but {', '.join(held)} alone does not determine the "
-                f"direction of {names[loose[0]]}, whose parent is {names[parent]}; give the part with {names[parent]} "
-                "too"
+                f"this model sees the directions of bones, but {', '.join(pieces)} alone does not determine the "
+                f"direction of {names[undetermined[0]]}, whose parent is {names[parent]}; give the part with "
+                f"{names[parent]} too"
             )
-        some: Tensor = data[next(iter(held))]
-        whole = some.new_zeros(*some.shape[:-1], size)
-        for name, places in held.items():
-            whole[..., list(places)] = data[name]
-        return whole
+        first_piece: Tensor = data[next(iter(pieces))]
+        x = first_piece.new_zeros(*first_piece.shape[:-1], size)
+        for name, places in pieces.items():
+            x[..., list(places)] = data[name]
+        return x
 
-    def _mean(self, lengths: Tensor, steps: Tensor | None) -> Tensor:
+    def _mean_lengths(self, lengths: Tensor, steps: Tensor | None) -> Tensor:
         """Average lengths (B, O, J - 1) to (B, J - 1) over the frames that are not padding."""
         if steps is None:
             return lengths.mean(1)
         valid = valid_steps(steps, lengths.shape[1])[..., None]
-        found: Tensor = (lengths * valid).sum(1) / valid.sum(1)
-        return found
+        mean: Tensor = (lengths * valid).sum(1) / valid.sum(1)
+        return mean
 
     def _check_complete(self, data: Batch) -> None:
         for name, mask in data.masks().items():
@@ -241,8 +245,8 @@ class Rotations(View):
     """Joint rotations instead of positions, and bones of constant length.
 
     Outside the model, x is positions (B, T, D) in metres. The model sees the position of the root, if x has it, and
-    then the rotation of every joint with children, in `form` and without jumps (`rotations.in_time`). Rotations are
-    taken from the data, or else estimated by `kinematics.inverse`, including the twist. Bones have their mean length in
+    then the rotation of every joint with children, in `form` and without jumps (`rotations.in_time`). Rotations come
+    from the data, or else from `kinematics.inverse`, which also estimates the twist. Bones have their mean length in
     the data, or their length in the rest pose if data are unavailable.
 
     Densities are densities of these numbers, not of positions, which have other volumes and one more dimension per
@@ -286,9 +290,9 @@ class Rotations(View):
 
     @override
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
-        seen = Batch(data)
+        converted = Batch(data)
         if WHOLE not in data or LENGTHS in data:
-            return seen
+            return converted
         x, skeleton = data[WHOLE], self.skeleton
         if x.shape[-1] != 3 * (skeleton.joints - (not self.root)):
             raise ValueError(
@@ -301,17 +305,19 @@ class Rotations(View):
                 "representation is positions, which may be masked"
             )
         positions = skeleton.with_root(x.unflatten(-1, (-1, 3)))
-        turns = data.view_inputs.get(ROTATIONS)
-        if turns is None:
+        quaternions = data.view_inputs.get(ROTATIONS)
+        if quaternions is None:
             matrices = kinematics.inverse(skeleton, positions, constant(self._offsets, x))[..., self.turning, :, :]
-            found = in_time(matrices, self.form)
+            rotations = in_time(matrices, self.form)
         else:
-            turns = turns[:, : x.shape[1]].unflatten(-1, (-1, 4))  # a past uses only its own frames
-            found = in_time(turns.index_select(-2, indices(self.turning, turns)).to(x), self.form, "quaternion")
-        place = [positions[..., skeleton.root, :]] if self.root else []
-        seen[WHOLE] = torch.cat([*place, found.flatten(-2)], -1)
-        seen[LENGTHS] = (view_inputs or Batch()).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
-        return seen
+            quaternions = quaternions[:, : x.shape[1]].unflatten(-1, (-1, 4))  # a past uses only its own frames
+            rotations = in_time(
+                quaternions.index_select(-2, indices(self.turning, quaternions)).to(x), self.form, "quaternion"
+            )
+        root = [positions[..., skeleton.root, :]] if self.root else []
+        converted[WHOLE] = torch.cat([*root, rotations.flatten(-2)], -1)
+        converted[LENGTHS] = (view_inputs or Batch()).get(LENGTHS, skeleton.bone_lengths(positions).mean(-2))
+        return converted
 
     @override
     def inverse(self, seen: Batch) -> Batch:
@@ -326,9 +332,9 @@ class Rotations(View):
             lengths = bones.new_zeros(*bones.shape[:-1], skeleton.joints)
             lengths = lengths.index_copy(-1, indices(children, bones), bones)
             offsets = lengths[..., None, :, None] * torch.nn.functional.normalize(offsets, dim=-1)  # (B, 1, J, 3)
-        place = x[..., :3] if self.root else torch.zeros_like(x[..., :3])
-        turns = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], skeleton.joints, 1, 1)
-        told = to_matrix(x[..., 3 * self.root :].unflatten(-1, (len(self.turning), -1)), self.form)
-        turns = turns.index_copy(-3, indices(self.turning, turns), told)
-        positions, _ = kinematics.forward(skeleton.parents, turns, offsets, place)
+        root = x[..., :3] if self.root else torch.zeros_like(x[..., :3])
+        rotations = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], skeleton.joints, 1, 1)
+        known_rotations = to_matrix(x[..., 3 * self.root :].unflatten(-1, (len(self.turning), -1)), self.form)
+        rotations = rotations.index_copy(-3, indices(self.turning, rotations), known_rotations)
+        positions, _ = kinematics.forward(skeleton.parents, rotations, offsets, root)
         return data | {WHOLE: (positions if self.root else skeleton.without_root(positions)).flatten(-2)}

@@ -72,10 +72,10 @@ class ActionClassifier(Trainable):
             raise SchemaError("an action classifier needs to know the classes; give windows whose clips have them")
         classes = sorted({clip.labels[self.label] for clip in windows.clips if self.label in clip.labels})
         if len(classes) < 2:
-            known = sorted({label for clip in windows.clips for label in clip.labels})
+            labels = sorted({label for clip in windows.clips for label in clip.labels})
             raise ValueError(
                 f"a classifier needs two classes: training clips have {' and '.join(classes) or 'nothing'} for the "
-                f"label {self.label!r}; their labels are {', '.join(known) or 'none (is labels.csv next to the file?)'}"
+                f"label {self.label!r}; labels are {', '.join(labels) or 'none (is labels.csv next to the file?)'}"
             )
         return replace(self, classes=tuple(classes))
 
@@ -157,5 +157,5 @@ class ActionClassifierModel(nn.Module):
             )
         parts = futures.reshape(-1, *futures.shape[-2:]).split(IN_CACHE)
         last = torch.cat([self.gru(part)[0][:, -1] for part in parts])
-        found: Tensor = torch.tanh(self.project(last)).unflatten(0, futures.shape[:-2])
-        return found
+        features_of_futures: Tensor = torch.tanh(self.project(last)).unflatten(0, futures.shape[:-2])
+        return features_of_futures

@@ -119,8 +119,8 @@ class VariedPoses:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw windows, rotated and with noise: {"x": (B, T, D)}; missing values are interpolated."""
-        drawn = self.windows.sample(batch_size, generator)
-        x = interpolate_missing(drawn["x"], drawn.mask())
+        batch = self.windows.sample(batch_size, generator)
+        x = interpolate_missing(batch["x"], batch.mask())
         if self.turned:
             angle = 2 * pi * torch.rand(len(x), 1, 1, generator=generator)
             x = rotate_about_up(x.unflatten(-1, (-1, 3)), angle, self.windows.skeleton.up).flatten(-2)
@@ -235,12 +235,12 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
         options = config["method"]
         parents = config["schema"]["skeleton"]["parents"]
         fits = options["method"] == PosePrior.name and tuple(parents) == skeleton.parents
-        given = options["heading"], options["layers"]
+        recorded_options = options["heading"], options["layers"]
     except (KeyError, TypeError):
         fits = False
     if not fits:
         raise ValueError(f"{path} does not contain a pose prior of the skeleton {skeleton.name!r}")
-    if given != (heading, PosePrior.layers):
+    if recorded_options != (heading, PosePrior.layers):
         raise ValueError(
             f"{path} was fitted with heading={options['heading']} and layers={options['layers']}, but this model sees "
             f"poses with heading={heading}, and takes a prior of {PosePrior.layers} layers"

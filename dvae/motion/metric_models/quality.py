@@ -182,8 +182,8 @@ class RealOrGeneratedModel(nn.Module):
     def logits(self, x: Tensor) -> Tensor:
         """Return the log-odds (B,) that windows (B, T, D) are real."""
         states, _ = self.gru(self.units(self.seen(x)))
-        found: Tensor = self.layers(states[:, -1])[:, 0]
-        return found
+        logits: Tensor = self.layers(states[:, -1])[:, 0]
+        return logits
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,7 @@ class Examples:
     """Windows with their real futures, and windows with generated futures.
 
     Args:
-        real, made: (N, T, D).
+        real, generated: (N, T, D).
     """
 
     real: Tensor
@@ -199,9 +199,9 @@ class Examples:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw half a batch of real and half of generated windows, independently: {"x": (B, T, D), "c": (B,)}."""
-        drawn = torch.randint(len(self.real), (batch_size,), generator=generator)
+        rows = torch.randint(len(self.real), (batch_size,), generator=generator)
         half = batch_size // 2
-        return _labelled(self.real[drawn[:half]], self.generated[drawn[half:]])
+        return _labelled(self.real[rows[:half]], self.generated[rows[half:]])
 
     def all(self) -> dict[str, Tensor]:
         """Return all real windows, then all others."""
@@ -246,16 +246,16 @@ class QualityScores(Result):
         """Return scores with standard errors over clips and over seeds, and the interval of the quality from both."""
         windows = f"{sum(self.clips.values())} windows of {len(self.clips)} clips"
         title = f"{self.record['protocol']['name']} · {windows} · {self.record['seeds']} classifiers each"
-        caption = "quality: 100 % - accuracy of a classifier that tells real from made; 50 % is the best\n"
+        caption = "quality: 100 % - accuracy of a classifier of real and generated windows; 50 % is the best\n"
         caption += "± standard error over clips ± over seeds of the classifier; 95 %: from both, by Student's t"
         table = Table(title=title, caption=caption)
         for header in ("", "quality (%)", "95 %", "taken for real (%)"):
             table.add_column(header, justify="right")
         for name in self.rows:
-            found = self[name]
-            low, high = found["quality"].interval()
+            scores = self[name]
+            low, high = scores["quality"].interval()
             interval = "–" if math.isnan(low) else f"{low:.1f} to {high:.1f}"
-            table.add_row(name, _said(found["quality"]), interval, _said(found["taken for real"]))
+            table.add_row(name, _cell(scores["quality"]), interval, _cell(scores["taken for real"]))
         return table
 
     @override
@@ -269,9 +269,9 @@ class QualityScores(Result):
         self.table()
 
 
-def _said(found: Estimate) -> str:
+def _cell(estimate: Estimate) -> str:
     return " ± ".join(
-        "–" if math.isnan(value) else f"{value:.1f}" for value in (found.mean, found.sequences, found.seeds)
+        "–" if math.isnan(value) else f"{value:.1f}" for value in (estimate.mean, estimate.sequences, estimate.seeds)
     )
 
 
@@ -323,60 +323,68 @@ def quality(
         raise ValueError(f"quality needs at least one example and one seed, got {examples} and {list(seeds)}")
     if references and STILL in models:
         raise ValueError(f"a model must not have the name of a reference row: {STILL}")
-    held, places = prepare_windows(test), clip_index(test.keys)
-    drawn = train.sample(examples, torch.Generator().manual_seed(seed))
-    known = EvaluationWindows(train, drawn, held.observed, [(train.split, "drawn", n) for n in range(examples)])
+    test_windows, clips = prepare_windows(test), clip_index(test.keys)
+    batch = train.sample(examples, torch.Generator().manual_seed(seed))
+    train_windows = EvaluationWindows(
+        train, batch, test_windows.observed, [(train.split, "drawn", n) for n in range(examples)]
+    )
     rows: dict[str, dict[str, np.ndarray]] = {}
-    forecasters = {name: _forecaster(model, held.futures.shape[1], forecast or {}) for name, model in models.items()}
-    forecasters |= {STILL: lambda past: last_value(past["x"], held.futures.shape[1])[0]} if references else {}
+    forecasters = {
+        name: _forecaster(model, test_windows.futures.shape[1], forecast or {}) for name, model in models.items()
+    }
+    forecasters |= {STILL: lambda past: last_value(past["x"], test_windows.futures.shape[1])[0]} if references else {}
     for name, futures in forecasters.items():
         with seeded_evaluation(models[name], seed) if name in models else nullcontext():
-            learned, judged = (_examples(name, futures, each, progress) for each in (known, held))
-        found: dict[str, list[Sequence[float]]] = {score: [] for score in SCORES}
+            train_examples, test_examples = (
+                _examples(name, futures, windows, progress) for windows in (train_windows, test_windows)
+            )
+        scores: dict[str, list[Sequence[float]]] = {score: [] for score in SCORES}
         for number in seeds:
             with seeded(number):
                 metric_model = method.build(train)
             bar = Bar(f"metric model of {name}, seed {number}", steps, progress)
             options = {**TRAINING, "seed": number, "progress": False, "trackers": [bar], **training}
-            fit(metric_model, method.train(learned, steps=steps), **options)
-            real, made = (_classified_as_real(metric_model, x) for x in (judged.real, judged.generated))
-            for score, values in zip(SCORES, ((1 - real + made) / 2, made), strict=True):
-                found[score].append(clip_means(100 * values, places))
-        rows[name] = {score: np.array(values) for score, values in found.items()}
+            fit(metric_model, method.train(train_examples, steps=steps), **options)
+            real, generated = (
+                _classified_as_real(metric_model, x) for x in (test_examples.real, test_examples.generated)
+            )
+            for score, values in zip(SCORES, ((1 - real + generated) / 2, generated), strict=True):
+                scores[score].append(clip_means(100 * values, clips))
+        rows[name] = {score: np.array(values) for score, values in scores.items()}
     record = {
         "classifier": method.config(),
         "training": {"steps": steps, "examples": examples, **TRAINING, **training},
         "seeds": len(seeds),
         "seed": seed,
         "forecast": dict(forecast or {}),
-        "data": held.description(),
+        "data": test_windows.description(),
         "trained on": train.fingerprint,
         "protocol": asdict(test.protocol),
     }
-    return QualityScores(rows, held.clips, plain(record))
+    return QualityScores(rows, test_windows.clips, plain(record))
 
 
 def _forecaster(model: Any, horizon: int, options: Mapping[str, Any]) -> Callable[[Batch], Tensor]:
     """Return a function from pasts to one future of each."""
 
     def futures(past: Batch) -> Tensor:
-        found = model.forecast(on_device_of(model, past), horizon, 1, **{"draw_emission": False, **options})
-        generated: Tensor = found["x"][0].cpu()
+        forecasts = model.forecast(on_device_of(model, past), horizon, 1, **{"draw_emission": False, **options})
+        generated: Tensor = forecasts["x"][0].cpu()
         return generated
 
     return futures
 
 
-def _examples(name: str, forecast: Callable[[Batch], Tensor], held: EvaluationWindows, progress: bool) -> Examples:
+def _examples(name: str, forecast: Callable[[Batch], Tensor], windows: EvaluationWindows, progress: bool) -> Examples:
     """Return windows, and their versions with futures of a model."""
-    made = []
+    generated = []
     with progress_bar(progress) as bar:
-        for start in bar.track(range(0, len(held.keys), 256), description=f"{name}, forecasts"):
+        for start in bar.track(range(0, len(windows.keys), 256), description=f"{name}, forecasts"):
             part = slice(start, start + 256)
-            futures = forecast(held.past(part))
-            refuse_non_finite(name, "forecast", futures.isfinite().all(-1).all(-1), held.keys[part])
-            made.append(torch.cat([held.x[part, : held.observed], futures], 1))
-    return Examples(held.x, torch.cat(made))
+            futures = forecast(windows.past(part))
+            refuse_non_finite(name, "forecast", futures.isfinite().all(-1).all(-1), windows.keys[part])
+            generated.append(torch.cat([windows.x[part, : windows.observed], futures], 1))
+    return Examples(windows.x, torch.cat(generated))
 
 
 def _classified_as_real(metric_model: RealOrGeneratedModel, x: Tensor) -> Tensor:

@@ -50,17 +50,17 @@ def statistics(windows: Windows | ExchangedWindows) -> dict[str, Statistic]:
         lowest = heights.nan_to_num(math.inf).amin(-1, keepdim=True)
         return mean_of_known(heights[..., feet] - lowest, (-2, -1))
 
-    def of(unit: str, function: Callable[[Tensor], Tensor]) -> Statistic:
+    def statistic(unit: str, function: Callable[[Tensor], Tensor]) -> Statistic:
         return Statistic(lambda x: function(windows.positions(x)), unit)
 
     return {
-        "speed": of("m/s", lambda found: fps * mean_of_known(found.diff(dim=-3).norm(dim=-1), (-2, -1))),
-        "acceleration": of(
-            "m/s²", lambda found: fps**2 * mean_of_known(found.diff(n=2, dim=-3).norm(dim=-1), (-2, -1))
+        "speed": statistic("m/s", lambda points: fps * mean_of_known(points.diff(dim=-3).norm(dim=-1), (-2, -1))),
+        "acceleration": statistic(
+            "m/s²", lambda points: fps**2 * mean_of_known(points.diff(n=2, dim=-3).norm(dim=-1), (-2, -1))
         ),
-        "bone length": of("m", lambda found: mean_of_known(skeleton.bone_lengths(found), (-2, -1))),
-        "bone stretch": of("%", bone_stretch),
-        **({"foot height": of("m", foot_height)} if feet else {}),
+        "bone length": statistic("m", lambda points: mean_of_known(skeleton.bone_lengths(points), (-2, -1))),
+        "bone stretch": statistic("%", bone_stretch),
+        **({"foot height": statistic("m", foot_height)} if feet else {}),
     }
 
 
@@ -86,14 +86,16 @@ def draw_traversal(
     azimuth = math.pi / 5 - final_heading(skeleton, poses[0, middle : middle + 1])
     figure = new_figure(0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
     panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
-    for panel, chosen, row in zip(panels, order.tolist(), poses, strict=True):
-        for column, drawn in enumerate(row):
-            at = (column * SPACING, 0.0)
-            pose(panel, row[middle], skeleton, at=at, azimuth=azimuth, colors="0.8", linewidths=1.6)
-            pose(panel, drawn, skeleton, at=at, azimuth=azimuth, colors="C0", linewidths=1.4)
+    for panel, coordinate, row in zip(panels, order.tolist(), poses, strict=True):
+        for column, shifted in enumerate(row):
+            offset = (column * SPACING, 0.0)
+            pose(panel, row[middle], skeleton, at=offset, azimuth=azimuth, colors="0.8", linewidths=1.6)
+            pose(panel, shifted, skeleton, at=offset, azimuth=azimuth, colors="C0", linewidths=1.4)
         hide_axes(panel)
-        moved = f"{found.latent}[{found.coordinates[chosen]}], which moves x by {float(found.effect[chosen]):.2g} m"
-        panel.set_title(moved, loc="left", fontsize=8)
+        title = (
+            f"{found.latent}[{found.coordinates[coordinate]}], which moves x by {float(found.effect[coordinate]):.2g} m"
+        )
+        panel.set_title(title, loc="left", fontsize=8)
         panel.tick_params(labelsize=8)
     panels[-1].set_xticks(
         SPACING * np.arange(len(found.offsets)), [f"{o:+.2g}" if o else "0" for o in found.offsets.tolist()]

@@ -39,7 +39,7 @@ def best_of_many(samples: Tensor, truth: Tensor) -> Tensor:
     _check(samples, truth=(truth, samples.shape[1:]))
     with torch.no_grad():
         best = torch.stack([_errors(sample, truth).sum((1, 2)) for sample in samples]).argmin(0)
-    return _errors(_chosen(samples, best, torch.arange(len(best), device=best.device)), truth).sum((1, 2))
+    return _errors(_select(samples, best, torch.arange(len(best), device=best.device)), truth).sum((1, 2))
 
 
 def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> T
         targets = (pseudo - samples[0, :, None]).masked_fill(~valid[..., None, None], 0).flatten(2)
         distances = offsets.square().sum(2)[:, None] - 2 * targets @ offsets.mT
         best = distances[sequence, future].argmin(1)
-    errors = (_chosen(samples, best, sequence) - truths).square().sum((1, 2))
+    errors = (_select(samples, best, sequence) - truths).square().sum((1, 2))
     return errors.new_zeros(sequences).index_add(0, sequence, errors) * (sequences / max(len(sequence), 1))
 
 
@@ -78,7 +78,7 @@ def _errors(samples: Tensor, truth: Tensor) -> Tensor:
     return torch.where(truth.isnan(), 0.0, samples - truth).square()
 
 
-def _chosen(samples: Tensor, sample: Tensor, sequence: Tensor) -> Tensor:
+def _select(samples: Tensor, sample: Tensor, sequence: Tensor) -> Tensor:
     """Return samples[sample, sequence], (N, T, D)."""
     return samples.flatten(0, 1).index_select(0, sample * samples.shape[1] + sequence)
 
@@ -99,13 +99,13 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
     if not scale > 0:
         raise ValueError(f"scale is {scale}, expected a distance above 0, in metres")
     first, second = torch.triu_indices(len(samples), len(samples), 1, device=samples.device)
-    one = torch.eye(len(samples), dtype=samples.dtype, device=samples.device)
-    pairs = one[first] - one[second]  # a matrix product is a third faster than indexing
+    identity = torch.eye(len(samples), dtype=samples.dtype, device=samples.device)
+    pairs = identity[first] - identity[second]  # a matrix product is a third faster than indexing
 
     def energy(x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
-            apart = (pairs @ x.flatten(1)).view(len(first), *x.shape[1:])
-        return (-apart.abs().sum((2, 3)) / scale).exp().sum(0) / max(len(first), 1)
+            pair_differences = (pairs @ x.flatten(1)).view(len(first), *x.shape[1:])
+        return (-pair_differences.abs().sum((2, 3)) / scale).exp().sum(0) / max(len(first), 1)
 
     diversity: Tensor = _InBlocks.apply(energy, samples)
     return diversity
@@ -150,11 +150,12 @@ def determinantal_diversity(samples: Tensor, quality: Tensor, scale: float) -> T
         raise ValueError(f"scale is {scale}, expected a squared distance above 0, in square metres")
     distances = _squared_distances(samples)
     r = quality.T.to(distances)
-    one = torch.eye(len(samples), dtype=distances.dtype, device=distances.device)
+    identity = torch.eye(len(samples), dtype=distances.dtype, device=distances.device)
     with torch.autocast(samples.device.type, enabled=False):
         kernel = r[:, :, None] * r[:, None] * (-distances / scale).exp()
-        left: Tensor = torch.linalg.inv_ex(kernel + one)[0]  # unlike inv, inv_ex does not synchronise with the device
-    return left.diagonal(dim1=1, dim2=2).sum(1) - len(samples)
+        # unlike inv, inv_ex does not synchronise with the device
+        inverse: Tensor = torch.linalg.inv_ex(kernel + identity)[0]
+    return inverse.diagonal(dim1=1, dim2=2).sum(1) - len(samples)
 
 
 def _squared_distances(samples: Tensor) -> Tensor:
@@ -204,8 +205,8 @@ def limb_length(samples: Tensor, reference: Tensor, skeleton: Skeleton) -> Tenso
 
     limbs = differences(skeleton, tuple(skeleton.edges), samples.shape[-1], samples.dtype, samples.device)
     pose = reference.detach()
-    lacking = skeleton.bone_lengths(skeleton.with_root(pose.unflatten(-1, (-1, 3)))).isnan()
-    expected = torch.where(lacking, torch.nan, _lengths(pose.nan_to_num(0.0), limbs))
+    is_missing = skeleton.bone_lengths(skeleton.with_root(pose.unflatten(-1, (-1, 3)))).isnan()
+    expected = torch.where(is_missing, torch.nan, _lengths(pose.nan_to_num(0.0), limbs))
     error: Tensor = _InBlocks.apply(lambda block, other: _limb_errors(block, other, limbs), samples, expected)
     return error
 
@@ -306,14 +307,14 @@ class _JointAngles(Function):
         _, sequences, frames, _ = samples.shape
         poses = samples.flatten(0, 2)
         gradient = torch.zeros_like(poses)
-        every = torch.arange(len(poses), device=poses.device)
+        all_rows = torch.arange(len(poses), device=poses.device)
         # finding these poses would synchronise with a GPU
-        chosen = slopes.any(1).nonzero()[:, 0] if poses.device.type == "cpu" else every
-        for rows in chosen.split(_poses_at_once(samples)):
+        violating = slopes.any(1).nonzero()[:, 0] if poses.device.type == "cpu" else all_rows
+        for rows in violating.split(_poses_at_once(samples)):
             slope = slopes[rows] * outputs[0][rows // frames % sequences, None]
             with torch.enable_grad():
-                some = poses[rows].requires_grad_()
-                (gradient[rows],) = torch.autograd.grad(cosines(some, ctx.skeleton), some, slope)
+                violating_poses = poses[rows].requires_grad_()
+                (gradient[rows],) = torch.autograd.grad(cosines(violating_poses, ctx.skeleton), violating_poses, slope)
         return gradient.view(samples.shape), None, None, None, None
 
 

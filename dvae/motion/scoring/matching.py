@@ -57,29 +57,29 @@ def parts(names: Sequence[str]) -> dict[str, int]:
     """Map parts to joints, as in {"pelvis": 0, "l hip": 1}; joints that match no part are left out."""
     words: dict[tuple[str, str], int] = {}
     for joint, name in enumerate(names):
-        for meant in readings(name):
-            words.setdefault(meant, joint)
+        for reading in readings(name):
+            words.setdefault(reading, joint)
     for side in ("l", "r"):
         if (side, "radius") in words:  # in Acclaim files, the wrist is the second half of the forearm
             words.pop((side, "wrist"), None)
-    found: dict[str, int] = {}
+    joint_of: dict[str, int] = {}
 
     def take(part: str, side: str, meaning: Sequence[str]) -> None:
         key = f"{side} {part}".strip()
         for word in meaning:
             joint = words.get((side, word))
-            if key not in found and joint is not None and joint not in found.values():
-                found[key] = joint
+            if key not in joint_of and joint is not None and joint not in joint_of.values():
+                joint_of[key] = joint
 
     for part, meaning in PARTS.items():
         for side in ("",) if part in _MIDDLE else ("l", "r"):
             take(part, side, meaning.split())
     for part, next_one in _FURTHER.items():  # files do not name the ends of chains; our readers do
         for side in ("",) if part in _MIDDLE else ("l", "r"):
-            if f"{side} {part}".strip() in found:
-                own = readings(names[found[f"{side} {part}".strip()]])
-                take(next_one, side, [f"{word}end" for _, word in own])
-    return found
+            if f"{side} {part}".strip() in joint_of:
+                end_readings = readings(names[joint_of[f"{side} {part}".strip()]])
+                take(next_one, side, [f"{word}end" for _, word in end_readings])
+    return joint_of
 
 
 def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> list[int]:
@@ -93,28 +93,29 @@ def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | No
     Raises:
         ValueError: some joints have no match.
     """
-    told = {new: find(names, old) for old, new in (said or {}).items()}
-    if unknown := told.keys() - set(skeleton.names):
+    assigned = {new: find(names, old) for old, new in (said or {}).items()}
+    if unknown := assigned.keys() - set(skeleton.names):
         raise ValueError(
             f"skeleton {skeleton.name!r} has no joint {min(unknown)!r}; it has {', '.join(skeleton.names)}"
         )
-    if set(skeleton.names) - told.keys() <= set(names):
-        told = {name: list(names).index(name) for name in skeleton.names if name not in told} | told
-    there, meant = parts(names), {joint: part for part, joint in parts(skeleton.names).items()}
-    alike = {letters(name): joint for joint, name in enumerate(names)}
-    found, lacking = [], []
+    if set(skeleton.names) - assigned.keys() <= set(names):
+        assigned = {name: list(names).index(name) for name in skeleton.names if name not in assigned} | assigned
+    source_parts, target_parts = parts(names), {joint: part for part, joint in parts(skeleton.names).items()}
+    joints_by_letters = {letters(name): joint for joint, name in enumerate(names)}
+    matches, unmatched = [], []
     for joint, name in enumerate(skeleton.names):
-        place = there.get(meant[joint]) if joint in meant else alike.get(letters(name))
-        place = told.get(name, place)
-        found.append(place)
-        if place is None:
-            lacking.append(name)
-    if lacking:
+        index = source_parts.get(target_parts[joint]) if joint in target_parts else joints_by_letters.get(letters(name))
+        index = assigned.get(name, index)
+        matches.append(index)
+        if index is None:
+            unmatched.append(name)
+    if unmatched:
         raise ValueError(
-            f"no joint matches {', '.join(lacking)} of skeleton {skeleton.name!r}; there are {', '.join(names)[:600]}. "
-            'Match them with joints={"name there": "name here", ...}'
+            f"no joint matches {', '.join(unmatched)} of skeleton {skeleton.name!r}; there are "
+            f"{', '.join(names)[:600]}. Match them with "
+            'joints={"name there": "name here", ...}'
         )
-    return [place for place in found if place is not None]
+    return [index for index in matches if index is not None]
 
 
 def against_world(parents: Sequence[int], rotations: Tensor) -> Tensor:
@@ -170,24 +171,25 @@ class Kept:
             ValueError: a joint is unknown or repeated, or the joints do not form one tree.
         """
         renamed = list(joints.values()) if isinstance(joints, Mapping) else None
-        chosen = []
+        selected = []
         for joint in joints:
-            place = find(names, joint) if isinstance(joint, str) else joint
-            if not 0 <= place < len(names) or place in chosen:
+            index = find(names, joint) if isinstance(joint, str) else joint
+            if not 0 <= index < len(names) or index in selected:
                 raise ValueError(f"joint {joint!r} is not one of {len(names)}, or occurs twice")
-            chosen.append(place)
-        above = []
-        for place in chosen:
-            parent = parents[place]
-            while parent >= 0 and parent not in chosen:
+            selected.append(index)
+        parents_of = []
+        for index in selected:
+            parent = parents[index]
+            while parent >= 0 and parent not in selected:
                 parent = parents[parent]
-            above.append(chosen.index(parent) if parent >= 0 else -1)
-        if len(roots := [names[joint] for joint, parent in zip(chosen, above, strict=True) if parent < 0]) != 1:
+            parents_of.append(selected.index(parent) if parent >= 0 else -1)
+        roots = [names[joint] for joint, parent in zip(selected, parents_of, strict=True) if parent < 0]
+        if len(roots) != 1:
             raise ValueError(
                 f"the joints that are kept need one common ancestor among them, such as the pelvis; their roots are "
                 f"{', '.join(roots)[:600] or 'none'}"
             )
-        return cls(tuple(chosen), tuple(renamed or (names[joint] for joint in chosen)), tuple(above))
+        return cls(tuple(selected), tuple(renamed or (names[joint] for joint in selected)), tuple(parents_of))
 
     @classmethod
     def onto(cls, names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> Kept:
@@ -207,18 +209,18 @@ class Kept:
             positions: (F, J, 3) of all joints in metres.
             rotations: (F, J, 4) of all joints relative to their parents, as quaternions.
         """
-        places = positions[:, list(self.joints)]
+        selected = positions[:, list(self.joints)]
         if rotations is None:
-            return places, None, None
+            return selected, None, None
         local = to_matrix(torch.from_numpy(rotations).double(), "quaternion")
         world = against_world(parents, local)[:, list(self.joints)]
         above = [joint if parent < 0 else parent for joint, parent in enumerate(self.parents)]
-        seen = torch.from_numpy(places).double()
-        bones = (world[:, above].mT @ (seen - seen[:, above])[..., None]).squeeze(-1)  # in the frame of the parent
+        points = torch.from_numpy(selected).double()
+        bones = (world[:, above].mT @ (points - points[:, above])[..., None]).squeeze(-1)  # in the frame of the parent
         offsets, loose = offsets_of(self.parents, bones)
         if loose > RIGID:
-            return places, None, None
-        turns = world[:, above].mT @ world
+            return selected, None, None
+        rotations_kept = world[:, above].mT @ world
         root = self.parents.index(-1)
-        turns[:, root] = world[:, root]
-        return places, continuous(from_matrix(turns, "quaternion")).numpy(), offsets.numpy()
+        rotations_kept[:, root] = world[:, root]
+        return selected, continuous(from_matrix(rotations_kept, "quaternion")).numpy(), offsets.numpy()

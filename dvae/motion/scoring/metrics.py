@@ -82,14 +82,14 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
     observed = windows.protocol.observed
     if not threshold > 0:
         raise ValueError(f"the multimodal threshold must be a positive distance, got {threshold}")
-    poses, seen = last_places(Batch(windows.all()), observed)
+    poses, known = last_places(Batch(windows.all()), observed)
     poses = poses.double()
-    found: list[Tensor] = []
+    truths: list[Tensor] = []
     for rows in torch.arange(len(poses)).split(512):
-        close = distances(poses[rows], poses, None if seen is None else seen[rows], seen) < threshold
+        close = distances(poses[rows], poses, None if known is None else known[rows], known) < threshold
         close[torch.arange(len(rows)), rows] = itself
-        found += [row.nonzero()[:, 0] for row in close]
-    return found
+        truths += [row.nonzero()[:, 0] for row in close]
+    return truths
 
 
 def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:
@@ -110,8 +110,8 @@ def multimodal_errors(samples: Array, truths: Array) -> Tensor:
     """
 
     def errors(x: Tensor, y: Tensor) -> Tensor:
-        apart = _cross(x, y)
-        return torch.cat([apart.amin(1), _median(apart, 1)]).mean(-1)
+        pairwise = _cross(x, y)
+        return torch.cat([pairwise.amin(1), _median(pairwise, 1)]).mean(-1)
 
     samples, truths = _multimodal(samples, truths)
     return per_window(errors, samples, truths)
@@ -195,11 +195,11 @@ def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: 
         places: `(N,)`, clip of every window, from 0 to C - 1.
     """
 
-    def distance(kept: Tensor) -> Tensor:
-        groups = [kept & (classes == number) for number in classes[kept].unique()]
+    def distance(included: Tensor) -> Tensor:
+        groups = [included & (classes == number) for number in classes[included].unique()]
         paces = [(rows.sum(), mean_of_known(motion[rows], 0), mean_of_known(real[rows], 0)) for rows in groups]
-        found = [n * cumulative_motion_distance(steps.where(~steps.isnan(), pace), pace) for n, steps, pace in paces]
-        return torch.stack(found).sum() / kept.sum()
+        weighted = [n * cumulative_motion_distance(steps.where(~steps.isnan(), pace), pace) for n, steps, pace in paces]
+        return torch.stack(weighted).sum() / included.sum()
 
     clips = range(int(places.max()) + 1)
     without = [distance(places != clip) for clip in clips] if len(clips) > 1 else []
@@ -211,13 +211,13 @@ def motion_pseudo_values(motion: Tensor, real: Tensor, classes: Tensor, places: 
 def _cross(samples: Tensor, truths: Tensor) -> Tensor:
     """Return displacements between (K, T, D) and (M, T, D), averaged over frames and at the last frame: (2, K, M)."""
 
-    def both(apart: Tensor) -> Tensor:
-        return torch.stack([apart.mean(0), apart[-1]])
+    def both(pairwise: Tensor) -> Tensor:
+        return torch.stack([pairwise.mean(0), pairwise[-1]])
 
     centre = truths.mean(0)
     if centre.isnan().any():
-        each = over_observed(lambda x, y: both(displacement(x, y).T))
-        return torch.stack([each(samples, truth) for truth in truths], -1)
+        errors = over_observed(lambda x, y: both(displacement(x, y).T))
+        return torch.stack([errors(samples, truth) for truth in truths], -1)
     # |x - y|^2 by matrix products, like cdist without its copies. Centring keeps the cancellation harmless.
     x, y = ((frames - centre).transpose(0, 1) for frames in (samples, truths))
     squares = x.square().sum(-1)[:, :, None] + y.square().sum(-1)[:, None]

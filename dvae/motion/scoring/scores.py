@@ -102,22 +102,24 @@ def scores(
             "errors in metres only, use dvae.motion.displacements"
         )
     moves = windows.protocol.root == "relative"
-    found = displacements(windows, _body(windows.skeleton) if moves else lambda x: x)
+    measures = displacements(windows, _body(windows.skeleton) if moves else lambda x: x)
     if moves:
-        found += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
+        measures += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
     if windows.given_joints:
-        found.append(_path_error(windows))
+        measures.append(_path_error(windows))
     bones = _bones(windows)
-    found += _limbs(windows, *bones)
+    measures += _limbs(windows, *bones)
     if windows.protocol.predicted > 1:
-        found.append(_cumulative_motion(windows))
+        measures.append(_cumulative_motion(windows))
     if windows.protocol.observed + windows.protocol.predicted > SEAM:
-        found.append(_jerk(windows))
+        measures.append(_jerk(windows))
     if pose_prior is not None:
-        found.append(_pose_nll(pose_prior, windows.protocol.observed))
-    judged = [_judged(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())]
-    found += [*(accuracy for accuracy, _ in judged if accuracy), *(distance for _, distance in judged)]
-    return [replace(measure, of_means=True) for measure in found]
+        measures.append(_pose_nll(pose_prior, windows.protocol.observed))
+    by_classifier = [
+        _classifier_scores(name, classifier, windows) for name, classifier in sorted((classifiers or {}).items())
+    ]
+    measures += [*(accuracy for accuracy, _ in by_classifier if accuracy), *(distance for _, distance in by_classifier)]
+    return [replace(measure, of_means=True) for measure in measures]
 
 
 _ADE = Measure("ADE", paired(average_displacement_error), "m", headline=True)
@@ -170,9 +172,13 @@ def _multimodal(
     threshold = getattr(windows.protocol, "multimodal_threshold", 0.5) if threshold is None else threshold
     truths = multimodal_truths(windows, threshold)
     futures = body(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :])
-    lonely = sum(len(found) == 1 for found in truths)
-    said: dict[str, Any] = {"threshold": threshold, "itself": True, "alone": lonely}
-    shared: Any = {"unit": "m", "note": multimodal_note(**said, windows=len(truths)), "basis": {"multimodal": said}}
+    alone = sum(len(truths_of_window) == 1 for truths_of_window in truths)
+    settings: dict[str, Any] = {"threshold": threshold, "itself": True, "alone": alone}
+    shared: Any = {
+        "unit": "m",
+        "note": multimodal_note(**settings, windows=len(truths)),
+        "basis": {"multimodal": settings},
+    }
 
     @lru_cache(maxsize=1)  # shared by all scores of a batch
     def errors(forecasts: Tensor, index: Tensor) -> Tensor:
@@ -190,12 +196,12 @@ def _multimodal(
     def diversity_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return (diversity(forecasts) - real()[index]).abs()
 
-    found = [
+    truths_of_window = [
         Measure(name, error(place), headline=name in ("MMADE", "MMFDE"), **shared)
         for place, name in enumerate(_MULTIMODAL)
     ]
     apde = Measure("APDE", diversity_error, pool=means_of_those_that_count, **shared)
-    return [*found, *([apde] if lonely < len(truths) else [])]
+    return [*truths_of_window, *([apde] if alone < len(truths) else [])]
 
 
 def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
@@ -205,18 +211,18 @@ def _diversities(futures: Tensor, sets: Sequence[Tensor]) -> Tensor:
         futures: (N, T, D).
         sets: indices of the futures in each set; the APD of a single future is NaN.
     """
-    among = torch.cat([*sets]).unique()
-    rows = futures[among].flatten(1).double()
+    members_of_any = torch.cat([*sets]).unique()
+    rows = futures[members_of_any].flatten(1).double()
     centre = rows.mean(0)
     if centre.isnan().any():
-        apds = [metrics.average_pairwise_distance(futures[held]) if len(held) > 1 else None for held in sets]
+        apds = [metrics.average_pairwise_distance(futures[members]) if len(members) > 1 else None for members in sets]
         return torch.stack([futures.new_tensor(math.nan) if apd is None else apd for apd in apds])
     rows = rows - centre  # otherwise distances that are small compared with the rows lose precision in products
     products = rows @ rows.T
     squares = products.diagonal()
-    apart = (squares[:, None] + squares).sub_(products, alpha=2).clamp_(min=0).sqrt_().fill_diagonal_(0.0)
-    chosen = torch.stack([torch.isin(among, held) for held in sets]).to(apart)
-    sums, counts = (chosen @ apart * chosen).sum(1), chosen.sum(1)
+    distances = (squares[:, None] + squares).sub_(products, alpha=2).clamp_(min=0).sqrt_().fill_diagonal_(0.0)
+    membership = torch.stack([torch.isin(members_of_any, members) for members in sets]).to(distances)
+    sums, counts = (membership @ distances * membership).sum(1), membership.sum(1)
     return (sums / (counts * (counts - 1))).to(futures)
 
 
@@ -232,13 +238,13 @@ def _body(skeleton: Skeleton) -> Callable[[Tensor], Tensor]:
 
 
 def _path_error(windows: Windows | ExchangedWindows) -> Measure:
-    places = [windows.joints.index(name) for name in windows.given_joints or ()]
+    columns = [windows.joints.index(name) for name in windows.given_joints or ()]
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         paths = past["y"][:, None, windows.protocol.observed :]
         paths = torch.where(truth[:, None].isnan(), torch.nan, paths)
         distances = (forecasts - paths).unflatten(-1, (-1, 3)).norm(dim=-1)
-        return mean_of_known(distances[..., places], (1, 2, 3))
+        return mean_of_known(distances[..., columns], (1, 2, 3))
 
     return Measure("path error", function, "m")
 
@@ -293,33 +299,33 @@ def _limbs(windows: Windows | ExchangedWindows, bones: list[int], note: str) -> 
 
     shared: Any = {"partial": windows.missing, "note": note}
     functions = {"bone-length error": bone_length_error, **{name: of_errors(score) for name, score in scores.items()}}
-    found = [Measure(name, function, "relative", **shared) for name, function in functions.items()]
+    measures = [Measure(name, function, "relative", **shared) for name, function in functions.items()]
 
     def angles(x: Tensor) -> Tensor:
         """Return angles between limbs, (pairs, ..., T)."""
         vectors = limbs(x)
-        u, v = (vectors.index_select(1, indices(each, x)) for each in (first, second))
+        u, v = (vectors.index_select(1, indices(joints_of_side, x)) for joints_of_side in (first, second))
         return torch.atan2(_norm(_cross(u, v)), (u * v).sum(0)).rad2deg()
 
     def angle_error(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         errors = ((angles(x) - angles(y)[:, None]).abs() for x, y in zip(forecasts, truth, strict=True))
-        return torch.stack([mean_of_known(each, (0, 2)).amin() for each in errors])
+        return torch.stack([mean_of_known(joints_of_side, (0, 2)).amin() for joints_of_side in errors])
 
     angular = Measure("limb-angle error", angle_error, "degrees", **shared)
-    return [*found, *([angular] if pairs else [])]
+    return [*measures, *([angular] if pairs else [])]
 
 
 def _coordinates(x: Tensor) -> Tensor:
     """Return joints (..., T, D) as (3, D / 3, ..., T), so that equal coordinates are contiguous."""
-    found: Tensor = x.unflatten(-1, (-1, 3)).movedim((-1, -2), (0, 1)).contiguous()
-    return found
+    coordinates: Tensor = x.unflatten(-1, (-1, 3)).movedim((-1, -2), (0, 1)).contiguous()
+    return coordinates
 
 
 def _norm(vectors: Tensor) -> Tensor:
     """Return norms (...) of vectors (3, ...), at least three times as fast as torch's norm over the first dimension."""
     x, y, z = vectors
-    found: Tensor = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
-    return found
+    norms: Tensor = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
+    return norms
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
@@ -336,26 +342,26 @@ def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
     except KeyError:
         label, labels = "", [""] * len(windows)
     names = sorted(set(labels))
-    classes = torch.tensor([names.index(each) for each in labels])
+    classes = torch.tensor([names.index(label_of_window) for label_of_window in labels])
     body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
 
     def moved(x: Tensor) -> Tensor:
         """Return mean steps of the joints, (B, ..., T - 1), of frames (B, ..., T, D)."""
         steps = (_norm(_coordinates(window).diff(dim=-1)) for window in body(x))
-        return torch.stack([mean_of_known(each, 0) for each in steps]).double()
+        return torch.stack([mean_of_known(label_of_window, 0) for label_of_window in steps]).double()
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return mean_of_known(moved(_where_true(forecasts, truth)), 1)
 
     real = mean_of_known(moved(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :]), -1)
-    what = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
+    scope = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
     return Measure(
         "CMD",
         function,
         "m",
         partial=windows.missing,
         pool=lambda motion, clips: motion_pseudo_values(motion, real, classes, clips),
-        note=f"CMD: {what}, against the pace of their true futures",
+        note=f"CMD: {scope}, against the pace of their true futures",
         basis={"CMD": {"label": label, "classes": names}},
     )
 
@@ -368,11 +374,11 @@ def _jerk(windows: Windows | ExchangedWindows) -> Measure:
     def jerk(x: Tensor) -> Tensor:
         """Return the jerk (B, ...) of frames (B, ..., T, D)."""
         changes = (_norm(_coordinates(window).diff(n=3, dim=-1)) for window in body(x))
-        return torch.stack([mean_of_known(each, (0, -1)) for each in changes]) * windows.protocol.fps**3
+        return torch.stack([mean_of_known(steps, (0, -1)) for steps in changes]) * windows.protocol.fps**3
 
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        seen = past.mask_to_nan()[:, None, start:].expand(-1, forecasts.shape[1], -1, -1)
-        return mean_of_known(jerk(torch.cat([seen, _where_true(forecasts, truth)], 2)), 1)
+        observed = past.mask_to_nan()[:, None, start:].expand(-1, forecasts.shape[1], -1, -1)
+        return mean_of_known(jerk(torch.cat([observed, _where_true(forecasts, truth)], 2)), 1)
 
     real = mean_of_known(jerk(Batch(windows.all()).mask_to_nan()[:, start:]), 0)
     note = f"jerk: {real:.1f} m/s³ of real motion"
@@ -388,20 +394,22 @@ def _where_true(forecasts: Tensor, truth: Tensor) -> Tensor:
 def _pose_nll(prior: Any, observed: int) -> Measure:
     if prior.forward_at not in (None, observed - 1):
         raise ValueError(
-            f"the pose prior reads windows turned at their frame {prior.forward_at + 1}, but here "
+            f"the pose prior reads windows rotated at their frame {prior.forward_at + 1}, but here "
             f"{observed} frames are observed; fit one under this protocol"
         )
 
     @torch.no_grad()
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        seen = interpolate_missing(past["x"], past.mask())[:, None].expand(-1, forecasts.shape[1], -1, -1)
-        motion = prior.facing(torch.cat([seen, forecasts], 2))[:, :, observed:]
+        history = interpolate_missing(past["x"], past.mask())[:, None].expand(-1, forecasts.shape[1], -1, -1)
+        motion = prior.facing(torch.cat([history, forecasts], 2))[:, :, observed:]
         return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
 
     return Measure("pose NLL", function, "nats", basis={"pose prior": _hash(prior)})
 
 
-def _judged(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> tuple[Measure | None, Measure]:
+def _classifier_scores(
+    name: str, classifier: Any, windows: Windows | ExchangedWindows
+) -> tuple[Measure | None, Measure]:
     """Return the ACC, if the class of some window is known, and the FID."""
     if windows.missing:
         raise ValueError(
@@ -411,22 +419,22 @@ def _judged(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> 
     labels = _labels(name, classifier, windows)
     classes = torch.tensor([classifier.classes.index(label) if label in classifier.classes else -1 for label in labels])
     unknown = int((classes < 0).sum())
-    described = {"label": classifier.label, "classes": list(classifier.classes)}
-    basis = {f"classifier {name}": {**described, "weights": _hash(classifier), "unknown": unknown}}
+    settings = {"label": classifier.label, "classes": list(classifier.classes)}
+    basis = {f"classifier {name}": {**settings, "weights": _hash(classifier), "unknown": unknown}}
     note = f"ACC, FID {name}: classifier {_hash(classifier)[:12]}"
-    note += f"; {unknown} of {len(labels)} windows are of no class it knows" if unknown else ""
+    note += f"; {unknown} of {len(labels)} windows have a class that it does not know" if unknown else ""
     shared: Any = {"truth": "real motion", "note": note, "basis": basis}
 
     @lru_cache(maxsize=1)  # shared by both scores of a batch
     def features(futures: Tensor) -> Tensor:
         with seeded_evaluation(classifier, 0):
-            found: Tensor = classifier.features(on_device_of(classifier, {"x": futures})["x"])
-            return found
+            values: Tensor = classifier.features(on_device_of(classifier, {"x": futures})["x"])
+            return values
 
     def accuracy(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        right = (classifier.logits(features(forecasts)).cpu().argmax(-1) == classes[index, None]).double().mean(1)
-        found: Tensor = right.masked_fill(classes[index] < 0, math.nan)
-        return found
+        hits = (classifier.logits(features(forecasts)).cpu().argmax(-1) == classes[index, None]).double().mean(1)
+        fraction: Tensor = hits.masked_fill(classes[index] < 0, math.nan)
+        return fraction
 
     x = windows.all()["x"][:, windows.protocol.observed :]
     real = torch.cat([features(futures) for futures in x.split(32)]).double().cpu()
@@ -436,8 +444,8 @@ def _judged(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> 
         pool=lambda generated, clips: metrics.frechet_pseudo_values(real, generated, clips),
         **shared,
     )
-    known = unknown < len(labels)
-    return Measure(f"ACC {name}", accuracy, "share", "higher", partial=True, **shared) if known else None, distance
+    some_known = unknown < len(labels)
+    return Measure(f"ACC {name}", accuracy, "share", "higher", partial=True, **shared) if some_known else None, distance
 
 
 def _labels(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> list[str]:
@@ -452,11 +460,11 @@ def _labels(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> 
             f"the classifier {name} was fitted to the skeleton {classifier.skeleton.name!r} and frames of "
             f"{classifier.size} numbers; these windows have the skeleton {windows.skeleton.name!r} and {size}"
         )
-    fitted, asked = ((p.predicted, p.fps) for p in (classifier.protocol, windows.protocol))
-    if fitted != asked:
+    expected, actual = ((p.predicted, p.fps) for p in (classifier.protocol, windows.protocol))
+    if expected != actual:
         raise ValueError(
-            f"the classifier {name} was fitted to {fitted[0]} predicted frames at {fitted[1]:g} fps; these windows "
-            f"have {asked[0]} at {asked[1]:g}"
+            f"the classifier {name} was fitted to {expected[0]} predicted frames at {expected[1]:g} fps; these windows "
+            f"have {actual[0]} at {actual[1]:g}"
         )
     clips = clip_index(windows.keys).bincount()
     if len(windows.keys) - (int(clips.max()) if len(clips) > 1 else 0) < 2:

@@ -78,8 +78,8 @@ class PseudoTruths:
                 self._limbs[node, nodes.index(parents[joint])] = -1
         self._chains = torch.linalg.inv(self._limbs).round()
 
-        listed = windows.all(stride)
-        x = interpolate_missing(listed["x"], listed.mask())[:, self._observed - 1 :]
+        candidates = windows.all(stride)
+        x = interpolate_missing(candidates["x"], candidates.mask())[:, self._observed - 1 :]
         self._average = self._lengths(x[:, 0].unflatten(-1, (-1, 3))).mean(0)
         self._last = torch.empty(len(x), len(nodes) * 3)
         self._futures = torch.empty(len(nodes), len(x), 3, x.shape[1] - 1)  # products and sums run along rows
@@ -120,8 +120,8 @@ class PseudoTruths:
         now = x[:, self._observed - 1]
         future = x[:, self._observed :].unflatten(-1, (-1, 3)).permute(0, 2, 3, 1)  # (B, n, 3, F)
         lengths = self._lengths(x[:, 0].unflatten(-1, (-1, 3)))
-        own = torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator.clone_state())))
-        order = torch.rand(len(x), len(self), generator=own)
+        own_generator = torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator.clone_state())))
+        order = torch.rand(len(x), len(self), generator=own_generator)
         order.masked_fill_(~self._possible(now, future, lengths), torch.inf)
         # computes limb vectors of average length, rescales them, and assembles the poses again
         posing = self._chains @ ((lengths / self._average.clamp(min=1e-9))[:, :, None] * self._limbs)
@@ -138,29 +138,29 @@ class PseudoTruths:
             others = self._futures[:, index.flatten()].flatten(2).unflatten(1, index.shape).transpose(0, 1)
             others = (posing[rows] @ others.flatten(2)).unflatten(2, (*index.shape[1:], 3, -1))  # (R, n, k, 3, F)
             far = (others - future[rows, :, None]).square().sum(3).sqrt().mean((1, 3)) >= self.minimum
-            found = rank.isfinite() & close & far
-            slot = count[rows, None] + found.cumsum(1) - 1
-            row, place = (found & (slot < self.most)).nonzero().T
-            chosen = rows[row], slot[row, place]
-            valid[chosen] = True
-            pseudo[*chosen, : self._observed] = x[rows[row], : self._observed]
-            pseudo[*chosen, self._observed :] = others[row, :, place].permute(0, 3, 1, 2).flatten(2)
-            count[rows] += found.sum(1)
+            admissible = rank.isfinite() & close & far
+            slot = count[rows, None] + admissible.cumsum(1) - 1
+            row, column = (admissible & (slot < self.most)).nonzero().T
+            target = rows[row], slot[row, column]
+            valid[target] = True
+            pseudo[*target, : self._observed] = x[rows[row], : self._observed]
+            pseudo[*target, self._observed :] = others[row, :, column].permute(0, 3, 1, 2).flatten(2)
+            count[rows] += admissible.sum(1)
             rows = rows[(count[rows] < self.most) & order[rows].isfinite().any(1)]
         return pseudo, valid
 
     def _possible(self, now: Tensor, future: Tensor, lengths: Tensor) -> Tensor:
         """Return (B, N), whether a candidate may meet the conditions; all others are excluded for certain."""
-        off = (lengths - self._average).abs() @ self._chains.T
+        shift = (lengths - self._average).abs() @ self._chains.T
         size = now.unflatten(-1, (-1, 3)).norm(dim=-1)
-        slack = (off + _ROUNDING * size).norm(dim=-1, keepdim=True)
+        slack = (shift + _ROUNDING * size).norm(dim=-1, keepdim=True)
         close = torch.cdist(now, self._last) < self.threshold + slack
 
         frames = future.shape[-1]
         squares = future.square().sum((2, 3))
         products = future.transpose(0, 1).flatten(2) @ self._futures.flatten(2).mT  # (n, B, N)
         distances = (squares.T[:, :, None] + self._squares[:, None] - 2 * products).clamp_(min=0).sqrt_()
-        slack = off + _ROUNDING * (squares / frames).sqrt()
+        slack = shift + _ROUNDING * (squares / frames).sqrt()
         far = distances.mean(0) / frames**0.5 + slack.mean(1, keepdim=True) >= self.minimum
         possible: Tensor = close & far
         return possible

@@ -121,12 +121,12 @@ class SegmentCompletion:
         with pyro.plate("sequences", size):
             z = pyro.sample(LATENT, prior.expand([size]))
             shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(parameters, kind).expand([size]))
-            times, made = self._made(z, shape, seen)
+            times, decoded = self._decode(z, shape, seen)
             if TIMES in seen:
                 _observe(TIMES, times, seen[TIMES], deviations.time)
-            for name, each in made.items():
-                counts = each.shape[-2] if name == SURFACES else 1  # as one vertex
-                _observe(name, each, seen[name], deviations.of(name) * counts**0.5)
+            for name, value in decoded.items():
+                counts = value.shape[-2] if name == SURFACES else 1  # as one vertex
+                _observe(name, value, seen[name], deviations.of(name) * counts**0.5)
         return {LATENT: z, SHAPE: shape}
 
     @cached_property
@@ -137,7 +137,7 @@ class SegmentCompletion:
         with torch.no_grad(), pyro.poutine.block():  # hides the inner program
             distribution = self.model.posterior(self.known)
         return dist.MultivariateNormal(
-            distribution.mean.mean(0), _shrunk(distribution.mean, distribution.variance.mean(0))
+            distribution.mean.mean(0), _shrink(distribution.mean, distribution.variance.mean(0))
         )
 
     @torch.no_grad()
@@ -152,45 +152,45 @@ class SegmentCompletion:
         Returns:
             Mapping from "surfaces", "points" or "markers" to the distances; for points, to the nearest vertex.
         """
-        made = self._made(z, shape, seen)[1]
-        return {name: (each - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, each in made.items()}
+        decoded = self._decode(z, shape, seen)[1]
+        return {name: (value - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, value in decoded.items()}
 
     def guide(self, seen: Mapping[str, Any]) -> Any:
         """Sample z of random known segments."""
         assert self.known is not None
-        chosen = torch.randint(len(self.known["x"]), (len(next(iter(seen.values()))),))
-        return self.model.guide({name: value[chosen] for name, value in self.known.items()})
+        rows = torch.randint(len(self.known["x"]), (len(next(iter(seen.values()))),))
+        return self.model.guide({name: value[rows] for name, value in self.known.items()})
 
     def renewed(self, seen: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the observations with the vertices nearest to points for these values of the latents."""
         if POINTS not in seen:
             return dict(seen)
         shape = values.get(SHAPE, seen.get(SHAPE))
-        met, _ = self._met(values[LATENT], shape, seen)
-        rotations, places = self.model.timed.poses(met)
+        frames, _ = self._at_moments(values[LATENT], shape, seen)
+        rotations, places = self.model.timed.poses(frames)
         return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
 
-    def _made(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+    def _decode(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the times (B, K) of the moments, and the decoded counterparts of all observations by name."""
         body = self.model.body
-        met, times = self._met(z, shape, seen)
-        rotations, places = self.model.timed.poses(met)
-        pose, made = (shape, rotations, places), {}
+        frames, times = self._at_moments(z, shape, seen)
+        rotations, places = self.model.timed.poses(frames)
+        pose, decoded = (shape, rotations, places), {}
         if SURFACES in seen:
-            made[SURFACES] = body.some(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
+            decoded[SURFACES] = body.some(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
         if SPOTS in seen:
-            made[SPOTS] = body.some(*pose, torch.tensor(self.markers, device=z.device))
+            decoded[SPOTS] = body.some(*pose, torch.tensor(self.markers, device=z.device))
         if POINTS in seen:
-            which = seen[NEAREST] if NEAREST in seen else nearest_vertices(body, *pose, seen[POINTS])
-            made[POINTS] = body.some(*pose, which)
-        return times, made
+            vertices = seen[NEAREST] if NEAREST in seen else nearest_vertices(body, *pose, seen[POINTS])
+            decoded[POINTS] = body.some(*pose, vertices)
+        return times, decoded
 
-    def _met(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """Return `_met` of the decoded segments; only the needed frames are decoded."""
-        frames, made = seen.get(FRAMES), self.model.decoder(z, shape)
+    def _at_moments(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+        """Return `_at_moments` of the decoded segments; only the needed frames are decoded."""
+        frames, decode = seen.get(FRAMES), self.model.decoder(z, shape)
         if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
-            return made(frames[0].long()), frames
-        return _along(self.model.timed.times(made(None, TIME)), made, seen)
+            return decode(frames[0].long()), frames
+        return _interpolate(self.model.timed.times(decode(None, TIME)), decode, seen)
 
     def read(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
         """Validate observations, and convert them to the model's precision and device.
@@ -200,47 +200,47 @@ class SegmentCompletion:
         Raises:
             ValueError: a name is unknown, a shape is wrong, observations are empty, or one has no time.
         """
-        found = {name: torch.as_tensor(value).to(like(self.model)) for name, value in seen.items()}
-        body, kinds = self.model.body, [name for name in (SURFACES, POINTS, SPOTS) if name in found]
-        moments = next((found[name] for name in (TIMES, FRAMES) if name in found), None)
-        if unknown := found.keys() - {TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE}:
+        tensors = {name: torch.as_tensor(value).to(like(self.model)) for name, value in seen.items()}
+        body, kinds = self.model.body, [name for name in (SURFACES, POINTS, SPOTS) if name in tensors]
+        moments = next((tensors[name] for name in (TIMES, FRAMES) if name in tensors), None)
+        if unknown := tensors.keys() - {TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE}:
             raise ValueError(
                 f"unknown observations {', '.join(sorted(unknown))}; expected some of {TIMES}, {FRAMES}, "
                 f"{SURFACES}, {POINTS}, {SPOTS} and {SHAPE}"
             )
-        if moments is None or moments.dim() != 2 or not (kinds or {TIMES, FRAMES} <= found.keys()):
-            given = {name: tuple(value.shape) for name, value in found.items()}
+        if moments is None or moments.dim() != 2 or not (kinds or {TIMES, FRAMES} <= tensors.keys()):
+            shapes = {name: tuple(value.shape) for name, value in tensors.items()}
             raise ValueError(
                 f"expected observations {SURFACES}, {POINTS} or {SPOTS}, with their moments (B, K) in {TIMES} or "
-                f"{FRAMES}; got {given}"
+                f"{FRAMES}; got {shapes}"
             )
         b, k = moments.shape
-        rest: dict[str, tuple[Any, ...]] = {
+        trailing_shapes: dict[str, tuple[Any, ...]] = {
             **{TIMES: (k,), FRAMES: (k,), SHAPE: (body.parameters_of_shape,)},
             **{SURFACES: (k, len(body.template), 3), SPOTS: (k, len(self.markers), 3)},
-            POINTS: (k, "M" if POINTS not in found else found[POINTS].shape[2:3].numel(), 3),
+            POINTS: (k, "M" if POINTS not in tensors else tensors[POINTS].shape[2:3].numel(), 3),
         }
-        for name, value in found.items():
-            if value.shape != (b, *rest[name]):
-                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {(b, *rest[name])}")
-        when = torch.stack([found[name].isfinite() for name in (TIMES, FRAMES) if name in found]).any(0)
+        for name, value in tensors.items():
+            if value.shape != (b, *trailing_shapes[name]):
+                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {(b, *trailing_shapes[name])}")
+        has_time = torch.stack([tensors[name].isfinite() for name in (TIMES, FRAMES) if name in tensors]).any(0)
         for name in kinds:
-            lost = found[name].isfinite().flatten(2).any(-1) & ~when
-            if lost.any():
-                row, column = lost.nonzero()[0].tolist()
+            untimed = tensors[name].isfinite().flatten(2).any(-1) & ~has_time
+            if untimed.any():
+                row, column = untimed.nonzero()[0].tolist()
                 raise ValueError(f"segment {row} has {name} at moment {column}, but no time and no frame there")
-        frames, last = found.get(FRAMES), self.model.timed.frames - 1
+        frames, last = tensors.get(FRAMES), self.model.timed.frames - 1
         if frames is not None and ((frames < 0) | (frames > last)).any():
             low, high = frames.nan_to_num(0.0).aminmax()
             raise ValueError(f"frames of chi must be from 0 to {last}, got {low:g} to {high:g}")
-        if SHAPE in found and not found[SHAPE].isfinite().all():
+        if SHAPE in tensors and not tensors[SHAPE].isfinite().all():
             raise ValueError(f"{SHAPE} must be given for all segments, or left out to be estimated; got NaN in some")
-        return found | ({SURFACES: found[SURFACES][..., ::THIN, :]} if SURFACES in found else {})
+        return tensors | ({SURFACES: tensors[SURFACES][..., ::THIN, :]} if SURFACES in tensors else {})
 
 
 @dataclass(frozen=True)
 class Completed:
-    """Segments that were completed.
+    """Completed segments and their posterior.
 
     Args:
         program: program of the observations.
@@ -265,19 +265,19 @@ class Completed:
     @property
     def x(self) -> Tensor:
         """The most probable frames (B, N, D)."""
-        return self._made(self.posterior.mode)[0]
+        return self._decode(self.posterior.mode)[0]
 
     @property
     def shape(self) -> Tensor:
         """The most probable bodies (B, S), or the known ones."""
-        return self._made(self.posterior.mode)[1]
+        return self._decode(self.posterior.mode)[1]
 
     def draw(self, n: int, seed: int = 0) -> tuple[Tensor, Tensor]:
         """Draw frames (n, B, N, D) and bodies (n, B, S) from the posterior."""
-        return self._made(self.posterior.draw(n, seed))
+        return self._decode(self.posterior.draw(n, seed))
 
     @torch.no_grad()
-    def _made(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _decode(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         z = values[LATENT]
         shape = values.get(SHAPE, self.seen.get(SHAPE)).expand(*z.shape[:-1], -1)  # type: ignore[union-attr]
         return self.model.decode(z, shape), shape
@@ -310,10 +310,10 @@ def complete(
     spots = markers or tuple(MARKERS.values())
     program = SegmentCompletion(model, deviations or Deviations(), spots, known, aggregate)
     data, guide = program.read(seen), None if known is None else program.guide
-    how: dict[str, Any] = {"descent": descent, "seed": seed, "chunk": chunk, "progress": progress}
+    options: dict[str, Any] = {"descent": descent, "seed": seed, "chunk": chunk, "progress": progress}
     with evaluating(model):
-        found = posterior(program, data, guide=guide, renew=program.renewed, **how)
-    return Completed(program, data, found)
+        result = posterior(program, data, guide=guide, renew=program.renewed, **options)
+    return Completed(program, data, result)
 
 
 def simulate_observations(
@@ -353,29 +353,29 @@ def simulate_observations(
     if frames is None:
         end = lasts if seconds is None else lasts.clamp(max=seconds)
         moments = (torch.arange(int(end.max() * fps + 1e-3) + 1).to(x) / fps).expand(len(x), -1)
-        seen = {TIMES: torch.where(moments <= end[:, None] + 1e-4, moments, torch.nan)}
+        observations = {TIMES: torch.where(moments <= end[:, None] + 1e-4, moments, torch.nan)}
     else:
-        seen = {FRAMES: torch.tensor(frames).to(x).expand(len(x), -1)}
-    rotations, places = model.timed.poses(_met(model.timed, x, seen)[0])
+        observations = {FRAMES: torch.tensor(frames).to(x).expand(len(x), -1)}
+    rotations, places = model.timed.poses(_at_moments(model.timed, x, observations)[0])
     if kind == SPOTS:
-        found = model.body.some(shape, rotations, places, torch.tensor(markers))
+        positions = model.body.some(shape, rotations, places, torch.tensor(markers))
     else:
-        found = model.body(shape, rotations, places)[0]
+        positions = model.body(shape, rotations, places)[0]
         if kind == POINTS:
-            found = sample_surfaces(found, model.body.faces, points, generator)
-    kept = torch.rand(found.shape[:-1], generator=generator) >= (0.0 if kind == SURFACES else gaps)
-    kept &= next(iter(seen.values())).isfinite()[..., None]
-    return {**seen, kind: torch.where(kept[..., None], found, torch.nan)}
+            positions = sample_surfaces(positions, model.body.faces, points, generator)
+    observed = torch.rand(positions.shape[:-1], generator=generator) >= (0.0 if kind == SURFACES else gaps)
+    observed &= next(iter(observations.values())).isfinite()[..., None]
+    return {**observations, kind: torch.where(observed[..., None], positions, torch.nan)}
 
 
 def sample_surfaces(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:
     """Draw points (..., M, 3) uniformly from surfaces (..., V, 3)."""
     first, second, third = (vertices[..., corner, :] for corner in faces.unbind(-1))
     area = (second - first).cross(third - first, dim=-1).norm(dim=-1)
-    drawn = torch.multinomial(area.flatten(0, -2), points, replacement=True, generator=generator)
-    which = drawn.unflatten(0, area.shape[:-1])[..., None].expand(*area.shape[:-1], points, 3)
-    corners = [corner.gather(-2, which) for corner in (first, second, third)]
-    across, along = torch.rand(2, *which.shape[:-1], 1, generator=generator).to(vertices)
+    triangles = torch.multinomial(area.flatten(0, -2), points, replacement=True, generator=generator)
+    indices = triangles.unflatten(0, area.shape[:-1])[..., None].expand(*area.shape[:-1], points, 3)
+    corners = [corner.gather(-2, indices) for corner in (first, second, third)]
+    across, along = torch.rand(2, *indices.shape[:-1], 1, generator=generator).to(vertices)
     across = across.sqrt()  # a triangle is wider near its side than near its corner
     shares = 1 - across, across * (1 - along), across * along
     return torch.stack([share * corner for share, corner in zip(shares, corners, strict=True)]).sum(0)
@@ -386,15 +386,15 @@ def chamfer(points: Tensor, vertices: Tensor) -> Tensor:
 
     The distance is one-sided, because few points do not cover the whole surface. NaN points are ignored.
     """
-    away = torch.cdist(points.nan_to_num(0.0), vertices).amin(-1)
-    return torch.where(points.isfinite().all(-1), away, torch.nan).nanmean(-1)
+    distances = torch.cdist(points.nan_to_num(0.0), vertices).amin(-1)
+    return torch.where(points.isfinite().all(-1), distances, torch.nan).nanmean(-1)
 
 
 def surfaces_at(model: Any, x: Tensor, shape: Tensor, times: Tensor) -> Tensor:
     """Return surfaces (B, K, V, 3) of frames (B, N, D) on bodies (B, S) at times (B, K); NaN after the end."""
-    met, reached = _met(model.timed, x, {TIMES: times})
-    found: Tensor = model.body(shape, *model.timed.poses(met))[0]
-    return torch.where((times <= reached + 1e-4)[..., None, None], found, torch.nan)
+    frames, reached = _at_moments(model.timed, x, {TIMES: times})
+    surfaces: Tensor = model.body(shape, *model.timed.poses(frames))[0]
+    return torch.where((times <= reached + 1e-4)[..., None, None], surfaces, torch.nan)
 
 
 def error_by_time(
@@ -412,83 +412,85 @@ def error_by_time(
     Returns:
         mean vertex error (K,) in metres, NaN if no segment is long enough, and the number of segments (K,).
     """
-    at = torch.tensor(times).to(truth[0]).expand(len(truth[0]), -1)
-    theirs = surfaces_at(model, *truth, at)
-    met, _ = _met(model.timed, made[0], {TIMES: at})
-    ours = model.body(made[1], *model.timed.poses(met))[0]
-    errors = vertex_error(ours[:, :, None], theirs[:, :, None])
+    moments = torch.tensor(times).to(truth[0]).expand(len(truth[0]), -1)
+    true_surfaces = surfaces_at(model, *truth, moments)
+    frames, _ = _at_moments(model.timed, made[0], {TIMES: moments})
+    surfaces = model.body(made[1], *model.timed.poses(frames))[0]
+    errors = vertex_error(surfaces[:, :, None], true_surfaces[:, :, None])
     return errors.nanmean(0), errors.isfinite().sum(0)
 
 
 def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tensor, points: Tensor) -> Tensor:
     """Return indices (B, K, M) of the vertices nearest to points (B, K, M, 3); other arguments as in `Body`."""
-    found = []
+    indices = []
     with torch.no_grad():
         at_once = max(1, AT_ONCE // points.shape[1])
         parts = (part.split(at_once) for part in (shape, rotations, places, points.nan_to_num(0.0)))
-        for some in zip(*parts, strict=True):
-            vertices = body(*some[:3])[0]
+        for batch in zip(*parts, strict=True):
+            vertices = body(*batch[:3])[0]
             pairs = max(1, PAIRS // (points.shape[2] * vertices.shape[2]))
-            each = zip(vertices.flatten(0, 1).split(pairs), some[3].flatten(0, 1).split(pairs), strict=True)
-            for flat, near in each:  # |p - v|^2 - |p|^2; the second term is constant
-                found.append(torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2).argmin(-1))
-    return torch.cat(found).unflatten(0, points.shape[:2])  # type: ignore[no-any-return]
+            blocks = zip(vertices.flatten(0, 1).split(pairs), batch[3].flatten(0, 1).split(pairs), strict=True)
+            for flat, near in blocks:  # |p - v|^2 - |p|^2; the second term is constant
+                indices.append(torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2).argmin(-1))
+    return torch.cat(indices).unflatten(0, points.shape[:2])  # type: ignore[no-any-return]
 
 
-def _shrunk(means: Tensor, variance: Tensor) -> Tensor:
+def _shrink(means: Tensor, variance: Tensor) -> Tensor:
     """Return the covariance (Z, Z) of a mixture of N normals with these means (N, Z) and mean variances (Z,).
 
-    It is shrunk towards its mean variance in all directions, by oracle approximating shrinkage (Chen, Wiesel, Eldar and
-    Hero 2010, IEEE Transactions on Signal Processing 58:10), so that a few segments do not exclude everything else. The
+    It is shrunk towards a multiple of the identity by oracle approximating shrinkage (Chen, Wiesel, Eldar and Hero
+    2010, IEEE Transactions on Signal Processing 58:10), so that a few segments do not exclude everything else. The
     estimator assumes independent means, so many segments of one take are shrunk too little.
     """
-    (n, p), away = means.shape, means - means.mean(0)
-    found = (away.mT @ away) / n + variance.diag()
-    trace, square = found.trace(), found.square().sum()
+    (n, p), centred = means.shape, means - means.mean(0)
+    covariance = (centred.mT @ centred) / n + variance.diag()
+    trace, square = covariance.trace(), covariance.square().sum()
     spread = (n + 1 - 2 / p) * (square - trace**2 / p)
     share = (((1 - 2 / p) * square + trace**2) / spread).nan_to_num(1.0).clamp(max=1.0)
-    return (1 - share) * found + share * trace / p * torch.eye(p).to(found)
+    return (1 - share) * covariance + share * trace / p * torch.eye(p).to(covariance)
 
 
 def _standard(dimensions: int, kind: Tensor) -> Any:
     return dist.Normal(kind.new_zeros(dimensions), 1.0).to_event(1)
 
 
-def _observe(name: str, made: Tensor, seen: Tensor, deviation: float) -> None:
+def _observe(name: str, decoded: Tensor, seen: Tensor, deviation: float) -> None:
     """Add the log density of observations as a factor, which avoids a scale per value and its logarithm."""
-    known = seen.isfinite()
-    away = torch.where(known, seen.nan_to_num(0.0) - made, 0.0).flatten(1).square().sum(-1)
-    pyro.factor(name, -away / (2 * deviation**2) - known.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
+    observed = seen.isfinite()
+    squared_error = torch.where(observed, seen.nan_to_num(0.0) - decoded, 0.0).flatten(1).square().sum(-1)
+    pyro.factor(name, -squared_error / (2 * deviation**2) - observed.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
 
 
-def _met(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+def _at_moments(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """Return the frames (B, K, D) at the observed moments, from frames (B, N, D), and their times (B, K) in seconds.
 
     Moments after the end use the last frame; its time then shows how much too early the segment ends.
     """
-    return _along(timed.times(x), lambda frames: x if frames is None else x[:, frames], seen)
+    return _interpolate(timed.times(x), lambda frames: x if frames is None else x[:, frames], seen)
 
 
-def _along(decoded: Tensor, made: Callable[[Tensor | None], Tensor], seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-    """Return `_met` for frames at times `decoded` (B, N); `made` decodes the given frames, or all of them (None)."""
-    many = decoded.shape[1]
+def _interpolate(
+    decoded: Tensor, decode: Callable[[Tensor | None], Tensor], seen: Mapping[str, Any]
+) -> tuple[Tensor, Tensor]:
+    """Return `_at_moments` for frames at times `decoded` (B, N); `decode` takes frame indices, or None for all."""
+    n_frames = decoded.shape[1]
     times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)
-    at = times.nan_to_num(0.0)
-    before = torch.searchsorted(decoded.detach(), at.contiguous(), right=True).sub(1).clamp(0, many - 2)
+    moments = times.nan_to_num(0.0)
+    before = torch.searchsorted(decoded.detach(), moments.contiguous(), right=True).sub(1).clamp(0, n_frames - 2)
     ends = torch.stack([before, before + 1], -1)
-    start, end = (decoded.gather(1, each) for each in ends.unbind(-1))
-    share = ((at - start) / (end - start)).clamp(0, 1)
+    start, end = (decoded.gather(1, columns) for columns in ends.unbind(-1))
+    share = ((moments - start) / (end - start)).clamp(0, 1)
     if FRAMES in seen:
         frames = seen[FRAMES].nan_to_num(0.0)
         located, around = seen[FRAMES].isfinite(), torch.stack([frames.floor(), frames.ceil()], -1)
         ends = torch.where(located[..., None], around.long(), ends)
         share = torch.where(located, frames - around[..., 0], share)
-        start, end = (decoded.gather(1, each) for each in ends.unbind(-1))
-    needed = torch.zeros(many, dtype=torch.bool, device=ends.device).index_fill(0, ends.flatten(), True)
-    if few := 2 * int(needed.sum()) <= many:  # for more frames, selection takes longer than decoding all
-        ends = (needed.cumsum(0) - 1)[ends]
-    x = made(needed.nonzero().squeeze(1) if few else None)
+        start, end = (decoded.gather(1, columns) for columns in ends.unbind(-1))
+    is_needed = torch.zeros(n_frames, dtype=torch.bool, device=ends.device).index_fill(0, ends.flatten(), True)
+    if few := 2 * int(is_needed.sum()) <= n_frames:  # for more frames, selection takes longer than decoding all
+        ends = (is_needed.cumsum(0) - 1)[ends]
+    x = decode(is_needed.nonzero().squeeze(1) if few else None)
     weights = torch.stack([1 - share, share], -1)
     # a matrix product has a cheap gradient; the gradient of indexing is as large as x for each index
-    lines = torch.zeros(*share.shape, x.shape[1]).to(x).scatter_add(2, ends, weights)
-    return lines @ x, torch.lerp(start, end, share)
+    interpolation = torch.zeros(*share.shape, x.shape[1]).to(x).scatter_add(2, ends, weights)
+    return interpolation @ x, torch.lerp(start, end, share)

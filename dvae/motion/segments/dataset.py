@@ -138,13 +138,13 @@ class SegmentData:
         if self.cut == "gait":
             return gait_cycles(self._embodied)
         cycles, fps = Cycles(), self.motion.skeleton.fps
-        kept = [clip for clip in self.motion if cycles.shortest <= (clip.frames - 1) / fps <= cycles.longest]
-        if not kept:
+        clips = [clip for clip in self.motion if cycles.shortest <= (clip.frames - 1) / fps <= cycles.longest]
+        if not clips:
             raise ValueError(
                 f"{self.path} has no clip of {cycles.shortest:g} to {cycles.longest:g} s that can be a whole "
                 "segment; cut='gait' finds the gait cycles of longer ones"
             )
-        marked = [replace(clip, labels={**clip.labels, "source": clip.name}) for clip in kept]
+        marked = [replace(clip, labels={**clip.labels, "source": clip.name}) for clip in clips]
         return fit_to_body(replace(self.motion, clips=marked), human())
 
     @cached_property
@@ -178,9 +178,9 @@ class SegmentData:
         takes = {f"{clip.split}/{clip.labels['source']}": clip for clip in reversed([*self.segments])}
         clips = among(segments) or among(takes)
         if len(clips) != 1:
-            few = [key.partition("/")[2] for key in (*takes, *segments)]
+            names = [key.partition("/")[2] for key in (*takes, *segments)]
             raise ValueError(
-                f"no segment or take {name!r}{nearest(name, few)} in {self.path}; the first is {next(iter(segments))}"
+                f"no segment or take {name!r}{nearest(name, names)} in {self.path}; the first is {next(iter(segments))}"
                 if not clips
                 else f"{name!r} is the name of several; choose {' or '.join('/'.join(clip.key) for clip in clips)}"
             )
@@ -204,8 +204,8 @@ class SegmentData:
         Raises:
             FileNotFoundError, ValueError: same as `open`.
         """
-        kept = {"cut": source.cut, "bodies": source.bodies}
-        return cls.open(path or source.path, source.skip_bad, **kept, seen=schema.timed)
+        options = {"cut": source.cut, "bodies": source.bodies}
+        return cls.open(path or source.path, source.skip_bad, **options, seen=schema.timed)
 
     @cached_property
     def _training(self) -> Segments:
@@ -214,8 +214,8 @@ class SegmentData:
         if self.seen is not None:
             return Segments(motion, self.seen, bodies=self.bodies)
         references = reference_cycles(self._embodied) if self.warped else ()
-        timed, seen = TimedFrames.seeing(motion, scaling=self.scaling, references=references)
-        return Segments(motion, timed, seen=seen, bodies=self.bodies)
+        timed, batch = TimedFrames.seeing(motion, scaling=self.scaling, references=references)
+        return Segments(motion, timed, seen=batch, bodies=self.bodies)
 
     @cached_property
     def _embodied(self) -> MotionSet:
@@ -225,15 +225,15 @@ class SegmentData:
         if split not in ("train", "validation", "test"):
             raise ValueError(f"no split {split!r}: expected train, validation or test")
         takes = list(dict.fromkeys(clip.labels["source"] for clip in self.segments if clip.split == "train"))
-        aside = {takes[place] for place in held_out(len(takes), VALIDATION)}
+        aside = {takes[index] for index in held_out(len(takes), VALIDATION)}
 
-        def where(clip: Clip) -> str:
+        def split_of(clip: Clip) -> str:
             return "validation" if clip.split == "train" and clip.labels["source"] in aside else clip.split
 
-        clips = [clip for clip in self.segments if where(clip) == split]
+        clips = [clip for clip in self.segments if split_of(clip) == split]
         if not clips:
             raise ValueError(
-                f"{self.path} has no segments for {split}: {len(self.segments)} are of takes in "
-                f"{', '.join(self.segments.splits)}, and validation takes a tenth of those in train"
+                f"{self.path} has no segments for {split}: its {len(self.segments)} segments are in "
+                f"{', '.join(self.segments.splits)}, and a tenth of the training takes is for validation"
             )
         return replace(self.segments, clips=clips)

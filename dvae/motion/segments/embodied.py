@@ -63,9 +63,9 @@ class SegmentSchema(Schema):
 
     @override
     def config(self) -> dict[str, Any]:
-        own = asdict(replace(self.timed, references=()))
-        references = [{**vars(each), "hips": each.hips.tolist()} for each in self.timed.references]
-        return {"sizes": dict(self.sizes), "timed": {**own, "references": references}}
+        fields = asdict(replace(self.timed, references=()))
+        references = [{**vars(reference), "hips": reference.hips.tolist()} for reference in self.timed.references]
+        return {"sizes": dict(self.sizes), "timed": {**fields, "references": references}}
 
     @classmethod
     @override
@@ -77,10 +77,10 @@ class SegmentSchema(Schema):
             raise ValueError(
                 f"timed.skeleton must be the skeleton of the supplied body, {', '.join(body.names)} with y up"
             )
-        found = cls.from_data(TimedFrames(skeleton, references=references, **tuples(timed)), body)
-        if config["sizes"] != found.sizes:
-            raise ValueError(f"sizes are {brief(config['sizes'])}, expected {found.sizes} for such segments")
-        return found
+        schema = cls.from_data(TimedFrames(skeleton, references=references, **tuples(timed)), body)
+        if config["sizes"] != schema.sizes:
+            raise ValueError(f"sizes are {brief(config['sizes'])}, expected {schema.sizes} for such segments")
+        return schema
 
 
 def _reference(config: Mapping[str, Any]) -> Reference:
@@ -131,12 +131,12 @@ class Segments:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Mapping[str, Any]:
         """Return `batch_size` distinct segments in random order, or all if there are fewer."""
-        chosen = torch.randperm(len(self), generator=generator)[:batch_size]
-        batch = Batch(self._batch).rows(chosen)
+        rows = torch.randperm(len(self), generator=generator)[:batch_size]
+        batch = Batch(self._batch).rows(rows)
         if not self.bodies:
             return batch
-        drawn = self.bodies * torch.randn(batch[SHAPE].shape, generator=generator)
-        return self.on_bodies(batch, drawn.clamp(-MOST, MOST))
+        shapes = self.bodies * torch.randn(batch[SHAPE].shape, generator=generator)
+        return self.on_bodies(batch, shapes.clamp(-MOST, MOST))
 
     def on_bodies(self, batch: Mapping[str, Any], shape: Tensor) -> Mapping[str, Any]:
         """Return the same rotations and times on bodies (B, S); root positions scale with the length of the legs."""
@@ -172,6 +172,6 @@ def surfaces_of(timed: TimedFrames, body: Body, x: Tensor, shape: Tensor) -> Ten
 
     Every segment starts at the origin with heading zero.
     """
-    rotations, place, _ = timed.unpack(x)
-    found: Tensor = body(shape, rotations, place)[0]
-    return found
+    rotations, translation, _ = timed.unpack(x)
+    surfaces: Tensor = body(shape, rotations, translation)[0]
+    return surfaces

@@ -91,14 +91,14 @@ class TimedFrames:
 
     def __post_init__(self) -> None:
         check(self)
-        for needed in ("offsets", "sides"):
-            getattr(self.skeleton, needed)  # these properties raise errors that explain what to do
+        for attribute in ("offsets", "sides"):
+            getattr(self.skeleton, attribute)  # these properties raise errors that explain what to do
         if self.frames < 2:
-            raise ValueError(f"{self.frames} frame has no time between frames; expected at least 2")
+            raise ValueError(f"frames must be at least 2, got {self.frames}")
         for name in ("mean", "deviation"):
             if (numbers := len(getattr(self, name))) not in (0, 6 * len(self.turning)):
                 raise ValueError(
-                    f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints that turn"
+                    f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints with children"
                 )
         if not np.isfinite([*self.mean, *self.deviation]).all():
             raise ValueError("mean or deviation have NaN or infinite numbers")
@@ -138,17 +138,17 @@ class TimedFrames:
         """Return the results of `of` and of `to` for these segments; their frames are computed only once."""
         if scaling not in ("identity", "deviation"):
             raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
-        made = cls(motion.skeleton, frames, references=references)
-        found = made._found(motion)
+        view = cls(motion.skeleton, frames, references=references)
+        unscaled = view._unscaled(motion)
         # in single precision, so that units do not depend on the last digits of a double
-        x = made._scaled(found)[WHOLE]
-        metres = max(float(x[..., made.parts["translation"]].abs().max()), 1e-3)
-        made = replace(made, metres=metres, seconds=float(made.lasts(x[..., -1:].double()).max()))
+        x = view._scaled(unscaled)[WHOLE]
+        metres = max(float(x[..., view.parts["translation"]].abs().max()), 1e-3)
+        view = replace(view, metres=metres, seconds=float(view.lasts(x[..., -1:].double()).max()))
         if scaling == "deviation":
-            turns = made._turns(x.double()).flatten(-2).flatten(0, 1)
-            deviation = turns.std(0, correction=0).clamp(STEADY)
-            made = replace(made, mean=tuple(turns.mean(0).tolist()), deviation=tuple(deviation.tolist()))
-        return made, made._scaled(found)
+            rotations = view._six_numbers(x.double()).flatten(-2).flatten(0, 1)
+            deviation = rotations.std(0, correction=0).clamp(STEADY)
+            view = replace(view, mean=tuple(rotations.mean(0).tolist()), deviation=tuple(deviation.tolist()))
+        return view, view._scaled(unscaled)
 
     @property
     def turning(self) -> list[int]:
@@ -163,8 +163,8 @@ class TimedFrames:
     @property
     def parts(self) -> Mapping[str, list[int]]:
         """Coordinates of a frame by part: rotations (Theta), translation of the root (Gamma), time (Phi)."""
-        turns = 6 * len(self.turning)
-        return {"rotations": [*range(turns)], "translation": [*range(turns, turns + 3)], "time": [turns + 3]}
+        end = 6 * len(self.turning)
+        return {"rotations": [*range(end)], "translation": [*range(end, end + 3)], "time": [end + 3]}
 
     def to(self, motion: MotionSet) -> dict[str, Any]:
         """Convert segments, each a clip, to time-stamped frames.
@@ -179,7 +179,7 @@ class TimedFrames:
         Raises:
             ValueError: a clip has no rotations, only one frame, or another skeleton.
         """
-        return self._scaled(self._found(motion))
+        return self._scaled(self._unscaled(motion))
 
     def back(self, seen: Mapping[str, Any], fps: float | None = None) -> MotionSet:
         """Convert time-stamped frames, from `to` or from a decoder, to motion.
@@ -198,22 +198,24 @@ class TimedFrames:
         skeleton, x = replace(self.skeleton, fps=fps or self.skeleton.fps), seen[WHOLE].detach().cpu().double()
         if not x.isfinite().all():
             raise ValueError(f"{int((~x.isfinite()).sum())} of the numbers of frames are NaN or infinite")
-        turns, places, times = self.unpack(x)
+        rotations, places, times = self.unpack(x)
         clips = []
         for b in range(len(x)):
-            values = _joined(continuous(from_matrix(turns[b][:, self.turning], "quaternion")), places[b])
-            at = np.arange(int(float(times[b, -1]) * skeleton.fps + 1e-3) + 1) / skeleton.fps
-            through = _cubic(times[b].numpy(), at.clip(max=float(times[b, -1])))
-            own, place = _parted(_normed(through @ values))
-            local = torch.eye(3).to(x).repeat(len(own), skeleton.joints, 1, 1)
-            local[:, self.turning] = to_matrix(own, "quaternion")
+            values = _join(continuous(from_matrix(rotations[b][:, self.turning], "quaternion")), places[b])
+            moments = np.arange(int(float(times[b, -1]) * skeleton.fps + 1e-3) + 1) / skeleton.fps
+            interpolation = _cubic(times[b].numpy(), moments.clip(max=float(times[b, -1])))
+            turned_quaternions, root_positions = _split_joined(_normalise(interpolation @ values))
+            local = torch.eye(3).to(x).repeat(len(turned_quaternions), skeleton.joints, 1, 1)
+            local[:, self.turning] = to_matrix(turned_quaternions, "quaternion")
             if HEADING in seen:
-                turn, place = self._faced(local[:, skeleton.root], place, seen[HEADING][b].cpu().double())
+                turn, root_positions = self._rotate_root(
+                    local[:, skeleton.root], root_positions, seen[HEADING][b].cpu().double()
+                )
                 local[:, skeleton.root] = turn
             if ORIGIN in seen:
-                place = place + seen[ORIGIN][b].cpu().double()
+                root_positions = root_positions + seen[ORIGIN][b].cpu().double()
             offsets = seen[OFFSETS][b].cpu().double() if OFFSETS in seen else skeleton.offsets
-            positions, _ = kinematics.forward(skeleton.parents, local, offsets, place)
+            positions, _ = kinematics.forward(skeleton.parents, local, offsets, root_positions)
             quaternions = continuous(from_matrix(local, "quaternion"))
             clips.append(Clip("all", f"{b:04d}", positions.numpy(), rotations=quaternions.numpy()))
         return MotionSet(clips, skeleton, "segments")
@@ -241,7 +243,7 @@ class TimedFrames:
         ends = [joint for joint in range(self.skeleton.joints) if joint not in turning]
         unturned = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], len(ends), 3, 3)
         back = indices([[*turning, *ends].index(joint) for joint in range(self.skeleton.joints)], x)
-        rotations = torch.cat([to_matrix(self._turns(x), "6d"), unturned], -3).index_select(-3, back)
+        rotations = torch.cat([to_matrix(self._six_numbers(x), "6d"), unturned], -3).index_select(-3, back)
         return rotations, x[..., -4:-1] * self.metres
 
     def times(self, x: Tensor) -> Tensor:
@@ -257,73 +259,79 @@ class TimedFrames:
     def travels(self, x: Tensor) -> Tensor:
         """Return the distance of the root between first and last frame of (..., N, D), (...,) in metres."""
         first, last = self.poses(x[..., [0, -1], :])[1].unbind(-2)
-        found: Tensor = (last - first).norm(dim=-1)
-        return found
+        distance: Tensor = (last - first).norm(dim=-1)
+        return distance
 
-    def _found(self, motion: MotionSet) -> dict[str, Tensor]:
+    def _unscaled(self, motion: MotionSet) -> dict[str, Tensor]:
         """Return the result of `to` with x before scaling: six numbers per rotation, metres, seconds."""
         skeleton = motion.skeleton
         if (skeleton.names, skeleton.parents, skeleton.up) != tuple(
             getattr(self.skeleton, name) for name in ("names", "parents", "up")
         ):
             raise ValueError(
-                f"{motion.name or 'these segments'} have the tree of joints {skeleton.name!r}, and frames here are of "
-                f"{self.skeleton.name!r}; dvae.motion.segments.gait.alike brings two sources onto one tree"
+                f"{motion.name or 'these segments'} have the joint tree of {skeleton.name!r}, expected the tree of "
+                f"{self.skeleton.name!r}; dvae.motion.segments.gait.on_common_joints maps two sources to one tree"
             )
         for clip in motion:
-            where = f"segment {'/'.join(clip.key)}"
+            segment = f"segment {'/'.join(clip.key)}"
             if clip.rotations is None:
-                raise ValueError(f"{where} has no rotations of joints; MotionSet.with_rotations() computes them")
+                raise ValueError(f"{segment} has no rotations of joints; MotionSet.with_rotations() computes them")
             if clip.frames < 2:
-                raise ValueError(f"{where} has {clip.frames} frame, expected at least 2, between which time passes")
+                raise ValueError(f"{segment} has {clip.frames} frame, expected at least 2")
         first = torch.from_numpy(np.stack([clip.positions[0] for clip in motion])).double()
         heading = skeleton.heading(first)
         x = first.new_empty(len(motion), self.frames, self.size)
-        for places, turns, positions in _of_one_length(motion):
-            at = np.linspace(0, turns.shape[1] - 1, self.frames)[None]
+        for rows, quaternions, positions in _of_one_length(motion):
+            frames = np.linspace(0, quaternions.shape[1] - 1, self.frames)[None]
             if self.references:
-                some = (motion.clips[n] for n in places)
-                at = np.stack([stamps(clip, self.skeleton, self.references, self.frames) for clip in some])
-            x[places] = self._seen(turns, positions[:, :, skeleton.root], at, skeleton.fps, -heading[places, None])
+                clips = (motion.clips[n] for n in rows)
+                frames = np.stack([stamps(clip, self.skeleton, self.references, self.frames) for clip in clips])
+            x[rows] = self._resampled(
+                quaternions, positions[:, :, skeleton.root], frames, skeleton.fps, -heading[rows, None]
+            )
         origin, offsets = first[:, skeleton.root], resting_offsets(motion)
         return {WHOLE: x, HEADING: heading, ORIGIN: origin, OFFSETS: offsets}
 
-    def _seen(self, turns: Tensor, place: Tensor, at: np.ndarray, fps: float, angle: Tensor) -> Tensor:
+    def _resampled(
+        self, quaternions: Tensor, root_positions: Tensor, frames: np.ndarray, fps: float, angle: Tensor
+    ) -> Tensor:
         """Return unscaled x (B, N, D) of quaternions (B, F, J, 4) and positions (B, F, 3), rotated by angles (B, 1).
 
-        Its frames are at frames `at` (B, N) of the clips, or (1, N) for all clips.
+        Its frames are at `frames` (B, N) of the clips, or (1, N) for all clips.
         """
-        root, times = self.skeleton.root, np.arange(turns.shape[1])
-        first, place = self._faced(to_matrix(turns[:, :, root], "quaternion"), place - place[:, :1], angle)
-        turns[:, :, root] = from_matrix(first, "quaternion")
-        given = _joined(continuous(normalised(turns[:, :, self.turning])), place)
-        there = torch.stack([_cubic(times, each) for each in at])
-        again = torch.stack([_cubic(each, times) for each in at])
-        values = _normed(there @ given)
+        root, times = self.skeleton.root, np.arange(quaternions.shape[1])
+        first, root_positions = self._rotate_root(
+            to_matrix(quaternions[:, :, root], "quaternion"), root_positions - root_positions[:, :1], angle
+        )
+        quaternions[:, :, root] = from_matrix(first, "quaternion")
+        original = _join(continuous(normalised(quaternions[:, :, self.turning])), root_positions)
+        to_frames = torch.stack([_cubic(times, row) for row in frames])
+        from_frames = torch.stack([_cubic(row, times) for row in frames])
+        values = _normalise(to_frames @ original)
         for _ in range(ROUNDS):  # add the error of the round trip to the values
-            values = _normed(values + there @ (given - _normed(again @ values)))
-        turns, place = _parted(values)
-        six = from_matrix(to_matrix(turns, "quaternion"), "6d").flatten(-2)
-        increments = torch.from_numpy(np.diff(at, prepend=0.0) / fps).expand(len(turns), -1)
-        return torch.cat([six, place, increments[..., None]], -1)
+            values = _normalise(values + to_frames @ (original - _normalise(from_frames @ values)))
+        quaternions, root_positions = _split_joined(values)
+        rotations = from_matrix(to_matrix(quaternions, "quaternion"), "6d").flatten(-2)
+        increments = torch.from_numpy(np.diff(frames, prepend=0.0) / fps).expand(len(quaternions), -1)
+        return torch.cat([rotations, root_positions, increments[..., None]], -1)
 
-    def _scaled(self, found: Mapping[str, Any]) -> dict[str, Any]:
+    def _scaled(self, unscaled: Mapping[str, Any]) -> dict[str, Any]:
         """Return scaled values in single precision."""
-        mean, deviation = self._scaling(found[WHOLE])
+        mean, deviation = self._scaling(unscaled[WHOLE])
         others = mean.new_tensor([self.metres] * 3 + [self.seconds / (self.frames - 1)])
-        x = (found[WHOLE] - pad(mean, (0, 4))).div_(torch.cat([deviation, others]))
-        return {name: value.float() for name, value in {**found, WHOLE: x}.items()}
+        x = (unscaled[WHOLE] - pad(mean, (0, 4))).div_(torch.cat([deviation, others]))
+        return {name: value.float() for name, value in {**unscaled, WHOLE: x}.items()}
 
-    def _faced(self, turn: Tensor, place: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    def _rotate_root(self, turn: Tensor, positions: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
         """Rotate the root's rotations (..., 3, 3) and positions (..., 3) about the up axis by angles (...)."""
         up = self.skeleton.up
-        return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(place, angle, up)
+        return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(positions, angle, up)
 
-    def _turns(self, x: Tensor) -> Tensor:
+    def _six_numbers(self, x: Tensor) -> Tensor:
         """Return six numbers of each joint with children (..., K, 6)."""
         mean, deviation = self._scaling(x)
-        found: Tensor = (x[..., :-4] * deviation + mean).unflatten(-1, (-1, 6))
-        return found
+        numbers: Tensor = (x[..., :-4] * deviation + mean).unflatten(-1, (-1, 6))
+        return numbers
 
     def _scaling(self, like: Tensor) -> tuple[Tensor, Tensor]:
         unturned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(self.turning)
@@ -334,48 +342,50 @@ def resting_offsets(motion: MotionSet) -> Tensor:
     """Return mean offsets of joints from their parents, in the coordinates of the parents, (B, J, 3) in metres."""
     skeleton = motion.skeleton
     parents, children = (list(ends) for ends in zip(*skeleton.edges, strict=True))
-    found = torch.zeros(len(motion), skeleton.joints, 3, dtype=torch.float64)
-    for some, turns, places in _of_one_length(motion):
-        local = to_matrix(turns, "quaternion")
+    offsets = torch.zeros(len(motion), skeleton.joints, 3, dtype=torch.float64)
+    for rows, quaternions, positions in _of_one_length(motion):
+        local = to_matrix(quaternions, "quaternion")
         # rotations only; the offsets do not matter here
-        _, world = kinematics.forward(skeleton.parents, local, places, places[..., 0, :])
-        limbs = (places[..., children, :] - places[..., parents, :])[..., None]
-        found[some[:, None], children] = (world[..., parents, :, :].mT @ limbs).squeeze(-1).mean(1)
-    return found
+        _, world = kinematics.forward(skeleton.parents, local, positions, positions[..., 0, :])
+        limbs = (positions[..., children, :] - positions[..., parents, :])[..., None]
+        offsets[rows[:, None], children] = (world[..., parents, :, :].mT @ limbs).squeeze(-1).mean(1)
+    return offsets
 
 
 def _of_one_length(motion: MotionSet) -> Iterator[tuple[np.ndarray, Tensor, Tensor]]:
     """Yield batches of equally long clips: indices in the set, quaternions (B, F, J, 4) and positions (B, F, J, 3)."""
     lengths = np.array([clip.frames for clip in motion])
     for frames in np.unique(lengths):
-        alike = np.flatnonzero(lengths == frames)
-        for some in np.array_split(alike, -(-len(alike) * frames // AT_ONCE)):
-            given = zip(*((motion.clips[n].rotations, motion.clips[n].positions) for n in some), strict=True)
-            turns, positions = (torch.from_numpy(np.stack(each)).double() for each in given)
-            yield some, turns, positions
+        same_length = np.flatnonzero(lengths == frames)
+        for rows in np.array_split(same_length, -(-len(same_length) * frames // AT_ONCE)):
+            arrays = zip(*((motion.clips[n].rotations, motion.clips[n].positions) for n in rows), strict=True)
+            quaternions, positions = (torch.from_numpy(np.stack(array)).double() for array in arrays)
+            yield rows, quaternions, positions
 
 
-def _joined(quaternions: Tensor, place: Tensor) -> Tensor:
+def _join(quaternions: Tensor, root: Tensor) -> Tensor:
     """Concatenate (..., K, 4) and (..., 3) to (..., 4 K + 3)."""
-    return torch.cat([quaternions.flatten(-2), place], -1)
+    return torch.cat([quaternions.flatten(-2), root], -1)
 
 
-def _parted(values: Tensor) -> tuple[Tensor, Tensor]:
+def _split_joined(values: Tensor) -> tuple[Tensor, Tensor]:
     """Split joined values into quaternions (..., K, 4) and positions (..., 3)."""
     return values[..., :-3].unflatten(-1, (-1, 4)), values[..., -3:]
 
 
-def _normed(values: Tensor) -> Tensor:
+def _normalise(values: Tensor) -> Tensor:
     """Normalise the quaternions of joined values in place."""
-    turns, _ = _parted(values)
-    turns /= turns.norm(dim=-1, keepdim=True)
+    quaternions, _ = _split_joined(values)
+    quaternions /= quaternions.norm(dim=-1, keepdim=True)
     return values
 
 
-def _cubic(times: np.ndarray, at: np.ndarray) -> Tensor:
+def _cubic(times: np.ndarray, targets: np.ndarray) -> Tensor:
     """Return the matrix (N, F) that interpolates values at F times to N others by the not-a-knot cubic spline."""
     degree = min(3, len(times) - 1)
     knots = np.concatenate([times[:1].repeat(degree + 1), times[2:-2], times[-1:].repeat(degree + 1)])
     splines = scipy.interpolate.BSpline
-    given, asked = (splines.design_matrix(each, knots, degree, extrapolate=True) for each in (times, at))
-    return torch.from_numpy(scipy.sparse.linalg.splu(given.T.tocsc()).solve(asked.T.toarray()).T)
+    source_matrix, target_matrix = (
+        splines.design_matrix(points, knots, degree, extrapolate=True) for points in (times, targets)
+    )
+    return torch.from_numpy(scipy.sparse.linalg.splu(source_matrix.T.tocsc()).solve(target_matrix.T.toarray()).T)

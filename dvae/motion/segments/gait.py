@@ -118,19 +118,19 @@ def gait_cycles(
     """
     cycles = cycles or Cycles()
     references = reference_cycles(motion, cycles) if references is None else references
-    found = []
+    clips = []
     for clip in motion:
         for side, first, last, cost in find_cycles(clip, motion.skeleton, references, cycles):
-            beside = {"cycle": side, "source": clip.name, "start": str(first), "cost": f"{cost:.3f}"}
+            labels = {"cycle": side, "source": clip.name, "start": str(first), "cost": f"{cost:.3f}"}
             part = clip.between(first, last + 1)
-            found.append(replace(part, name=f"{clip.name}-{side}-{first}", labels={**clip.labels, **beside}))
-    if not found:
+            clips.append(replace(part, name=f"{clip.name}-{side}-{first}", labels={**clip.labels, **labels}))
+    if not clips:
         raise ValueError(
             f"{motion.name or 'this motion'} has no gait cycle of {cycles.shortest:g} to {cycles.longest:g} s whose "
             f"hips are within {cycles.threshold:g} rad of the references; raise the threshold, if people walk in it"
         )
     return MotionSet(
-        found, motion.skeleton, f"{motion.name} cycles".strip(), copy=False, interpretation=motion.interpretation
+        clips, motion.skeleton, f"{motion.name} cycles".strip(), copy=False, interpretation=motion.interpretation
     )
 
 
@@ -147,20 +147,22 @@ def on_common_joints(first: MotionSet, second: MotionSet) -> tuple[MotionSet, Mo
     from ..files.reading import select_joints
 
     shared = [name for name in first.skeleton.names if name in second.skeleton.names]
-    kept = select_joints(first, shared)
-    both = kept, select_joints(second, onto=replace(kept.skeleton, fps=second.skeleton.fps))
+    selected = select_joints(first, shared)
+    both = selected, select_joints(second, onto=replace(selected.skeleton, fps=second.skeleton.fps))
     marked = [
         replace(clip, split=f"{n}{clip.split}", rotations=None) for n, motion in enumerate(both) for clip in motion
     ]
-    loose = MotionSet(marked, replace(kept.skeleton, rest=(), lengths=()), copy=False).loosened()
-    found = []
+    loose = MotionSet(marked, replace(selected.skeleton, rest=(), lengths=()), copy=False).loosened()
+    motions = []
     for n, motion in enumerate(both):
         clips = [replace(clip, split=clip.split[1:]) for clip in loose if clip.split[0] == str(n)]
-        own = replace(loose.skeleton, fps=motion.skeleton.fps, name=motion.skeleton.name)
-        found.append(
-            MotionSet(clips, own, motion.name, copy=False, skipped=motion.skipped, interpretation=motion.interpretation)
+        skeleton = replace(loose.skeleton, fps=motion.skeleton.fps, name=motion.skeleton.name)
+        motions.append(
+            MotionSet(
+                clips, skeleton, motion.name, copy=False, skipped=motion.skipped, interpretation=motion.interpretation
+            )
         )
-    return found[0].with_rotations(), found[1].with_rotations()
+    return motions[0].with_rotations(), motions[1].with_rotations()
 
 
 def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference], cycles: Cycles) -> list[Found]:
@@ -170,14 +172,14 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
         ValueError: the clip has no rotations, or the rate of a reference differs from `cycles.rate`.
     """
     compared, ratio = _at_rate(clip, skeleton.fps, cycles.rate)
-    turned = _turned(compared, skeleton)
-    hips, bent = _hips(turned), _bent(turned, skeleton)
+    thighs = _thigh_rotations(compared, skeleton)
+    hips, angles = _hip_quaternions(thighs), _thigh_angles(thighs, skeleton)
     longest = min(int(cycles.longest * cycles.rate + 1e-6) + 1, len(hips))
     shortest = int(np.ceil(cycles.shortest * cycles.rate - 1e-6)) + 1
-    swings = _deviations(bent[:, 0] - bent[:, 1], longest) >= cycles.swing
-    possible = swings & (_open(hips, longest) <= cycles.threshold)
+    swings = _deviations(angles[:, 0] - angles[:, 1], longest) >= cycles.swing
+    possible = swings & (_end_distances(hips, longest) <= cycles.threshold)
     possible[:, : shortest - 1] = False
-    found = []
+    found_cycles = []
     for reference in references:
         if reference.rate != cycles.rate:
             raise ValueError(
@@ -185,12 +187,12 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
             )
         if not possible.any():
             continue  # true for most clips; skips the expensive costs
-        costs = subsequence_costs(_apart(reference.hips, hips), longest)
+        costs = subsequence_costs(_distances(reference.hips, hips), longest)
         costs[~possible] = np.inf
-        for first, frames in _cheapest(costs, cycles.threshold, cycles.overlap):
-            start, end = (min(round(place * ratio), clip.frames - 1) for place in (first, first + frames))
-            found.append(Found(reference.side, start, end, float(costs[first, frames])))
-    return sorted(found, key=lambda each: (each.first, each.side))
+        for first, frames in _select_cheapest(costs, cycles.threshold, cycles.overlap):
+            start, end = (min(round(frame * ratio), clip.frames - 1) for frame in (first, first + frames))
+            found_cycles.append(Found(reference.side, start, end, float(costs[first, frames])))
+    return sorted(found_cycles, key=lambda each: (each.first, each.side))
 
 
 def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[Reference, Reference]:
@@ -204,25 +206,26 @@ def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[R
         ValueError: no walk is regular enough for two cycles.
     """
     cycles = cycles or Cycles()
-    walked: tuple[list[tuple[np.ndarray, Clip]], ...] = ([], [])
-    best = -np.inf
+    candidates: tuple[list[tuple[np.ndarray, Clip]], ...] = ([], [])
+    most_regular = -np.inf
     for clip in [clip for clip in motion if clip.split == "train"] or motion:
         compared, _ = _at_rate(clip, motion.skeleton.fps, cycles.rate)
-        turned = _turned(compared, motion.skeleton)
-        bent = _bent(turned, motion.skeleton)
-        regular, period = _regularity(bent[:, 0] - bent[:, 1], cycles)
-        best = max(best, regular)
+        thighs = _thigh_rotations(compared, motion.skeleton)
+        angles = _thigh_angles(thighs, motion.skeleton)
+        regular, period = _regularity(angles[:, 0] - angles[:, 1], cycles)
+        most_regular = max(most_regular, regular)
         if regular >= cycles.regular:
-            hips = _hips(turned)
-            for own, angle in zip(walked, bent.T, strict=True):
-                own += [(hips[first : last + 1], clip) for first, last in _between_peaks(angle, period)]
-    if not all(walked):
+            hips = _hip_quaternions(thighs)
+            for cycles_of_side, angle in zip(candidates, angles.T, strict=True):
+                cycles_of_side += [(hips[first : last + 1], clip) for first, last in _between_peaks(angle, period)]
+    if not all(candidates):
         raise ValueError(
-            f"no clip of {motion.name or 'this motion'} has legs that swing by at least {cycles.swing:g} rad, twice "
-            f"and alike (at best {max(best, 0):.2f}, expected {cycles.regular:g} of 2), {cycles.shortest:g} to "
-            f"{cycles.longest:g} s each; give references= of walking people, or lower `regular` or `swing`"
+            f"no clip of {motion.name or 'this motion'} is a regular walk, with thighs that swing by at least "
+            f"{cycles.swing:g} rad, a period of {cycles.shortest:g} to {cycles.longest:g} s and a regularity from "
+            f"{cycles.regular:g} (best: {max(most_regular, 0):.2f}); give references= of walking people, or lower "
+            "`regular` or `swing`"
         )
-    left, right = (_typical(own) for own in walked)
+    left, right = (_most_typical(cycles_of_side) for cycles_of_side in candidates)
     return (
         Reference("left", left[0], cycles.rate, left[1].key),
         Reference("right", right[0], cycles.rate, right[1].key),
@@ -236,18 +239,18 @@ def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], fram
     """
 
     def even(hips: np.ndarray) -> np.ndarray:
-        at = np.linspace(0, len(hips) - 1, frames)
+        positions = np.linspace(0, len(hips) - 1, frames)
         values = continuous(torch.from_numpy(hips)).numpy()
-        before = np.minimum(at.astype(int), len(hips) - 2)
-        part = (at - before)[:, None, None]
+        before = np.minimum(positions.astype(int), len(hips) - 2)
+        part = (positions - before)[:, None, None]
         between = (1 - part) * values[before] + part * values[before + 1]
-        found: np.ndarray = between / np.linalg.norm(between, axis=-1, keepdims=True)
-        return found
+        quaternions: np.ndarray = between / np.linalg.norm(between, axis=-1, keepdims=True)
+        return quaternions
 
-    own = even(_hips(_turned(clip, skeleton)))
-    warped = [alignment(_apart(even(reference.hips), own)) for reference in references]
-    places, _ = min(warped, key=lambda each: each[1])
-    return places * ((clip.frames - 1) / (frames - 1))
+    hips_of_clip = even(_hip_quaternions(_thigh_rotations(clip, skeleton)))
+    warped = [alignment(_distances(even(reference.hips), hips_of_clip)) for reference in references]
+    aligned, _ = min(warped, key=lambda each: each[1])
+    return aligned * ((clip.frames - 1) / (frames - 1))
 
 
 def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
@@ -288,37 +291,37 @@ def _legs(skeleton: Skeleton) -> list[list[int]]:
     return legs
 
 
-def _turned(clip: Clip, skeleton: Skeleton) -> torch.Tensor:
+def _thigh_rotations(clip: Clip, skeleton: Skeleton) -> torch.Tensor:
     """Return the rotations of both thighs relative to the pelvis, (F, 2, 3, 3)."""
-    found = []
+    rotations_by_side = []
     for *hips, _ in _legs(skeleton):
-        turns = to_matrix(tensor_of(clip.rotations)[:, hips].double(), "quaternion")
-        found.append(reduce(torch.matmul, turns.unbind(1)))
-    return torch.stack(found, 1)
+        rotations = to_matrix(tensor_of(clip.rotations)[:, hips].double(), "quaternion")
+        rotations_by_side.append(reduce(torch.matmul, rotations.unbind(1)))
+    return torch.stack(rotations_by_side, 1)
 
 
-def _hips(turned: torch.Tensor) -> np.ndarray:
+def _hip_quaternions(thighs: torch.Tensor) -> np.ndarray:
     """Return the same rotations as quaternions (F, 2, 4)."""
-    found: np.ndarray = from_matrix(turned, "quaternion").numpy()
-    return found
+    quaternions: np.ndarray = from_matrix(thighs, "quaternion").numpy()
+    return quaternions
 
 
-def _bent(turned: torch.Tensor, skeleton: Skeleton) -> np.ndarray:
+def _thigh_angles(rotations: torch.Tensor, skeleton: Skeleton) -> np.ndarray:
     """Return the forward angles of the left and the right thigh relative to the pelvis, (F, 2) in radians."""
     up = torch.eye(3, dtype=torch.float64)[skeleton.vertical]
     ahead = torch.tensor([0.0, 0.0, 1.0] if skeleton.up == "y" else [0.0, -1.0, 0.0], dtype=torch.float64)
     ahead = rotate_about_up(ahead, skeleton.heading(_resting(skeleton)), skeleton.up)
     knees = skeleton.offsets[[leg[-1] for leg in _legs(skeleton)]]
-    thighs = (turned @ knees[..., None]).squeeze(-1)
-    found: np.ndarray = torch.atan2(thighs @ ahead, -thighs @ up).numpy()
-    return found
+    directions = (rotations @ knees[..., None]).squeeze(-1)
+    angles: np.ndarray = torch.atan2(directions @ ahead, -directions @ up).numpy()
+    return angles
 
 
-def _apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return (M, F) root mean square angles over both hips between quaternions (M, 2, 4) and (F, 2, 4), in radians."""
     cosine = np.abs(np.einsum("mhq,fhq->hmf", first, second)).clip(max=1)
-    found: np.ndarray = np.sqrt(np.square(2 * np.arccos(cosine)).mean(0))
-    return found
+    distances: np.ndarray = np.sqrt(np.square(2 * np.arccos(cosine)).mean(0))
+    return distances
 
 
 def _regularity(swing: np.ndarray, cycles: Cycles) -> tuple[float, int]:
@@ -326,14 +329,14 @@ def _regularity(swing: np.ndarray, cycles: Cycles) -> tuple[float, int]:
 
     A regular angle repeats after a period, and changes its sign after half of it."""
     swing = swing - swing.mean()
-    least = max(2, round(cycles.shortest * cycles.rate))
-    lags = np.arange(least, min(int(cycles.longest * cycles.rate), (len(swing) - 1) // 2) + 1)
+    shortest = max(2, round(cycles.shortest * cycles.rate))
+    lags = np.arange(shortest, min(int(cycles.longest * cycles.rate), (len(swing) - 1) // 2) + 1)
     if not len(lags) or swing.std() < cycles.swing:
         return -np.inf, 0
-    some = np.arange(lags[-1] + 1)
-    pairs = [(swing[: len(swing) - lag], swing[lag:]) for lag in some]
-    alike = np.array([(a @ b) / max(np.sqrt((a @ a) * (b @ b)), 1e-12) for a, b in pairs])
-    scores = alike[lags] - np.interp(lags / 2, some, alike)
+    shifts = np.arange(lags[-1] + 1)
+    pairs = [(swing[: len(swing) - lag], swing[lag:]) for lag in shifts]
+    correlations = np.array([(a @ b) / max(np.sqrt((a @ a) * (b @ b)), 1e-12) for a, b in pairs])
+    scores = correlations[lags] - np.interp(lags / 2, shifts, correlations)
     return float(scores.max()), int(lags[scores.argmax()])
 
 
@@ -346,45 +349,45 @@ def _between_peaks(angle: np.ndarray, period: int) -> list[tuple[int, int]]:
     return [(a, b) for a, b in pairwise(tops) if abs(b - a - period) <= max(period // 8, 1)]
 
 
-def _typical(cycles: Sequence[tuple[np.ndarray, Clip]]) -> tuple[np.ndarray, Clip]:
+def _most_typical(cycles: Sequence[tuple[np.ndarray, Clip]]) -> tuple[np.ndarray, Clip]:
     """Return the cycle with the smallest mean distance from the others, at equal fractions of their durations."""
-    some = cycles[:: -(-len(cycles) // MOST_CYCLES)]
+    candidates = cycles[:: -(-len(cycles) // MOST_CYCLES)]
     share = np.linspace(0, 1, 25)
-    seen = np.stack([hips[np.rint(share * (len(hips) - 1)).astype(int)] for hips, _ in some])
-    cosine = np.abs(np.einsum("athq,bthq->abth", seen, seen)).clip(max=1)
-    far = 2 * np.sqrt(np.square(np.arccos(cosine)).mean(-1)).mean(-1).mean(-1)
-    return some[int(np.argmin(far))]
+    samples = np.stack([hips[np.rint(share * (len(hips) - 1)).astype(int)] for hips, _ in candidates])
+    cosine = np.abs(np.einsum("athq,bthq->abth", samples, samples)).clip(max=1)
+    distances = 2 * np.sqrt(np.square(np.arccos(cosine)).mean(-1)).mean(-1).mean(-1)
+    return candidates[int(np.argmin(distances))]
 
 
 def _deviations(angle: np.ndarray, longest: int) -> np.ndarray:
     """Return (F, K) standard deviations of an angle (F,) over k + 1 frames from s on; 0 if the clip ends earlier."""
     frames = np.arange(len(angle))[:, None] + np.arange(longest + 1)
     sums, squares = (np.pad(np.cumsum(values), (1, longest), mode="edge") for values in (angle, angle**2))
-    many = np.arange(1, longest + 1)
-    mean, square = ((each[frames[:, 1:]] - each[frames[:, :1]]) / many for each in (sums, squares))
+    counts = np.arange(1, longest + 1)
+    mean, square = ((total[frames[:, 1:]] - total[frames[:, :1]]) / counts for total in (sums, squares))
     inside = frames[:, :-1] < len(angle)
     return np.where(inside, np.sqrt(np.maximum(square - mean**2, 0)), 0.0)
 
 
-def _open(hips: np.ndarray, longest: int) -> np.ndarray:
+def _end_distances(hips: np.ndarray, longest: int) -> np.ndarray:
     """Return (F, K) distances between the first and last of k + 1 poses from frame s on; arbitrary after the end."""
     padded = np.concatenate([hips, np.repeat(hips[-1:], longest - 1, axis=0)])
     later = np.lib.stride_tricks.sliding_window_view(padded, longest, axis=0)  # (F, 2, 4, K)
     cosine = np.abs(np.einsum("fhq,fhqk->hfk", hips, later)).clip(max=1)
-    found: np.ndarray = np.sqrt(np.square(2 * np.arccos(cosine)).mean(0))
-    return found
+    distances: np.ndarray = np.sqrt(np.square(2 * np.arccos(cosine)).mean(0))
+    return distances
 
 
-def _cheapest(costs: np.ndarray, threshold: float, overlap: float) -> list[tuple[int, int]]:
+def _select_cheapest(costs: np.ndarray, threshold: float, overlap: float) -> list[tuple[int, int]]:
     """Return starts and lengths of subsequences [s, k] below a threshold, the cheapest first, with limited overlap."""
     starts, lengths = np.nonzero(costs <= threshold)
     order = np.argsort(costs[starts, lengths], kind="stable")
     starts, lengths = starts[order], lengths[order]
-    found = []
+    selected = []
     while len(starts):
         first, frames = int(starts[0]), int(lengths[0])
-        found.append((first, frames))
+        selected.append((first, frames))
         shared = np.minimum(starts + lengths, first + frames) - np.maximum(starts, first)
-        free = shared <= overlap * np.minimum(lengths, frames)
-        starts, lengths = starts[free], lengths[free]
-    return found
+        is_free = shared <= overlap * np.minimum(lengths, frames)
+        starts, lengths = starts[is_free], lengths[is_free]
+    return selected

@@ -64,13 +64,13 @@ class Interpolation:
     @property
     def global_pose(self) -> Tensor:
         """Angle of the root rotation relative to the first step, (B, M) in degrees, averaged over frames."""
-        return self._away(self._unpacked[0][..., [self.timed.skeleton.root], :, :])
+        return self._mean_angle(self._unpacked[0][..., [self.timed.skeleton.root], :, :])
 
     @property
     def local_pose(self) -> Tensor:
         """The same for all other joints with children, relative to their parents, averaged over these joints too."""
         others = [joint for joint in self.timed.turning if joint != self.timed.skeleton.root]
-        return self._away(self._unpacked[0][..., others, :, :])
+        return self._mean_angle(self._unpacked[0][..., others, :, :])
 
     @property
     def measures(self) -> Mapping[str, Tensor]:
@@ -98,10 +98,10 @@ class Interpolation:
             pair: index of the pair.
             fps: frames per second; default: the rate of the training data.
         """
-        made = self.timed.back({WHOLE: self.x[pair], OFFSETS: self.body.offsets(self.shape[pair])}, fps)
-        names = [f"step-{n:02d}" for n in range(len(made))]
-        clips = [replace(clip, name=name) for clip, name in zip(made, names, strict=True)]
-        return replace(made, clips=clips, name="interpolation")
+        motion = self.timed.back({WHOLE: self.x[pair], OFFSETS: self.body.offsets(self.shape[pair])}, fps)
+        names = [f"step-{n:02d}" for n in range(len(motion))]
+        clips = [replace(clip, name=name) for clip, name in zip(motion, names, strict=True)]
+        return replace(motion, clips=clips, name="interpolation")
 
     def vertices(self, pair: int = 0) -> Tensor:
         """Return surfaces (M, N, V, 3) of a pair in metres."""
@@ -111,10 +111,12 @@ class Interpolation:
     def _unpacked(self) -> tuple[Tensor, Tensor, Tensor]:
         return self.timed.unpack(self.x)
 
-    def _away(self, turns: Tensor) -> Tensor:
+    def _mean_angle(self, rotations: Tensor) -> Tensor:
         """Return the mean angle (B, M) in degrees of rotations (B, M, N, K, 3, 3) relative to the first step."""
-        apart = (turns - turns[:, :1]).flatten(-2).norm(dim=-1)  # 2 sqrt(2) sin(angle / 2), accurate for small angles
-        angle = 2 * torch.asin((apart / 8**0.5).clamp(max=1))
+        distances = (
+            (rotations - rotations[:, :1]).flatten(-2).norm(dim=-1)
+        )  # 2 sqrt(2) sin(angle / 2), accurate for small angles
+        angle = 2 * torch.asin((distances / 8**0.5).clamp(max=1))
         return angle.mean((-2, -1)).rad2deg()
 
 
@@ -132,8 +134,8 @@ def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any],
     """
     if steps < 2 or len(first[WHOLE]) != len(second[WHOLE]):
         raise ValueError(
-            f"expected at least 2 steps between as many segments as others, got {steps} between {len(first[WHOLE])} "
-            f"and {len(second[WHOLE])}"
+            f"expected at least 2 steps and two batches of the same size, got {steps} steps, and "
+            f"{len(first[WHOLE])} and {len(second[WHOLE])} segments"
         )
     with seeded_evaluation(model, 0):
         ends = [on_device_of(model, batch) for batch in (first, second)]
@@ -159,9 +161,9 @@ def transfer(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
         x (B, N, D).
     """
     with seeded_evaluation(model, 0):
-        seen = on_device_of(model, batch)
-        found: Tensor = model.decode(model.encode(seen), shape.to(seen[SHAPE]))
-        return found
+        data = on_device_of(model, batch)
+        x: Tensor = model.decode(model.encode(data), shape.to(data[SHAPE]))
+        return x
 
 
 def falls(values: Tensor) -> Tensor:
@@ -191,14 +193,14 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
     names = list(dict.fromkeys(labels))
     if len(names) > 10 * len(MARKERS):
         raise ValueError(f"{len(names)} labels are too many to distinguish; give a label with few values")
-    away = means - means.mean(0)
-    _, spread, axes = torch.linalg.svd(away, full_matrices=False)
-    places, shares = (away @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()
+    centred = means - means.mean(0)
+    _, spread, axes = torch.linalg.svd(centred, full_matrices=False)
+    coordinates, shares = (centred @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()
     columns = -(-len(names) // 20)
     figure = new_figure(5.0 + 1.3 * columns, 4.2)
     panel = figure.subplots()
     for n, name in enumerate(names):
-        first, second = places[np.array([label == name for label in labels]), :2].T
+        first, second = coordinates[np.array([label == name for label in labels]), :2].T
         colour, marker = f"C{n % 10}", MARKERS[n // 10]
         panel.scatter(first, second, s=9, alpha=0.7, label=name or "none", color=colour, marker=marker)
     panel.set_xlabel(f"first axis of z, {shares[0]:.0%} of variance")

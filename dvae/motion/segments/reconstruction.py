@@ -64,8 +64,8 @@ class Reconstruction(Result):
 
     def difference(self, first: str, second: str, score: str = ERROR) -> Score:
         """Return the paired difference of two rows, first minus second, with its standard error, clustered by take."""
-        ours, theirs = (self._row(row)[score] for row in (first, second))
-        return self._score(ours - theirs)
+        first_values, second_values = (self._row(row)[score] for row in (first, second))
+        return self._score(first_values - second_values)
 
     @override
     def table(self) -> Table:
@@ -82,7 +82,7 @@ class Reconstruction(Result):
         table.add_column("median\nmm", justify="right")
         for row, values in self.rows.items():
             scores = self[row]
-            cells = [_shown(scores[name], METRICS[name]) if name in scores else "–" for name in names]
+            cells = [_cell(scores[name], METRICS[name]) if name in scores else "–" for name in names]
             table.add_row(row, *cells, f"{np.median(values[ERROR]):.1f}")
         return table
 
@@ -120,8 +120,8 @@ class Reconstruction(Result):
         return self.rows[row]
 
     def _score(self, values: np.ndarray) -> Score:
-        places = clip_index([(split, take, 0) for split, _, take in self.segments])
-        mean, deviations = linearised(np.array(clip_means(torch.from_numpy(values), places)), places.bincount().numpy())
+        takes = clip_index([(split, take, 0) for split, _, take in self.segments])
+        mean, deviations = linearised(np.array(clip_means(torch.from_numpy(values), takes)), takes.bincount().numpy())
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
 
@@ -142,17 +142,17 @@ class PrincipalComponents:
         """Return the first components of segments, or as many as exist."""
         values = _joined(segments.all())
         mean = values.mean(0)
-        away = values - mean  # (B, N D + S): fewer segments than dimensions
-        _, shares = torch.linalg.eigh((away @ away.T).double())
-        most = max(min(components, len(values) - 1), 1)
-        directions, _ = torch.linalg.qr(away.T @ shares[:, -most:].flip(-1).to(away))
+        centred = values - mean  # (B, N D + S): fewer segments than dimensions
+        _, shares = torch.linalg.eigh((centred @ centred.T).double())
+        count = max(min(components, len(values) - 1), 1)
+        directions, _ = torch.linalg.qr(centred.T @ shares[:, -count:].flip(-1).to(centred))
         return cls(mean, directions)
 
     def __call__(self, batch: Mapping[str, Any]) -> Tensor:
         """Return x (B, N, D), projected on the components."""
         values = _joined(batch) - self.mean
-        near = self.mean + values @ self.directions @ self.directions.T
-        return near[:, : -batch[SHAPE].shape[-1]].view_as(batch[WHOLE])
+        projected = self.mean + values @ self.directions @ self.directions.T
+        return projected[:, : -batch[SHAPE].shape[-1]].view_as(batch[WHOLE])
 
 
 def _joined(batch: Mapping[str, Any]) -> Tensor:
@@ -195,36 +195,38 @@ def reconstruct_segments(
             f"expected at least one model, batch_size from 1 and bound_particles from 0, got {len(models)}, "
             f"{batch_size} and {bound_particles}"
         )
-    seen, remembered = _Seen(segments), None if training is None else _Seen(training)
+    representations, for_training = _Representations(segments), None if training is None else _Representations(training)
     rows: dict[str, dict[str, np.ndarray]] = {}
     linear: dict[tuple[str, int], str] = {}
     with progress_bar(progress) as bar:
 
-        def score(name: str, held: Segments, function: Callable[[Mapping[str, Any]], Mapping[str, Tensor]]) -> None:
-            found = []
-            for part in bar.track(torch.arange(len(held)).split(batch_size), description=name):
-                found.append(function(Batch(held.all()).rows(part)))
-            rows[name] = {key: torch.cat([one[key].cpu() for one in found]).double().numpy() for key in found[0]}
-            if wrong := np.flatnonzero(~np.isfinite(rows[name][ERROR])).tolist():
-                where = "/".join(held.motion.clips[wrong[0]].key)
-                raise FloatingPointError(f"the output of {name} for segment {where} is not finite")
+        def score(name: str, subset: Segments, function: Callable[[Mapping[str, Any]], Mapping[str, Tensor]]) -> None:
+            batches = []
+            for part in bar.track(torch.arange(len(subset)).split(batch_size), description=name):
+                batches.append(function(Batch(subset.all()).rows(part)))
+            rows[name] = {
+                key: torch.cat([batch[key].cpu() for batch in batches]).double().numpy() for key in batches[0]
+            }
+            if invalid := np.flatnonzero(~np.isfinite(rows[name][ERROR])).tolist():
+                segment = "/".join(subset.motion.clips[invalid[0]].key)
+                raise FloatingPointError(f"the output of {name} for segment {segment} is not finite")
 
         for name, model in models.items():
-            held = seen.by(model.timed)
+            test_segments = representations.by(model.timed)
             with seeded_evaluation(model, seed):
-                score(name, held, partial(_scores, model, held, bound_particles))
-            size = model.sizes["z"] + held.schema.size(SHAPE)
-            if remembered is None or (key := (_key(model.timed), size)) in linear:
+                score(name, test_segments, partial(_scores, model, test_segments, bound_particles))
+            size = model.sizes["z"] + test_segments.schema.size(SHAPE)
+            if for_training is None or (key := (_key(model.timed), size)) in linear:
                 continue
             linear[key] = f"PCA of {size}" if f"PCA of {size}" not in rows else f"PCA of {size}, frames of {name}"
-            known = PrincipalComponents.of(remembered.by(model.timed), size)
-            score(linear[key], held, partial(_linear, known, held))
+            components = PrincipalComponents.of(for_training.by(model.timed), size)
+            score(linear[key], test_segments, partial(_linear, components, test_segments))
     keys = [(clip.split, clip.name, clip.labels.get("source", clip.name)) for clip in segments.motion]
     notes = [] if training is None else [f"PCA: components of [chi, beta] of {len(training)} training segments"]
     return Reconstruction(rows, keys, segments.motion.fingerprint(), notes, dict(configs or {}))
 
 
-class _Seen:
+class _Representations:
     """The same segments in the representation of each model; models with the same representation share them."""
 
     def __init__(self, segments: Segments) -> None:
@@ -243,32 +245,32 @@ def _key(timed: TimedFrames) -> str:
     return json.dumps(SegmentSchema({}, timed=timed).config())
 
 
-def _scores(model: Any, held: Segments, particles: int, batch: Mapping[str, Any]) -> dict[str, Tensor]:
+def _scores(model: Any, segments: Segments, particles: int, batch: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return the scores of a batch, (B,) each."""
-    seen = on_device_of(model, batch)
-    found = _errors(held, model.decode(model.encode(seen), seen[SHAPE]).cpu(), batch)
-    terms = SequenceELBO().terms(model, seen)
-    found["ELBO"] = terms.per_frame
+    data = on_device_of(model, batch)
+    scores = _errors(segments, model.decode(model.encode(data), data[SHAPE]).cpu(), batch)
+    terms = SequenceELBO().terms(model, data)
+    scores["ELBO"] = terms.per_frame
     if particles:
-        weighted = iwae_bound(model, seen, particles=particles)
-        found |= {"IWAE bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
-    return found
+        bound = iwae_bound(model, data, particles=particles)
+        scores |= {"IWAE bound": bound.bound / terms.frames, "k-hat": bound.khat}
+    return scores
 
 
-def _linear(known: PrincipalComponents, held: Segments, batch: Mapping[str, Any]) -> dict[str, Tensor]:
+def _linear(components: PrincipalComponents, segments: Segments, batch: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return the errors of principal components."""
-    return _errors(held, known(batch), batch)
+    return _errors(segments, components(batch), batch)
 
 
-def _errors(held: Segments, x: Tensor, batch: Mapping[str, Any]) -> dict[str, Tensor]:
+def _errors(segments: Segments, x: Tensor, batch: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return errors (B,) of frames (B, N, D): of the surface in millimetres, of the duration in milliseconds."""
-    made, theirs = (surfaces_of(held.timed, held.body, frames, batch[SHAPE]) for frames in (x, batch[WHOLE]))
-    lasts = (held.timed.lasts(x) - held.timed.lasts(batch[WHOLE])).abs()
-    return {ERROR: 1000 * vertex_error(made, theirs), DURATION: 1000 * lasts}
+    surfaces, truth = (surfaces_of(segments.timed, segments.body, frames, batch[SHAPE]) for frames in (x, batch[WHOLE]))
+    lasts = (segments.timed.lasts(x) - segments.timed.lasts(batch[WHOLE])).abs()
+    return {ERROR: 1000 * vertex_error(surfaces, truth), DURATION: 1000 * lasts}
 
 
-def _shown(score: Score, metric: Metric) -> str:
+def _cell(score: Score, metric: Metric) -> str:
     decimals = 1 if metric.unit in ("mm", "ms") else 3
     low, high = score.interval()
-    told = "" if math.isnan(low) or metric.unit == "" else f" [{low:.{decimals}f}, {high:.{decimals}f}]"
-    return f"{score.mean:.{decimals}f}{told}"
+    interval = "" if math.isnan(low) or metric.unit == "" else f" [{low:.{decimals}f}, {high:.{decimals}f}]"
+    return f"{score.mean:.{decimals}f}{interval}"

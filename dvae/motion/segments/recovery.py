@@ -59,7 +59,7 @@ UNRELIABLE = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Recovered:
-    """Segments that were recovered.
+    """Completed segments, with draws from the posterior and distances from the observations.
 
     Args:
         found: most probable segments.
@@ -94,57 +94,55 @@ class Recovered:
     def table(self) -> Group:
         """Return the results with their intervals and, below, diagnostics; one row per segment in both tables."""
         timed, draws = self.found.model.timed, len(self.drawn[0])
-        ways = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
+        measures = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
         errors = {f"from\n{name}\nmm": value for name, value in self.away.items()}
-        apart = {"vertex error": "vertex\nerror\nmm", "duration error": "duration\nerror\nms"}
-        errors |= {apart[name]: value for name, value in self.errors.items()}
-        told = (
-            f"[ ]: {100 * LEVEL:g} % of {draws} draws, too narrow where errors are alike or larger than deviations say"
-        )
-        what = _table((*ways, *errors), told)
-        how = _table(
+        titles = {"vertex error": "vertex\nerror\nmm", "duration error": "duration\nerror\nms"}
+        errors |= {titles[name]: value for name, value in self.errors.items()}
+        caption = f"[ ]: {100 * LEVEL:g} % of {draws} draws; too narrow if errors are correlated or exceed deviations"
+        results = _table((*measures, *errors), caption)
+        diagnostics = _table(
             ("left\nnats", "behind\nnats", "bent", "k-hat"),
-            "left: by which the energy would still fall, about 0 where the search has converged\n"
-            "behind: by which other starts arrived above the best\n"
-            "bent: directions in which it is less sure than the prior: no normal\n"
-            f"k-hat: above {UNRELIABLE} the draws, and so intervals, are rough",
+            "left: remaining reduction of the energy, about 0 if the search has converged\n"
+            "behind: energy of the other starts minus the energy of the best\n"
+            "bent: number of directions with less curvature than the prior, where a normal does not fit\n"
+            f"k-hat: above {UNRELIABLE}, draws and intervals are unreliable",
         )
         posterior = self.found.posterior
-        measured = [(measure(self.found.x), measure(self.drawn[0])) for measure in ways.values()]
+        measured = [(measure(self.found.x), measure(self.drawn[0])) for measure in measures.values()]
         for row, key in enumerate(self.keys):
             others = posterior.behind[1:, row].tolist()
-            what.add_row(
+            results.add_row(
                 "/".join(key),
-                *(_with_interval(value[row], drawn[:, row]) for value, drawn in measured),
+                *(_with_interval(value[row], draws_of_measure[:, row]) for value, draws_of_measure in measured),
                 *(f"{1000 * float(value[row]):.1f}" for value in errors.values()),
             )
-            how.add_row(
+            diagnostics.add_row(
                 "/".join(key),
                 _brief(float(posterior.left[row])),
                 " to ".join(dict.fromkeys(map(_brief, others[:1] + others[-1:]))),
                 str(int(posterior.bent[row])),
                 f"{float(self.khat[row]):.2f}",
             )
-        return Group(what, how)
+        return Group(results, diagnostics)
 
     def motion(self, draws: int = 0) -> MotionSet:
         """Return the most probable segments, each followed by some of its draws, as clips.
 
         All clips start at the origin with heading zero."""
         pairs = zip((self.found.x, self.found.shape), self.drawn, strict=True)
-        x, shape = (torch.cat([mode[None], drawn[:draws]]).transpose(0, 1).flatten(0, 1) for mode, drawn in pairs)
+        x, shape = (torch.cat([mode[None], samples[:draws]]).transpose(0, 1).flatten(0, 1) for mode, samples in pairs)
         ends = ["found", *(f"draw-{n:02d}" for n in range(1, draws + 1))]
-        return self._moved(x, shape, [(split, f"{name}-{end}") for split, name in self.keys for end in ends])
+        return self._motion(x, shape, [(split, f"{name}-{end}") for split, name in self.keys for end in ends])
 
     def true_motion(self) -> MotionSet | None:
         """Return the truths, if known, in the same form."""
-        return None if self.truth is None else self._moved(self.truth[WHOLE], self.truth[SHAPE], self.keys)
+        return None if self.truth is None else self._motion(self.truth[WHOLE], self.truth[SHAPE], self.keys)
 
-    def _moved(self, x: Tensor, shape: Tensor, keys: Sequence[tuple[str, str]]) -> MotionSet:
+    def _motion(self, x: Tensor, shape: Tensor, keys: Sequence[tuple[str, str]]) -> MotionSet:
         model = self.found.model
-        made: MotionSet = model.timed.back({WHOLE: x, OFFSETS: model.body.offsets(shape)})
-        named = zip(made, keys, strict=True)
-        return replace(made, clips=[replace(clip, split=split, name=name) for clip, (split, name) in named])
+        motion: MotionSet = model.timed.back({WHOLE: x, OFFSETS: model.body.offsets(shape)})
+        clips = zip(motion, keys, strict=True)
+        return replace(motion, clips=[replace(clip, split=split, name=name) for clip, (split, name) in clips])
 
 
 def recover(
@@ -170,12 +168,12 @@ def recover(
     Raises:
         ValueError: same as `complete`; or a segment has no observations.
     """
-    _check_something(SegmentCompletion(model).read(seen))
-    how: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
-    found = complete(model, seen, **how, seed=seed, progress=progress)
-    bound = found.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
-    away = found.program.away(found.seen, found.posterior.mode[LATENT], found.shape)
-    return Recovered(found, keys, found.draw(DRAWS, seed), bound.khat, away, truth)
+    _check_nonempty(SegmentCompletion(model).read(seen))
+    options: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
+    completed = complete(model, seen, **options, seed=seed, progress=progress)
+    bound = completed.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
+    distances = completed.program.away(completed.seen, completed.posterior.mode[LATENT], completed.shape)
+    return Recovered(completed, keys, completed.draw(DRAWS, seed), bound.khat, distances, truth)
 
 
 def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
@@ -195,24 +193,24 @@ def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
         for name, array in arrays.items():
             if array.dtype.kind not in "fiu" or not array.size:
                 raise ValueError(f"{name} is {array.dtype} {array.shape}, expected numbers")
-        found = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
-        if all(found[name].dim() == 1 for name in (TIMES, FRAMES) if name in found):
-            found = {name: value[None] for name, value in found.items()}
-        for name, value in found.items():
+        observations = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
+        if all(observations[name].dim() == 1 for name in (TIMES, FRAMES) if name in observations):
+            observations = {name: value[None] for name, value in observations.items()}
+        for name, value in observations.items():
             _check_numbers(name, value)
-        _check_something(SegmentCompletion(model).read(found))
+        _check_nonempty(SegmentCompletion(model).read(observations))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return found
+    return observations
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Return arrays of numbers with known names and bounded sizes."""
-    known = (TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE)
+    names = (TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE)
     with archive(path) as members:
-        if unknown := [name for name in members if name not in known]:
-            meant = nearest(unknown[0], known)
-            raise NpyError(f"{unknown[0]!r} is not an observation{meant}; expected some of {', '.join(known)}")
+        if unknown := [name for name in members if name not in names]:
+            hint = nearest(unknown[0], names)
+            raise NpyError(f"{unknown[0]!r} is not an observation{hint}; expected some of {', '.join(names)}")
         if (size := sum(member.size for member in members.values())) > LARGEST:
             raise NpyError(
                 f"it unpacks to {size:,} bytes, at most {LARGEST:,} are read; give fewer moments or segments"
@@ -240,15 +238,15 @@ def _check_numbers(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} has {far:g}; expected parameters of shape, which vary about as N(0, 1)")
 
 
-def _check_something(seen: Mapping[str, Any]) -> None:
+def _check_nonempty(seen: Mapping[str, Any]) -> None:
     """Raise an error if a segment has no observations."""
     kinds = [seen[name].isfinite().flatten(2).any(-1) for name in (SURFACES, POINTS, SPOTS) if name in seen]
     timed = [seen[name].isfinite() for name in (TIMES, FRAMES) if name in seen]
-    some = torch.stack(kinds).any(0) if kinds else torch.stack(timed).all(0)
-    if not (known := some.any(-1)).all():
-        row = int(known.logical_not().nonzero()[0])
+    moments = torch.stack(kinds).any(0) if kinds else torch.stack(timed).all(0)
+    if not (has_observations := moments.any(-1)).all():
+        row = int(has_observations.logical_not().nonzero()[0])
         raise ValueError(
-            f"segment {row} of {len(known)}, counted from 0, has no observations: all is NaN; leave it out"
+            f"segment {row} of {len(has_observations)}, counted from 0, has no observations: all is NaN; leave it out"
         )
 
 
@@ -261,8 +259,8 @@ def _table(columns: Sequence[str], caption: str) -> Table:
     return table
 
 
-def _with_interval(value: Tensor, drawn: Tensor) -> str:
-    low, high = drawn.quantile(drawn.new_tensor([(1 - LEVEL) / 2, (1 + LEVEL) / 2])).tolist()
+def _with_interval(value: Tensor, samples: Tensor) -> str:
+    low, high = samples.quantile(samples.new_tensor([(1 - LEVEL) / 2, (1 + LEVEL) / 2])).tolist()
     return f"{float(value):.2f} [{low:.2f}, {high:.2f}]"
 
 

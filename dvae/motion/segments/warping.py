@@ -38,7 +38,7 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
     ahead = np.full((rows, frames + steps), np.inf)
     for i in range(rows):
         ahead[i, i : i + frames] = local[i]
-    found = np.full((frames, longest), np.inf)
+    costs = np.full((frames, longest), np.inf)
     before, last, now = (np.full((rows + 1, frames), np.inf) for _ in range(3))  # row 0 precedes the reference
     for d in range(steps):
         lo, hi = max(0, d - longest + 1), min(rows, d + 1)
@@ -49,10 +49,10 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
             either = np.minimum(last[lo:hi], last[lo + 1 : hi + 1])
             now[lo + 1 : hi + 1] = np.minimum(either, before[lo:hi] + cost) + cost
         if d >= rows - 1:
-            found[:, d - rows + 1] = now[rows]
+            costs[:, d - rows + 1] = now[rows]
         before, last, now = last, now, before
-    found /= rows + 1 + np.arange(longest)
-    return found
+    costs /= rows + 1 + np.arange(longest)
+    return costs
 
 
 def alignment(local: np.ndarray) -> tuple[np.ndarray, float]:
@@ -75,14 +75,14 @@ def alignment(local: np.ndarray) -> tuple[np.ndarray, float]:
     steps = ((1, 1), (1, 2), (2, 1))
     total = np.full((rows + 2, frames + 2), np.inf)  # two rows and columns before the first
     total[2, 2] = local[0, 0]
-    chosen = np.zeros((rows, frames), int)
+    best_steps = np.zeros((rows, frames), int)
     for i in range(1, rows):
-        ways = [total[i + 2 - di, 2 - dj : frames + 2 - dj] + local[i] * max(di, dj) for di, dj in steps]
-        chosen[i] = np.argmin(ways, axis=0)
-        total[i + 2, 2:] = np.min(ways, axis=0)
+        totals = [total[i + 2 - di, 2 - dj : frames + 2 - dj] + local[i] * max(di, dj) for di, dj in steps]
+        best_steps[i] = np.argmin(totals, axis=0)
+        total[i + 2, 2:] = np.min(totals, axis=0)
     path = [(rows - 1, frames - 1)]
     while path[-1] != (0, 0):
-        (i, j), (di, dj) = path[-1], steps[chosen[path[-1]]]
+        (i, j), (di, dj) = path[-1], steps[best_steps[path[-1]]]
         path.append((i - di, j - dj))
-    at, places = np.array(path[::-1]).T
-    return np.interp(np.arange(rows), at, places), float(local[at, places].mean())
+    rows_on_path, columns = np.array(path[::-1]).T
+    return np.interp(np.arange(rows), rows_on_path, columns), float(local[rows_on_path, columns].mean())

@@ -53,9 +53,9 @@ def test_points_that_are_left_out_or_renamed_are_named(tmp_path):
     assert sorted(read.names) == ["HEAD", "HIP", "LFT", "LFT_2", "LFT_3"]
     np.testing.assert_allclose(read.positions[:, read.names.index("LFT_3")], places[:, 3, :3], rtol=1e-6)
     assert read.notes == [
-        "1 points never seen are left out (GONE)",
+        "1 points never observed are left out (GONE)",
         "2 points without a name are left out (point 7, point 8)",
-        "3 places that are exactly 0, 0, 0 with residual 0 are read as not seen",
+        "3 positions that are exactly 0, 0, 0 with residual 0 are read as missing",
         "another marker LFT is read as LFT_3",
     ]
     assert np.isnan(read.positions).any(2).sum(0)[read.names.index("HEAD")] == 3

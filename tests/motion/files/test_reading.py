@@ -99,7 +99,7 @@ def test_a_joint_rests_where_its_channels_place_it(people, tmp_path):
     path.write_text(placed(text, "LKnee", 1.0))  # a centimetre along each axis, in every other frame
     read = read_motion(path)
     assert (read.clips[0].rotations, read.skeleton.rest) == (None, ())
-    assert "rotations are left out, as a joint moves against the one that it hangs from" in read.interpretation
+    assert "rotations are left out, because a joint moves relative to its parent" in read.interpretation
     path.write_text(placed(text, "LKnee", 0.01))
     assert read_motion(path).clips[0].rotations is not None
 
@@ -190,7 +190,7 @@ def test_who_lies_is_said_and_files_that_say_their_axis_are_turned(people, tmp_p
     tilted = [replace(clip, positions=clip.positions[..., [2, 0, 1]]) for clip in people]  # z up
     save(tmp_path / "a.npz", MotionSet(tilted, WALKER))
     read = read_motion(tmp_path / "a.npz")
-    assert read.interpretation == "heads are above feet along z, not y, which was taken for up in 3 of 3 clips"
+    assert read.interpretation == "heads are above feet along z, but y is assumed to be up in 3 of 3 clips"
     assert read.interpretation in printed(read).replace("\n", " ")
     assert read_motion(tmp_path / "a.npz", up="z").interpretation == ""
     for name, up, clip in (("a", "y", people.clips[0]), ("b", "y", people.clips[1]), ("c", "z", tilted[2])):
@@ -202,7 +202,7 @@ def test_who_lies_is_said_and_files_that_say_their_axis_are_turned(people, tmp_p
         np.testing.assert_allclose(clip.positions[..., 1], own.positions[..., 1], atol=1e-6)
     given = read_motion(tmp_path / "mixed", up="y")
     assert (
-        "heads are above feet along z, not y, which was taken for up in 1 of 3 files, the first a.csv"
+        "heads are above feet along z, but y is assumed to be up in 1 of 3 files, the first a.csv"
         in given.interpretation
     )
 
@@ -231,7 +231,7 @@ def test_files_of_a_folder_are_alike_or_it_is_said_which_is_not(bvh, tmp_path):
     stranger = bvh / "train" / "stranger.bvh"
     text = (bvh / "train" / "person_0000.bvh").read_text()
     for old, new, message in (
-        ("JOINT LShoulder", "JOINT Wing", r"stranger\.bvh: lacks LShoulder and has Wing, other than .*person_0002"),
+        ("JOINT LShoulder", "JOINT Wing", r"stranger\.bvh: does not have LShoulder and has Wing, unlike .*person_0002"),
         ("Frame Time: 0.03333333", "Frame Time: 0.01", r"stranger\.bvh: 100 frames per second, .* has 30"),
         ("MOTION", "", r"stranger\.bvh"),
     ):

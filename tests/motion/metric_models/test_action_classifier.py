@@ -221,7 +221,7 @@ def test_classes_that_it_does_not_know_count_for_fid_alone_and_the_record_says_s
     unknown, used = some.labels("way").count("sideways"), result.basis["classifier way"]
     assert used["unknown"] == unknown > 0
     assert used["weights"] != result.basis["classifier a"]["weights"]
-    assert f"{unknown} of {len(some)} windows are of no class it knows" in " ".join(str(result).split())
+    assert f"{unknown} of {len(some)} windows have a class that it does not know" in " ".join(str(result).split())
     assert f"ACC, FID way: classifier {used['weights'][:12]}" in str(result)
     assert result["real motion"]["ACC way"] == Score(1, 0)
     assert list(result.metrics)[-4:] == ["ACC a", "ACC way", "FID a", "FID way"]

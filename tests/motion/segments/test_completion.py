@@ -11,8 +11,8 @@ from dvae.motion import bodies
 from dvae.motion.segments.completion import (
     Deviations,
     SegmentCompletion,
-    _met,
-    _shrunk,
+    _at_moments,
+    _shrink,
     chamfer,
     complete,
     error_by_time,
@@ -72,19 +72,21 @@ def test_moments_are_met_in_decoded_time(model):
     x = made(model, 2)[2].requires_grad_()
     times = model.timed.times(x)
     for frame in (0, 40, 99):
-        met, reached = _met(model.timed, x, {"times": times[:, [frame]].detach()})
+        met, reached = _at_moments(model.timed, x, {"times": times[:, [frame]].detach()})
         torch.testing.assert_close(met, x[:, [frame]])
         torch.testing.assert_close(reached, times[:, [frame]])
     between = (times[:, [3]] + 2 * times[:, [4]]) / 3
-    torch.testing.assert_close(_met(model.timed, x, {"times": between.detach()})[0], (x[:, [3]] + 2 * x[:, [4]]) / 3)
-    located = _met(model.timed, x, {"frames": torch.full((2, 1), 3 + 2 / 3).double()})
+    torch.testing.assert_close(
+        _at_moments(model.timed, x, {"times": between.detach()})[0], (x[:, [3]] + 2 * x[:, [4]]) / 3
+    )
+    located = _at_moments(model.timed, x, {"frames": torch.full((2, 1), 3 + 2 / 3).double()})
     torch.testing.assert_close(located[0], (x[:, [3]] + 2 * x[:, [4]]) / 3)
     torch.testing.assert_close(located[1], between)
-    after, reached = _met(model.timed, x, {"times": times[:, [-1]].detach() + 0.5})
+    after, reached = _at_moments(model.timed, x, {"times": times[:, [-1]].detach() + 0.5})
     torch.testing.assert_close(after, x[:, [-1]])
     torch.testing.assert_close(reached, times[:, [-1]])
     # the later all frames are, the earlier is the one that is met
-    gradient = torch.autograd.grad(_met(model.timed, x, {"times": between.detach()})[0].sum(), x)[0]
+    gradient = torch.autograd.grad(_at_moments(model.timed, x, {"times": between.detach()})[0].sum(), x)[0]
     assert gradient[..., 1:5, -1].abs().min() > 0
 
 
@@ -180,23 +182,23 @@ def test_known_segments_make_the_prior(model, segments):
     seen = {**simulate_observations(model, x, shape, "markers", frames=[0]), SHAPE: shape}
     how = {"deviations": Deviations(marker=1e6, time=1e6), "descent": BRIEF}
     ours, theirs = (complete(model, seen, known=batch, aggregate=each, **how).posterior for each in (True, False))
-    wide = _shrunk(distribution.mean, distribution.variance.mean(0)).diagonal()
+    wide = _shrink(distribution.mean, distribution.variance.mean(0)).diagonal()
     torch.testing.assert_close(ours.mode["z"], distribution.mean.mean(0).expand(2, -1))
     torch.testing.assert_close(ours.deviation["z"], wide.sqrt().expand(2, -1))
     torch.testing.assert_close(theirs.mode["z"], torch.zeros_like(z))
     torch.testing.assert_close(theirs.deviation["z"], torch.ones_like(z))
 
 
-def test_a_covariance_of_few_is_shrunk():
+def test_a_covariance_of_few_is_shrink():
     """Of 50 with the covariance diag(3, 1), by hand: the share is 4^2 / (50 (10 - 4^2 / 2)) = .16, towards 2."""
-    by_hand = _shrunk(torch.zeros(50, 2), torch.tensor([3.0, 1.0]))
+    by_hand = _shrink(torch.zeros(50, 2), torch.tensor([3.0, 1.0]))
     torch.testing.assert_close(by_hand, torch.tensor([2.84, 1.16]).diag())
     root = torch.randn(6, 6).double() * torch.tensor([2.0, 1, 1, 0.5, 0.5, 0.1])
     truth, none = root @ root.mT, torch.zeros(6).double()
-    assert torch.linalg.eigvalsh(_shrunk(torch.randn(5, 6).double() @ root.mT, none))[0] > 1e-3
+    assert torch.linalg.eigvalsh(_shrink(torch.randn(5, 6).double() @ root.mT, none))[0] > 1e-3
     many = torch.randn(200_000, 6).double() @ root.mT
-    torch.testing.assert_close(_shrunk(many, none), truth, rtol=0, atol=0.02 * float(truth.trace()))
-    torch.testing.assert_close(_shrunk(many[:1], none + 3), 3 * torch.eye(6).double())
+    torch.testing.assert_close(_shrink(many, none), truth, rtol=0, atol=0.02 * float(truth.trace()))
+    torch.testing.assert_close(_shrink(many[:1], none + 3), 3 * torch.eye(6).double())
 
 
 def test_scans_are_uniform_and_errors_are_of_the_time_asked_for(model):

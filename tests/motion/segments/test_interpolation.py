@@ -72,7 +72,7 @@ def test_a_motion_on_another_body_has_its_bones(held, model):
         expected = model.body.offsets(shape)[[child for _, child in clips.skeleton.edges]].norm(dim=-1)
         torch.testing.assert_close(lengths, expected.expand_as(lengths), rtol=0, atol=1e-4)
     for first, second, steps in ((some(held, [0]), some(held, [0]), 1), (some(held, [0]), some(held, [1, 2]), 3)):
-        with pytest.raises(ValueError, match=f"at least 2 steps between as many segments as others, got {steps}"):
+        with pytest.raises(ValueError, match=f"at least 2 steps and two batches of the same size, got {steps}"):
             interpolate(model, first, second, steps)
 
 

@@ -104,13 +104,13 @@ def test_what_is_no_segment_is_refused(people):
     for call, message in (
         (lambda: view.to(bare), r"train/person_0000 has no rotations of joints; MotionSet.with_rotations"),
         (lambda: view.to(replace(people, clips=[people.clips[0].between(4, 5)])), "has 1 frame, expected at least 2"),
-        (lambda: view.to(stranger), "alike brings two sources onto one tree"),
+        (lambda: view.to(stranger), "on_common_joints maps two sources to one tree"),
         (lambda: view.back({"x": torch.zeros(1, 99, 76)}), r"expected \(..., 100, 76\)"),
         (lambda: view.back({"x": lost}), "1 of the numbers of frames are NaN or infinite"),
         (lambda: TimedFrames(replace(skeleton, rest=())), "has no rest pose"),
         (lambda: TimedFrames(replace(skeleton, left=(), right=())), "has no left and right joints"),
         (lambda: TimedFrames(skeleton, mean=(0.0,)), "expected 6 for each of 12 joints"),
-        (lambda: TimedFrames(skeleton, frames=1), "1 frame has no time between frames"),
+        (lambda: TimedFrames(skeleton, frames=1), "frames must be at least 2, got 1"),
         (lambda: TimedFrames.of(people, scaling="centred"), "expected 'identity' or 'deviation'"),
     ):
         with pytest.raises(ValueError, match=message):
