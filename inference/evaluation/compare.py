@@ -106,8 +106,8 @@ def compare(
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
-        >>> found = dvae.compare({"surrogate": model}, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
-        >>> found.ranking
+        >>> result = dvae.compare({"surrogate": model}, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> result.ranking
         ['surrogate']
     """
     if min(particles, estimates, batch_size) < 1 or min(filter_particles, contrasts, samples) < 0:

@@ -118,8 +118,8 @@ class Comparison(Result):
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
         >>> p, sizes = "p(z_t | z_{t-1}) p(x_t | z_t)", {"z": 1, "x": 2}
         >>> models = {name: dvae.linear_gaussian_surrogate(p, q, sizes, 4) for name, q in pairs.items()}
-        >>> found = dvae.compare(models, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
-        >>> found.difference("smooths", "filters").mean, found.ranking  # doctest: +ELLIPSIS
+        >>> result = dvae.compare(models, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> result.difference("smooths", "filters").mean, result.ranking  # doctest: +ELLIPSIS
         (..., [...])
     """
 

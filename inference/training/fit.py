@@ -78,8 +78,8 @@ class Fit:
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
-        >>> found = dvae.fit(model, torch.randn(6, 4, 2), steps=3, log_every=1, progress=False)
-        >>> found.status, found.series("bound")[0]
+        >>> result = dvae.fit(model, torch.randn(6, 4, 2), steps=3, log_every=1, progress=False)
+        >>> result.status, result.series("bound")[0]
         ('finished', [1, 2, 3])
     """
 
