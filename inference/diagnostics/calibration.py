@@ -171,8 +171,8 @@ class Calibration(Result):
             for panel in (top, bottom):
                 panel.tick_params(labelsize=7)
             if column == 0:
-                top.set_ylabel("ranks\nover uniform", fontsize=8)
-                bottom.set_ylabel("ECDF\nless uniform", fontsize=8)
+                top.set_ylabel("ranks\n/ uniform", fontsize=8)
+                bottom.set_ylabel("ECDF\n− uniform", fontsize=8)
         for place in range(len(order), rows * columns):
             row, column = divmod(place, columns)
             panels[2 * row, column].set_axis_off()

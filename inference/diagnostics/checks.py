@@ -117,7 +117,10 @@ def default_statistics(windows: HeldOutWindows) -> dict[str, Statistic]:
     """
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
-        unit, note = "scales", "statistics of all columns together are of numbers in their scales, in the training data"
+        unit, note = (
+            "scales",
+            "statistics of all columns together are in the scales of their columns, from the training data",
+        )
     elif len(units) > 1:
         unit, note = "", f"statistics without a unit mix numbers in {', '.join(unit or '1' for unit in units)}"
     else:
