@@ -125,7 +125,7 @@ def test_bands_are_kept_and_put_around_forecasts(fitted, tmp_path):
     assert again.plot()._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(ValueError, match="bands"):
         bands.apply(forecasts, "futures")
-    with pytest.raises(ValueError, match=r"\(20, B, 4, 2\), not \(19, 500, 4, 2\)"):
+    with pytest.raises(ValueError, match=r"\(20, B, 4, 2\), got \(19, 500, 4, 2\)"):
         bands.apply(forecasts[:19])
     document = bands.document()
     shapes = document["attributes"]
