@@ -48,8 +48,8 @@ def predictive_bound(
         The bound in nats per sequence, and the tail shape of the weights, (B,) each.
 
     Raises:
-        ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or there is no
-            frame to observe or to predict.
+        ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no frame is
+            left to observe or to predict.
     """
     require_likelihood(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:

@@ -103,7 +103,7 @@ class Correction:
     links: tuple[Link, ...]
 
     def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]]) -> Parameters:
-        """Return corrected location and scale (k B, S, D), given those of the guide and the latents by step."""
+        """Return corrected location and scale (k B, S, D), from the guide's parameters and the latents by step."""
         if len(parameters[0]) % len(self.unit):
             raise ValueError(
                 f"this guide was fitted to {len(self.unit)} sequences, but the batch has {len(parameters[0])} rows; "

@@ -391,8 +391,8 @@ def _ranks(
     sites = poutine.trace(infer).get_trace(repeated).nodes
     if missing := [name for name in model.latents if name not in sites]:
         raise ValueError(f"the guide has no site for {', '.join(missing)}; it needs one for each latent")
-    found: dict[str, Any] = {name: sites[name]["value"] for name in model.latents}
-    drawn_values = quantities(repeated, found)
+    draws_of_guide: dict[str, Any] = {name: sites[name]["value"] for name in model.latents}
+    drawn_values = quantities(repeated, draws_of_guide)
     true_values = quantities(batch, {name: truth[name] for name in model.latents})
     return (drawn_values.unflatten(0, (draws, count)) < true_values).sum(0).cpu()
 

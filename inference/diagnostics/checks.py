@@ -232,7 +232,7 @@ class PredictiveChecks(Result):
             "outside: share of windows with a tail area below .05 or above .95",
             f"forecasts of a true model have ½ and, with {self.samples} replicates, {expected:.1%}"
             if self.emission == "drawn"
-            else f"means have no emission noise, so even those of a true model need not have ½ and {expected:.1%}",
+            else f"means have no emission noise, so even a true model need not have ½ and {expected:.1%}",
             *self.notes,
         ]
         table = Table(title=self._title, caption="\n".join(caption))

@@ -489,7 +489,7 @@ def _moments(inferred: Inferred, draws: Tensor) -> LatentMoments:
     flat = values.flatten(0, 1)
     deviation = flat.std(0)
     unit = (flat - flat.mean(0)) / deviation.clamp(min=1e-12)
-    # errors of deviations use the effective number of squares, as that of means is larger: NUTS alternates sides
+    # Errors of deviations use the effective number of squares, because means have a larger one: NUTS alternates sides.
     squares = (values - flat.mean(0)).square() / (2 * deviation.clamp(min=1e-12))
     with np.errstate(invalid="ignore"):  # the error of constant chains is NaN
         errors = [array_stats.mcse(each.numpy(), chain_axis=0, draw_axis=1) for each in (values, squares)]

@@ -162,7 +162,7 @@ class Comparison(Result):
     def pairs(self, metric: str = "IWAE bound") -> Pairs:
         """Return all paired differences in a metric, with p-values adjusted for their number.
 
-        See `multiple_comparisons.pairs`.
+        `multiple_comparisons.pairs` describes the adjustment.
 
         Raises:
             KeyError: when a model has no such metric.
@@ -189,7 +189,7 @@ class Comparison(Result):
     def required(self, first: str, second: str, metric: str = "IWAE bound", **options: Any) -> Requirement:
         """Return how many training seeds and clips would distinguish two models.
 
-        Options are those of `multiple_comparisons.required`.
+        `multiple_comparisons.required` has the same options.
 
         Raises:
             KeyError: as `difference`.

@@ -48,7 +48,7 @@ def clustered_variance(deviations: np.ndarray) -> float:
 
 
 def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) -> int:
-    """Return the number of independent draws whose histogram is as uncertain as that of draws dependent within clips.
+    """Return the number of independent draws with the same uncertainty of histograms as draws dependent within clips.
 
     The number is one over the root mean square of v / (p (1 - p)) over shares p, with v the clustered variance of the
     observed share. For N independent draws this ratio is 1 / N. With the mean instead of the root mean square, this is

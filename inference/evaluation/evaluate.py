@@ -300,7 +300,7 @@ def _references(
 
 
 def forecaster_of(model: Any, held: EvaluationWindows, samples: int, options: Mapping[str, Any]) -> Forecaster:
-    """Return the function from a slice of windows to a model's K futures; `options` are those of its `forecast`."""
+    """Return the function from a slice of windows to a model's K futures, with `options` for its `forecast`."""
     horizon = held.futures.shape[1]
     return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
 

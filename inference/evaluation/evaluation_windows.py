@@ -73,7 +73,7 @@ class EvaluationWindows:
 
     @property
     def notes(self) -> list[str]:
-        """Notes on missing values; empty if there are none."""
+        """Notes on missing values; empty if all values were observed."""
         return [
             f"{shares['past']:.1%} of the past values and {shares['future']:.1%} of the future values were observed; "
             "scores use only these"

@@ -12,9 +12,9 @@ expectations over V, without draws. Their values for calibrated forecasts are ex
 
 Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`; the result
 has the leading shape `(...)`. Functions accept torch tensors and numpy arrays and return a tensor. NaN in a truth was
-not observed and is ignored, as is a frame without observations. The value for a data set is the plain mean over its
-windows. Every function raises ValueError for shapes that do not fit. Windows are scored one after another, so memory
-does not grow with their number.
+not observed and is ignored. Frames without observations are ignored, too. The value for a data set is the plain mean
+over its windows. Every function raises ValueError for shapes that do not fit. Windows are scored one after another, so
+memory does not grow with their number.
 """
 
 import math
@@ -357,7 +357,7 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
     """Return the Fréchet distance between features of true and generated windows, as jackknife pseudo-values of clips.
 
-    See `jackknife_pseudo_values`.
+    `jackknife_pseudo_values` defines these values.
 
     Args:
         real: features `(N, F)` of the true futures.
@@ -391,7 +391,7 @@ def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> t
 def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """Return means (1 + C, F) and covariances (1 + C, F, F) of features (N, K, F).
 
-    The first are of all windows, the others of all windows except those of one of C > 1 clips.
+    The first are of all windows; each of the others omits the windows of one of C > 1 clips.
     """
 
     def sums(values: Tensor) -> Tensor:
@@ -448,7 +448,7 @@ def displacement(samples: Tensor, truth: Tensor) -> Tensor:
 def mean_pairwise_distance(samples: Tensor) -> Tensor:
     """Return the mean distance over pairs of (K, T, D), each a vector of T * D numbers."""
     rows = samples.flatten(1)
-    if rows.isnan().any():  # the mean square over common numbers stands for all; NaN if no two samples share any
+    if rows.isnan().any():  # scale the mean square over common numbers to all; NaN if no two samples share any
         squares = [(rows[k + 1 :] - row).square().nanmean(1) for k, row in enumerate(rows[:-1])]
         return (rows.shape[1] * torch.cat(squares)).sqrt().nanmean()
     return torch.pdist(rows).mean() if len(rows) > 1 else samples.new_zeros(())

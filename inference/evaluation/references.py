@@ -225,7 +225,7 @@ class References:
 
     @property
     def usual(self) -> list[str]:
-        """Available default rows of an evaluation: those that the windows name, or else those of their kind."""
+        """Available default rows of an evaluation: the names in the windows, or else the rows for their kind."""
         names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
         return [name for name in names if not self.missing_requirement(name)]
 

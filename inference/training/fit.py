@@ -353,7 +353,7 @@ def _fit(
 def _observed(model: nn.Module, validation: Any) -> int | None:
     """Return the number of observed steps of validation windows with a horizon.
 
-    Return None if there is no horizon, or if the model's bound is not of the original data.
+    Return None without a horizon, or if the model's bound is not of the original data.
     """
     if not isinstance(model, DynamicalVAE) or not model.likelihood or model.view.measured:
         return None

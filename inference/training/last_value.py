@@ -6,9 +6,9 @@ v_h is the mean square of x_{t+h} - x_t over training windows, for each coordina
 past, the reference is this density given all steps before t.
 
 A model trained with scheduled sampling reads its own means. Its reference uses the mean and variance over training
-windows for observed steps, and the last observed value as x_s for all future steps. The probability of a discrete value
-is that of the interval around it. The probability of a class is that of no change, or of any change divided equally
-among the other classes.
+windows for observed steps, and the last observed value as x_s for all future steps. A discrete value has the
+probability of the interval around it. The last class has the probability of no change, and all other classes share the
+rest equally.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _spreads(x: Tensor, mask: Tensor, classes: Sequence[list[int]], discrete: Te
     """Return the mean (D,) and standard deviations (T, D).
 
     Row 0 is for deviations from the mean, row h for differences over h steps. For a class variable, the first
-    coordinate instead contains the probability of each class in row 0, and that of no change in later rows.
+    coordinate instead contains the probability of each class in row 0, and the probability of no change in later rows.
     """
     count = mask.sum((0, 1)).clamp(min=1)
     mean = x.sum((0, 1)) / count

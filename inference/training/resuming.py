@@ -85,7 +85,7 @@ def restore(svi: SVI, run: Run) -> None:
     # Copy, because set_state reads the whole storage: a view would return another row's bytes, or crash.
     random = {name: value[svi.fabric.global_rank].clone() for name, value in parts["random"].items()}
     try:
-        # Options such as weight_decay are those of this fit, not of the checkpoint.
+        # Options such as weight_decay come from this fit, not from the checkpoint.
         options = svi.optimizer.state_dict()["param_groups"]
         svi.optimizer.load_state_dict({"state": moments, "param_groups": options})
         svi.generator.set_state(random.pop("generator"))
@@ -133,7 +133,7 @@ def _moments(svi: SVI, run: Run, tensors: Mapping[str, Tensor]) -> dict[int, dic
     """Return the state of the optimiser by index of the parameter.
 
     Raises:
-        CheckpointError: when the state cannot be that of the optimiser for this model at the run's step.
+        CheckpointError: when the optimiser cannot have had this state for this model at the run's step.
     """
     indices = {str(index): index for index in range(len(svi.parameters))}
     moments: dict[int, dict[str, Tensor]] = {}

@@ -2,7 +2,7 @@
 
 A row maps names to numbers, in nats per frame. `bound`, `log_likelihood/x` and `kl/z` are of a training batch, and with
 the prefix `validation/` of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling` are
-of the step, as is `weight/x` if an objective has adaptive weights.
+of the step; so is `weight/x` for an objective with adaptive weights.
 """
 
 import io
