@@ -197,7 +197,7 @@ class Balance:
         tasks = self.objective.tasks
         weights, first = (torch.stack([state[f"{name}/{task}"] for task in tasks]) for name in ("weight", "first"))
         if not (weights > 0).all() or abs(weights.sum() - len(tasks)) > 1e-6:
-            raise ValueError(f"the weights of {', '.join(tasks)} must be positive and have the sum {len(tasks)}")
+            raise ValueError(f"the weights of {', '.join(tasks)} must be positive numbers with the sum {len(tasks)}")
         self.weights, self.first = weights, first
 
     def _gradient(self, task: str, loss: Tensor) -> Tensor:

@@ -134,7 +134,7 @@ class SVI:
     def state(self) -> State:
         """State of the run, after `init`."""
         if self._state is None:
-            raise RuntimeError("the run has no state yet; call init() first")
+            raise RuntimeError("the run has not begun; call init() first")
         return self._state
 
     @property
