@@ -1,4 +1,4 @@
-"""Bounds, the shared loop, forecasting, evaluation and comparison."""
+"""Bounds, training, evaluation, comparison and diagnostics of models."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Bounds of the evidence and their terms."""
+"""Bounds on the log evidence and their terms."""
 
 from typing import TYPE_CHECKING
 

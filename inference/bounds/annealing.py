@@ -12,7 +12,7 @@ there and run back to the guide give weights whose mean inverse is unbiased for 
 Monte Carlo: Grosse, Ghahramani and Adams, 2015, arXiv 1511.02543). On average the evidence lies between the two. Their
 gap on simulated data shows how reliable the lower bound is on real data for a similar model.
 
-Transitions are Hamiltonian, with all chains of all sequences as the rows of one batch. Coordinates are in the guide's
+Transitions are Hamiltonian. All chains of all sequences are the rows of one batch. Coordinates are in the guide's
 standard deviations. Separate chains tune the step sizes for each sequence and temperature, which then stay fixed.
 Chains that adapt their own step sizes would not leave f_b invariant.
 """
@@ -93,8 +93,8 @@ def annealed_bound(
         temperatures: L, number of temperatures.
         chains: K, number of chains per sequence.
         leaps: number of leapfrog steps of a transition, each a gradient of model and guide.
-        latents: exact draws (B, ...) from the posterior by name, such as the latents of simulated data; the chains then
-            run from these to the guide, and the bound is an upper one.
+        latents: exact draws (B, ...) from the posterior by name, such as the latents of simulated data; the chains the
+            chains then run from these to the guide and give an upper bound.
         seed: seed of the chains.
         chunk: largest number of sequences times chains in memory.
         progress: whether to show a bar.
@@ -110,8 +110,8 @@ def annealed_bound(
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> x = model.sample(3, 4)["x"]
-        >>> found = dvae.annealed_bound(model, x, temperatures=50)
-        >>> bool((found.bound - dvae.Oracle(model, 4).evidence(x)).abs().max() < 1.0)
+        >>> result = dvae.annealed_bound(model, x, temperatures=50)
+        >>> bool((result.bound - dvae.Oracle(model, 4).evidence(x)).abs().max() < 1.0)
         True
     """
     if min(temperatures, chains, leaps, chunk) < 1:
@@ -126,18 +126,18 @@ def annealed_bound(
         raise ValueError("sequences of a group have no separate evidence; remove 'group' from the batch")
     size = require_data(model, data)
     if not size:
-        raise ValueError("the batch holds no sequences")
-    given = None if latents is None else _exact(model, data, latents)
+        raise ValueError("the batch has no sequences; expected at least one")
+    start_latents = None if latents is None else _exact(model, data, latents)
     at_once = max(1, chunk // chains)
-    found = []
+    results = []
     with seeded_evaluation(model, seed), progress_bar(progress) as bar:
         for first in bar.track(range(0, size, at_once), description="annealing"):
             part = slice(first, first + at_once)
-            start = None if given is None else {name: value[part] for name, value in given.items()}
-            some = data.rows(part)
-            lengths = _Annealing(model, some, temperatures, min(chains, TRIED), leaps).lengths()
-            found.append(_Annealing(model, some, temperatures, chains, leaps).run(lengths, start))
-    bound, error, effective, accepted = (torch.cat(parts) for parts in zip(*found, strict=True))
+            start = None if start_latents is None else {name: value[part] for name, value in start_latents.items()}
+            sequences = data.rows(part)
+            step_sizes = _Annealing(model, sequences, temperatures, min(chains, TRIED), leaps).step_sizes()
+            results.append(_Annealing(model, sequences, temperatures, chains, leaps).run(step_sizes, start))
+    bound, error, effective, accepted = (torch.cat(parts) for parts in zip(*results, strict=True))
     return AnnealedBound(bound, error, effective, accepted, chains, temperatures)
 
 
@@ -147,17 +147,17 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, A
     Raises:
         ValueError: when a latent is missing, or has another shape.
     """
-    if lacking := [name for name in model.latents if name not in latents]:
-        raise ValueError(f"reverse chains need start values of all latents; missing are {', '.join(lacking)}")
+    if missing := [name for name in model.latents if name not in latents]:
+        raise ValueError(f"reverse chains need start values of all latents; missing are {', '.join(missing)}")
     first = data[model.observed[0]]
-    found = {}
+    values = {}
     for name in model.latents:
-        found[name] = torch.as_tensor(latents[name]).to(like(model))
+        values[name] = torch.as_tensor(latents[name]).to(like(model))
         steps = first.shape[1:2] if model.generative.local(name) else ()
         expected = (len(first), *steps, model.sizes[name])
-        if found[name].shape != expected:
-            raise ValueError(f"the latent {name} has shape {tuple(found[name].shape)}, expected {tuple(expected)}")
-    return found
+        if values[name].shape != expected:
+            raise ValueError(f"the latent {name} has shape {tuple(values[name].shape)}, expected {tuple(expected)}")
+    return values
 
 
 class _Annealing:
@@ -171,41 +171,41 @@ class _Annealing:
         self.levels = range(1, temperatures)
         draws = [model.guide(self.data) for _ in range(math.ceil(DRAWS / chains))]
         self.like = {name: draws[0][name] for name in model.latents}
-        drawn = torch.stack([self._joined(each) for each in draws]).unflatten(1, (chains, -1))
-        self.scale = drawn.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
+        flat = torch.stack([self._flattened(draw) for draw in draws]).unflatten(1, (chains, -1))
+        self.scale = flat.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
 
-    def lengths(self) -> dict[int, Tensor]:
-        """Return step sizes (B,) at each temperature, tuned by chains that are used for nothing else."""
-        points = self._joined(self.model.guide(self.data))
-        step, found = points.new_full((len(points) // self.chains,), FIRST), {}
+    def step_sizes(self) -> dict[int, Tensor]:
+        """Return step sizes (B,) for each temperature, tuned by separate chains."""
+        points = self._flattened(self.model.guide(self.data))
+        step, step_sizes = points.new_full((len(points) // self.chains,), FIRST), {}
         for level in self.levels:
             points, accepted, _ = self._move(points, float(self.inverse[level]), step)
             step = (step * torch.exp(accepted - ACCEPTED)).clamp(LEAST, MOST)
-            found[level] = step
-        return found
+            step_sizes[level] = step
+        return step_sizes
 
     def run(
-        self, lengths: Mapping[int, Tensor], start: Mapping[str, Tensor] | None
+        self, step_sizes: Mapping[int, Tensor], start: Mapping[str, Tensor] | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return bound, error, effective number and acceptance, (B,) each; with a start, of reverse chains."""
+        """Return bound, error, effective number of chains and acceptance rate, (B,) each; reverse if `start`."""
         back = start is not None
-        points = self._joined(self.model.guide(self.data) if start is None else repeat(start, self.chains))
-        weights, rate = points.new_zeros(len(points)), []
-        gaps = self.inverse.diff().to(points)
-        for level in [*reversed(self.levels), 0] if back else [*self.levels, len(gaps)]:
-            if level in lengths:
-                points, accepted, ratio = self._move(points, float(self.inverse[level]), lengths[level])
-                rate.append(accepted)
-            else:  # at the end, without a transition
-                joint, own = self._densities(points)
-                ratio = joint - own
-            weights += gaps[level if back else level - 1] * ratio
+        points = self._flattened(self.model.guide(self.data) if start is None else repeat(start, self.chains))
+        weights, rates = points.new_zeros(len(points)), []
+        increments = self.inverse.diff().to(points)
+        for level in [*reversed(self.levels), 0] if back else [*self.levels, len(increments)]:
+            if level in step_sizes:
+                points, accepted, ratio = self._move(points, float(self.inverse[level]), step_sizes[level])
+                rates.append(accepted)
+            else:  # the last level has no transition
+                log_joint, log_guide = self._densities(points)
+                ratio = log_joint - log_guide
+            weights += increments[level if back else level - 1] * ratio
         log_weights = weights.unflatten(0, (self.chains, -1)) * (-1 if back else 1)
         bound = log_weights.logsumexp(0) - math.log(self.chains)
         shares = (log_weights - log_weights.amax(0)).exp()
         effective = shares.sum(0).square() / shares.square().sum(0)
         spread = shares.std(0) / shares.mean(0) / math.sqrt(self.chains) if self.chains > 1 else bound * math.nan
-        accepted = torch.stack(rate).mean(0) if rate else torch.ones_like(bound)
+        accepted = torch.stack(rates).mean(0) if rates else torch.ones_like(bound)
         if back:
             return -bound, bound * math.nan, bound * math.nan, accepted
         return bound, spread, effective, accepted
@@ -219,36 +219,35 @@ class _Annealing:
             step: step sizes (B,), in the guide's standard deviations.
 
         Returns:
-            Points (R, N); the acceptance rate (B,); and log p(x, z) - log q(z | x), (R,), at the points before the
-            move.
+            Points (R, N), acceptance rate (B,), and log p(x, z) - log q(z | x) at the points before the move, (R,).
         """
         length = step.repeat(self.chains)[:, None]
         momentum = torch.randn_like(points)
         before, slope, weight = self._slope(points, inverse)
-        moved, kicked = points, momentum + 0.5 * length * self.scale * slope
+        proposal, new_momentum = points, momentum + 0.5 * length * self.scale * slope
         for leap in range(self.leaps):
-            moved = moved + length * self.scale * kicked
-            after, slope, _ = self._slope(moved, inverse)
-            kicked = kicked + (0.5 if leap == self.leaps - 1 else 1.0) * length * self.scale * slope
-        ratio = after - before - 0.5 * (kicked.square() - momentum.square()).sum(1)
-        chance = ratio.nan_to_num(-math.inf).clamp(max=0).exp()
-        taken = torch.rand_like(chance) < chance
-        points = torch.where(taken[:, None], moved, points)
-        return points, chance.unflatten(0, (self.chains, -1)).mean(0), weight
+            proposal = proposal + length * self.scale * new_momentum
+            after, slope, _ = self._slope(proposal, inverse)
+            new_momentum = new_momentum + (0.5 if leap == self.leaps - 1 else 1.0) * length * self.scale * slope
+        ratio = after - before - 0.5 * (new_momentum.square() - momentum.square()).sum(1)
+        acceptance = ratio.nan_to_num(-math.inf).clamp(max=0).exp()
+        accepted = torch.rand_like(acceptance) < acceptance
+        points = torch.where(accepted[:, None], proposal, points)
+        return points, acceptance.unflatten(0, (self.chains, -1)).mean(0), weight
 
     def _slope(self, points: Tensor, inverse: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return log f_b (R,), its gradient (R, N), and log p(x, z) - log q(z | x), (R,)."""
         # cuDNN has no gradients of recurrent networks in evaluation mode
         with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False):
             points = points.detach().requires_grad_()
-            joint, own = self._densities(points)
-            tempered = (1 - inverse) * own + inverse * joint
+            log_joint, log_guide = self._densities(points)
+            tempered = (1 - inverse) * log_guide + inverse * log_joint
             (slope,) = torch.autograd.grad(tempered.sum(), points)
-        return tempered.detach(), slope.nan_to_num(), (joint - own).detach()
+        return tempered.detach(), slope.nan_to_num(), (log_joint - log_guide).detach()
 
     def _densities(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return log p(x, z) and log q(z | x), (R,) each."""
         return joint_and_guide(self.model, self.data, split(points, self.like))
 
-    def _joined(self, values: Mapping[str, Tensor]) -> Tensor:
+    def _flattened(self, values: Mapping[str, Tensor]) -> Tensor:
         return joined({name: values[name] for name in self.model.latents})

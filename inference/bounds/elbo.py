@@ -59,7 +59,7 @@ class Terms:
 
     @property
     def likelihood(self) -> bool:
-        """Whether there is a likelihood; if energies replace it, `bound` is minus the KL terms."""
+        """Whether the model has a likelihood; if energies replace it, `bound` is minus the KL terms."""
         return bool(self.log_likelihood)
 
     @property
@@ -80,9 +80,8 @@ class SequenceELBO(ELBO):
     It can be used like any Pyro ELBO; `terms` returns it by variable and sequence. The KL of a latent is analytic per
     step if both conditionals are normal and no generative parent of the latent is its descendant in the guide.
     Otherwise it is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic
-    form is wrong: it holds parents fixed that vary with the latent.) The parents are taken from the program as it runs:
-    where x is missing or replaced in scheduled sampling, the model reads its own mean, which varies with the parents of
-    x.
+    form is wrong: it keeps parents fixed that vary with the latent.) Parents depend on the data of the run: where x is
+    missing or replaced in scheduled sampling, the model reads its own mean, which varies with the parents of x.
 
     It traces like `TraceMeanField_ELBO` and agrees with it where that is correct. It evaluates each conditional only
     once, as it does not compute the trace's own log probability.
@@ -161,19 +160,19 @@ class SequenceELBO(ELBO):
                 _record(terms, terms.log_likelihood, name, site_log_prob(fn, value), run)
             else:
                 raise ValueError(f"the latent {name} is in the model but not in the guide")
-        found = [*terms.log_likelihood.values(), *terms.kl.values(), *terms.energies.values()]
-        if found and not len(terms.frames):  # no variable has steps, so each sequence counts once
-            terms.frames = torch.ones_like(found[0])
+        values = [*terms.log_likelihood.values(), *terms.kl.values(), *terms.energies.values()]
+        if values and not len(terms.frames):  # no variable has steps, so each sequence counts once
+            terms.frames = torch.ones_like(values[0])
         return terms
 
 
 def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
-    drawn = poutine.trace(guide).get_trace(*args, **kwargs)
-    return poutine.trace(poutine.replay(model, trace=drawn)).get_trace(*args, **kwargs), drawn
+    guide_trace = poutine.trace(guide).get_trace(*args, **kwargs)
+    return poutine.trace(poutine.replay(model, trace=guide_trace)).get_trace(*args, **kwargs), guide_trace
 
 
 def sites_of(trace: Any) -> dict[str, dict[str, Any]]:
-    """Return the sample sites of a trace by name, except variables that all sequences share, drawn alike in both.
+    """Return the sample sites of a trace by name, except variables shared by all sequences, whose terms cancel.
 
     Raises:
         ValueError: when a handler has scaled or masked a site.
@@ -211,15 +210,15 @@ def total(logs: Mapping[str, Tensor]) -> Tensor:
 def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     """Return log p(x, z) and log q(z | x) at these latents, (B,) each."""
     traces = (
-        poutine.trace(poutine.condition(each, data=dict(latents))).get_trace(batch)
-        for each in (model.model, model.guide)
+        poutine.trace(poutine.condition(program, data=dict(latents))).get_trace(batch)
+        for program in (model.model, model.guide)
     )
-    joint, own = (total(log_densities(trace)) for trace in traces)
-    return joint, own
+    joint, guide = (total(log_densities(trace)) for trace in traces)
+    return joint, guide
 
 
 def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]) -> set[str]:
-    """Return the latents whose KL term may be analytic; none for programs whose factorizations are unknown."""
+    """Return the latents whose KL term may be analytic; the empty set if a program's factorization is unknown."""
     # In a replayed model, latent sites have the guide's `infer` dict; data sites have the model's.
     sites = ([site for site in model_sites.values() if site["is_observed"]], guide_sites.values())
     notes = [next((s["infer"] for s in group if "program" in s["infer"]), None) for group in sites]
@@ -228,9 +227,9 @@ def _closed_forms(model_sites: Mapping[str, Any], guide_sites: Mapping[str, Any]
     pair, run = [note["program"] for note in notes], notes[0]["run"]  # type: ignore[index]
     # Data that are missing, fed back, or a function of their parents vary with these parents.
     hidden = frozenset(run.hidden) | {name for name, s in model_sites.items() if s["infer"].get("_deterministic")}
-    depends = hidden or any(equations.masks for equations in pair)  # whether it depends on the length
-    right = _analytic(*pair, hidden, run.length if depends else None)
-    return {name for name, analytic in right.items() if analytic}
+    depends_on_length = hidden or any(equations.masks for equations in pair)
+    is_analytic = _analytic(*pair, hidden, run.length if depends_on_length else None)
+    return {name for name, analytic in is_analytic.items() if analytic}
 
 
 _analytic = functools.lru_cache(maxsize=256)(analytic_kl)
@@ -245,10 +244,10 @@ def _kl(p: Any, q: Any, value: Tensor, closed: bool) -> Tensor:
             return kl_divergence(q, p)
         except NotImplementedError:  # this pair of families has no closed form
             pass
-    ours, theirs = site_log_prob(q, value), site_log_prob(p, value)
-    if ours.dim() != theirs.dim():  # a custom guide, whose density is not by step
-        ours, theirs = (part.sum(-1) if part.dim() == 2 else part for part in (ours, theirs))
-    return ours - theirs
+    log_q, log_p = site_log_prob(q, value), site_log_prob(p, value)
+    if log_q.dim() != log_p.dim():  # a custom guide, whose density is not by step
+        log_q, log_p = (part.sum(-1) if part.dim() == 2 else part for part in (log_q, log_p))
+    return log_q - log_p
 
 
 def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, run: Rollout | None) -> None:
@@ -263,10 +262,10 @@ def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, ru
 
 
 def _frames(rollout: Rollout) -> Tensor:
-    some, rows = like(next(iter(rollout.conditionals.values()))), rollout.batch // rollout.draws
+    reference, rows = like(next(iter(rollout.conditionals.values()))), rollout.batch // rollout.draws
     if rollout.lengths is None:
-        return some.new_full((rows,), float(rollout.length))
-    return rollout.lengths[:rows].to(some.dtype)
+        return reference.new_full((rows,), float(rollout.length))
+    return rollout.lengths[:rows].to(reference.dtype)
 
 
 def _mean(draws: list[Terms]) -> Terms:
@@ -308,14 +307,14 @@ def require_data(model: DynamicalVAE, data: AnyBatch) -> int:
     Raises:
         ValueError: when data or context are missing.
     """
-    needed = (*model.observed, *model.context)
-    if missing := [name for name in needed if name not in data]:
-        raise ValueError(f"the bound needs {', '.join(needed)}; missing in the batch are {', '.join(missing)}")
+    required = (*model.observed, *model.context)
+    if missing := [name for name in required if name not in data]:
+        raise ValueError(f"the bound needs {', '.join(required)}; missing in the batch are {', '.join(missing)}")
     return len(data[model.observed[0]])  # type: ignore[call-overload, index]
 
 
 KHAT_PARTICLES = 25
-"""Fewest particles for k-hat: arviz_stats fits the tail to a fifth of them, and needs five."""
+"""Smallest number of particles for k-hat: arviz_stats fits the tail to a fifth of them and needs five."""
 
 
 @dataclass(frozen=True)
@@ -408,8 +407,8 @@ def _repeated_weights(model: DynamicalVAE, data: AnyBatch, options: Mapping[str,
 
 
 def _log_weights(model: DynamicalVAE, batch: AnyBatch, options: Mapping[str, Any]) -> Tensor:
-    joint, drawn = map(log_densities, _traces(model, model.guide, (batch,), options))
-    return total(joint) - total(drawn)
+    joint, guide = map(log_densities, _traces(model, model.guide, (batch,), options))
+    return total(joint) - total(guide)
 
 
 def _khat(log_weights: Tensor) -> Tensor:

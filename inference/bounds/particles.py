@@ -89,14 +89,14 @@ def fivo_bound(
         data = model.read(batch)
         size = require_data(model, data)
         at_once = max(1, chunk // particles)
-        if refused := obstacle(model, data):
-            raise ValueError(refused)
+        if reason := obstacle(model, data):
+            raise ValueError(reason)
         parts = []
         for first in range(0, size, at_once):
-            some = data.rows(slice(first, first + at_once))
-            part = Filter(model, some, particles).run(resample_below)
+            sequences = data.rows(slice(first, first + at_once))
+            part = Filter(model, sequences, particles).run(resample_below)
             parts.append((part.bound, part.effective, part.resamplings))
-        bound, effective, resamplings = (torch.cat(found, dim=-1) for found in zip(*parts, strict=True))
+        bound, effective, resamplings = (torch.cat(values, dim=-1) for values in zip(*parts, strict=True))
         return FIVOBound(bound + (0 if data.log_det is None else data.volume), effective, resamplings, particles)
 
 
@@ -130,9 +130,11 @@ class Filter:
         valid = None if self.known.lengths is None else valid_steps(self.known.lengths, length).t()
         effective: list[Tensor] = []
         with memoizing():
-            guide = {name: self._law(model.encoder[name], self.known.values) for name in self._local(model.latents)}
+            guide = {
+                name: self._stepwise(model.encoder[name], self.known.values) for name in self._local(model.latents)
+            }
             order = [name for block in model.generative.blocks for name in block.names]
-            prior = {name: self._law(model.generator[name], self.shared) for name in self._local(order)}
+            prior = {name: self._stepwise(model.generator[name], self.shared) for name in self._local(order)}
         noise = {
             name: distribution.conditional.head.noise(
                 (len(self.sequence), length, distribution.conditional.size), bound
@@ -140,7 +142,7 @@ class Filter:
             for name, distribution in guide.items()
         }
         data = {name: self._by_step(self.known.values[name]) for name in self._local(model.observed)}
-        counted = {name: None if (m := self.known.mask(name)) is None else self._by_step(m) for name in prior}
+        masks = {name: None if (mask := self.known.mask(name)) is None else self._by_step(mask) for name in prior}
         for t in range(length):
             if t or self.statics:
                 low = effective_size(log_weights) < resample_below * self.particles
@@ -151,7 +153,7 @@ class Filter:
                     self.statics, self.paths, guide, prior = select([self.statics, self.paths, guide, prior], rows)
                     log_weights = log_weights.masked_fill(low, 0)
                     resamplings += low
-            log_weights = log_weights + self._step(t, guide, prior, noise, data, counted).view(shape)
+            log_weights = log_weights + self._step(t, guide, prior, noise, data, masks).view(shape)
             size = effective_size(log_weights)
             effective.append(size if valid is None else size.masked_fill(~valid[t], math.nan))
         log_weights = log_weights + self._draw_statics(late=True).view(shape)
@@ -182,7 +184,7 @@ class Filter:
         prior: Mapping[str, Stepwise],
         noise: Mapping[str, tuple[Tensor, ...]],
         data: Mapping[str, Rows],
-        counted: Mapping[str, Rows | None],
+        masks: Mapping[str, Rows | None],
     ) -> Tensor:
         """Draw the latents at t, and return the log weights (N,) of the step."""
         total = like(self.model).new_zeros(len(self.sequence))
@@ -190,18 +192,18 @@ class Filter:
         for name, distribution in guide.items():
             parameters = distribution.step(t, history)
             self.paths[name][t] = distribution.conditional.draw(parameters, noise[name][t])
-            total = total - _log_prob(distribution.conditional, parameters, self.paths[name][t], _at(counted[name], t))
+            total = total - _log_prob(distribution.conditional, parameters, self.paths[name][t], _at(masks[name], t))
         for name, distribution in prior.items():
             parameters = distribution.step(t, history)
             value = data[name][t] if name in data else self.paths[name][t]
-            total = total + _log_prob(distribution.conditional, parameters, value, _at(counted[name], t))
+            total = total + _log_prob(distribution.conditional, parameters, value, _at(masks[name], t))
             if name in self.hidden:  # the model reads its own mean where x is missing
-                seen = self.known.observed[name][:, t].index_select(0, self.sequence)
-                self.paths[name][t] = torch.where(seen, value, distribution.conditional.mean(parameters))
+                observed = self.known.observed[name][:, t].index_select(0, self.sequence)
+                self.paths[name][t] = torch.where(observed, value, distribution.conditional.mean(parameters))
         return total
 
     def _draw_statics(self, late: bool) -> Tensor:
-        """Draw the static latents that precede or follow the steps, and return the log weights (N,)."""
+        """Draw the static latents that precede the steps, or follow them if `late`, and return log weights (N,)."""
         model, total = self.model, like(self.model).new_zeros(len(self.sequence))
         for name in model.latents:
             if not model.generative.local(name) and (name in self.late) == late:
@@ -210,48 +212,52 @@ class Filter:
                 noise = conditional.head.noise((len(self.sequence), conditional.size), total)
                 self.statics[name] = Rows([conditional.draw(parameters, noise)])
                 total = total - _log_prob(conditional, parameters, self.statics[name][0])
-        known = {**self.shared, **self.drawn}
+        values = {**self.shared, **self.drawn}
         for factor in model.generative.factors:
-            if factor.local or _waits(factor, {*self.late, *self.paths}) != late:
+            if factor.local or _involves(factor, {*self.late, *self.paths}) != late:
                 continue
             name = factor.child
-            value = known[name] if name in self.statics else pick(known[name], self.sequence)
+            value = values[name] if name in self.statics else pick(values[name], self.sequence)
             conditional = model.generator[name]
             total = total + _log_prob(conditional, self._parameters(conditional, self.shared), value)
         return total
 
     def _parameters(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Parameters:
         """Return the parameters (N, D) of a static variable."""
-        given, size, lengths, rows = self._given(conditional, shared)
-        return tuple(pick(p, rows) for p in conditional(given, size, self.known.length, lengths))
+        parents, size, lengths, rows = self._known_parents(conditional, shared)
+        return tuple(pick(p, rows) for p in conditional(parents, size, self.known.length, lengths))
 
-    def _law(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Stepwise:
-        given, size, lengths, rows = self._given(conditional, shared)
-        live = [name for name in conditional.parents if name not in given]
-        if not live:
-            everywhere = conditional(given, size, self.known.length, lengths)
-            return Stepwise(conditional, select([p.unbind(1) for p in everywhere], rows), [])
-        state = conditional.start(given, size, self.known.length, lengths)
-        reads = [*live, conditional.factor.child] if conditional.head.residual else live
+    def _stepwise(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Stepwise:
+        parents, size, lengths, rows = self._known_parents(conditional, shared)
+        later_parents = [name for name in conditional.parents if name not in parents]
+        if not later_parents:
+            parameters = conditional(parents, size, self.known.length, lengths)
+            return Stepwise(conditional, select([p.unbind(1) for p in parameters], rows), [])
+        state = conditional.start(parents, size, self.known.length, lengths)
+        reads = [*later_parents, conditional.factor.child] if conditional.head.residual else later_parents
         return Stepwise(conditional, conditional.select(state, rows), reads)
 
-    def _given(
+    def _known_parents(
         self, conditional: Conditional, shared: Mapping[str, Tensor]
     ) -> tuple[dict[str, Tensor], int, Tensor | None, Tensor]:
-        """Return the known parents, their number of rows, their lengths, and the row of each particle.
+        """Return the parents known before the steps, their number of rows, their lengths, and each particle's row.
 
-        Values that all particles of a sequence share are computed once per sequence.
+        Parents shared by all particles of a sequence have one row per sequence.
         """
-        lengths, seen = self.known.lengths, self.known.observed
-        there = {presence(name): steps for name, steps in self.known.present.items() if name in conditional.parents}
-        there |= {indicator(name): seen[name] for name in conditional.indicators if name in seen}
-        given = {**{name: shared[name] for name in conditional.parents if name in shared}, **there}
-        own = {name: value for name, value in self.drawn.items() if name in conditional.parents and name not in shared}
-        if not own:
-            return given, self.known.batch, lengths, self.sequence
-        given = {name: pick(value, self.sequence) for name, value in given.items()} | own
-        everyone = torch.arange(len(self.sequence), device=self.sequence.device)
-        return given, len(everyone), None if lengths is None else lengths[self.sequence], everyone
+        lengths, observed = self.known.lengths, self.known.observed
+        indicators = {
+            presence(name): steps for name, steps in self.known.present.items() if name in conditional.parents
+        }
+        indicators |= {indicator(name): observed[name] for name in conditional.indicators if name in observed}
+        parents = {**{name: shared[name] for name in conditional.parents if name in shared}, **indicators}
+        particle_parents = {
+            name: value for name, value in self.drawn.items() if name in conditional.parents and name not in shared
+        }
+        if not particle_parents:
+            return parents, self.known.batch, lengths, self.sequence
+        parents = {name: pick(value, self.sequence) for name, value in parents.items()} | particle_parents
+        rows = torch.arange(len(self.sequence), device=self.sequence.device)
+        return parents, len(rows), None if lengths is None else lengths[self.sequence], rows
 
 
 @dataclass
@@ -260,8 +266,8 @@ class Stepwise:
 
     Args:
         conditional: conditional of the variable.
-        state: state of its network; the parameters by step if it reads no variable that is drawn in the steps.
-        reads: names of the parents that are drawn in the steps.
+        state: state of its network; its parameters by step if `reads` is empty.
+        reads: names of the parents drawn in the steps.
     """
 
     conditional: Conditional
@@ -277,8 +283,8 @@ class Stepwise:
 
     def select(self, rows: Tensor) -> Stepwise:
         """Return the conditional for these particles."""
-        moved = self.conditional.select(self.state, rows) if self.reads else select(self.state, rows)
-        return Stepwise(self.conditional, moved, self.reads)
+        state = self.conditional.select(self.state, rows) if self.reads else select(self.state, rows)
+        return Stepwise(self.conditional, state, self.reads)
 
 
 def effective_size(log_weights: Tensor) -> Tensor:
@@ -294,25 +300,25 @@ def ancestors(log_weights: Tensor, chosen: Tensor) -> Tensor:
     `chosen` (B,) are their own ancestors.
     """
     count, batch = log_weights.shape
-    places = torch.arange(count, device=log_weights.device)[:, None]
+    identity = torch.arange(count, device=log_weights.device)[:, None]
     cumulative = log_weights.double().softmax(0).cumsum(0)
-    points = (places + torch.rand(batch, dtype=torch.double, device=places.device)) / count * cumulative[-1]
-    found = torch.searchsorted(cumulative.t().contiguous(), points.t().contiguous(), right=True).t()
-    particle = torch.where(chosen, found.clamp_(max=count - 1), places)
-    return (particle * batch + torch.arange(batch, device=places.device)).flatten()
+    points = (identity + torch.rand(batch, dtype=torch.double, device=identity.device)) / count * cumulative[-1]
+    resampled = torch.searchsorted(cumulative.t().contiguous(), points.t().contiguous(), right=True).t()
+    particle = torch.where(chosen, resampled.clamp_(max=count - 1), identity)
+    return (particle * batch + torch.arange(batch, device=identity.device)).flatten()
 
 
 def _log_mean(log_weights: Tensor) -> Tensor:
     return log_weights.logsumexp(0) - math.log(len(log_weights))
 
 
-def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, counted: Tensor | None = None) -> Tensor:
-    """Return the log probability (N,) of values (N, D), without entries that are not `counted`."""
-    entries = conditional.distribution(parameters).log_prob(conditional.scored(value, counted))
-    if counted is not None and counted.dim() != entries.dim():  # only guide or model scores whole events
-        counted = counted.all(-1) if conditional.whole else counted[:, None]
-    # where rather than a product: an entry that is not counted may be infinite
-    entries = entries if counted is None else torch.where(counted, entries, 0.0)
+def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the log probability (N,) of values (N, D), of the entries that `mask` includes."""
+    entries = conditional.distribution(parameters).log_prob(conditional.scored(value, mask))
+    if mask is not None and mask.dim() != entries.dim():  # only guide or model scores whole events
+        mask = mask.all(-1) if conditional.whole else mask[:, None]
+    # where rather than a product: an excluded entry may be infinite
+    entries = entries if mask is None else torch.where(mask, entries, 0.0)
     return entries if conditional.whole else entries.sum(-1)
 
 
@@ -322,25 +328,25 @@ def _at(values: Rows | None, t: int) -> Tensor | None:
 
 def _hidden(run: Rollout) -> list[str]:
     """Return the data variables with missing entries, where the model reads its own means."""
-    return [name for name, seen in run.observed.items() if not seen.all()]
+    return [name for name, observed in run.observed.items() if not observed.all()]
 
 
 def _late(model: DynamicalVAE) -> set[str]:
-    """Return the static latents that the guide draws after the steps, because they read variables drawn there."""
+    """Return the static latents that the guide draws after the steps, because they read variables of the steps."""
     late: set[str] = set()
     for name in model.latents:
         factor = model.inference.factor(name)
-        if not factor.local and _waits(factor, late | {n for n in model.latents if model.generative.local(n)}):
+        if not factor.local and _involves(factor, late | {n for n in model.latents if model.generative.local(n)}):
             late.add(name)
     return late
 
 
-def _waits(factor: Factor, names: set[str]) -> bool:
+def _involves(factor: Factor, names: set[str]) -> bool:
     return factor.child in names or any(parent.name in names for parent in factor.parents)
 
 
 def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
-    """Return a sentence on why a model cannot be filtered forward step by step; "" if it can.
+    """Return the reason why particles cannot filter a model forward in time; "" if they can.
 
     Raises:
         ValueError: when the batch cannot be read.
@@ -364,7 +370,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
     if static := [name for name in hidden if not model.generative.local(name)]:
         return f"a static variable has no missing entries in a FIVO bound, but {', '.join(static)} has"
     latents = [name for name in model.latents if model.generative.local(name)]
-    for equations, drawn in ((model.inference, latents), (model.generative, [*latents, *hidden])):
+    for equations, step_names in ((model.inference, latents), (model.generative, [*latents, *hidden])):
         for factor in equations.factors:
             for parent in factor.parents if factor.local else ():
                 if parent.name in late:
@@ -372,7 +378,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
                         f"{factor} reads {parent}, which {model.inference.factor(parent.name)} draws after all steps, "
                         f"so particles cannot be weighted at each step; {instead}"
                     )
-                if parent.name in drawn and _reads_ahead(parent, run.length):
+                if parent.name in step_names and _reads_ahead(parent, run.length):
                     missing = " where entries are missing" if parent.name in hidden else ""
                     return (
                         f"{factor} reads {parent}, and {parent.name} after t is not drawn yet{missing} when the "

@@ -6,8 +6,8 @@ density of the future x_{O+1:T} is therefore
     F = E_{q(w, z_{1:O} | x_{1:O})} p(x_{O+1:T} | w, z_{1:O}, x_{1:O})
 
 which is p(x_{O+1:T} | x_{1:O}) if the guide is the posterior. Its logarithm is a proper score (Gneiting and Raftery,
-2007). Draws from F estimate it badly, because few of them come near a given future. The latents are therefore proposed
-by the guide given past and future, and weighted:
+2007). Draws from F estimate it badly, because few of them come near a given future. Latents are therefore proposed by
+the guide given past and future, and weighted:
 
     F = E_q [ q(w, z_{1:O} | x_{1:O}) prod_{t > O} p(z_t | .) p(x_t | .) / q ],    q = q(w, z_{1:T} | x_{1:T})
 
@@ -35,7 +35,7 @@ from .elbo import IWAEBound, importance_mean, log_densities, require_likelihood,
 def predictive_bound(
     model: DynamicalVAE, batch: AnyBatch, observed: int, particles: int = 100, *, chunk: int = 4096
 ) -> IWAEBound:
-    """Return a bound on the log density of the future under the model's forecast; see the module.
+    """Return a lower bound on the log density of the future under the model's forecast; see the module.
 
     Args:
         model: model with its guide.
@@ -48,13 +48,13 @@ def predictive_bound(
         The bound in nats per sequence, and the tail shape of the weights, (B,) each.
 
     Raises:
-        ValueError: when the model has no likelihood or its own forecast method, the batch is ragged, or no frame is
-            observed or to predict.
+        ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no frame is
+            left to observe or to predict.
     """
     require_likelihood(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
         raise ValueError(
-            f"{type(model).__name__} has a custom forecast, whose density is not known; leave the log score out"
+            f"{type(model).__name__} has a custom forecast, whose density is not known; omit the log score"
         )
     with model.running():
         data = model.read(batch)
@@ -62,37 +62,38 @@ def predictive_bound(
         observed -= model.view.past  # the view's past frames are context, which is always given
         if model.grouped and data.group is not None:
             raise ValueError(
-                f"groups share {', '.join(model.grouped)}, but a log score is of one sequence; leave it out"
+                f"groups share {', '.join(model.grouped)}, but a log score is of one sequence; remove 'group' from the "
+                "batch, or omit the log score"
             )
         if data.lengths is not None:
-            raise ValueError("a log score needs sequences of one length, but these have lengths")
+            raise ValueError("a log score needs sequences of equal length; remove 'lengths' from the batch")
         first = 0 if model.view.past else 1
         if particles < 1 or not first <= observed < length:
-            taken = model.view.past
+            context_frames = model.view.past
             raise ValueError(
-                f"expected at least 1 particle, and observed frames from {taken + first} to {taken + length - 1}; got "
-                f"{particles} and {taken + observed}"
+                f"expected at least 1 particle, and observed frames from {context_frames + first} to "
+                f"{context_frames + length - 1}; got {particles} and {context_frames + observed}"
             )
         log_det = torch.zeros(size, length) if data.log_det is None else data.log_det
         if log_det.dim() == 1:
             raise ValueError(
                 "the view changes the volume of whole sequences, and the share of the future in it is not known; "
-                "leave the log score out, or give the view a log_det by entry, (B, T, D)"
+                "omit the log score, or return log_det by entry, (B, T, D), from the view"
             )
         past = data.map(lambda value: value[:, :observed] if value.dim() == 3 else value)
 
         def log_weights(count: int) -> Tensor:
-            whole = repeat(data, count)
-            proposed = poutine.trace(model.guide).get_trace(whole)
-            joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(whole)
+            repeated = repeat(data, count)
+            proposed = poutine.trace(model.guide).get_trace(repeated)
+            joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(repeated)
             if not observed:  # latents are then from the prior
                 return total(log_densities(joint)) - total(log_densities(proposed))
-            drawn = {n: s["value"] for n, s in sites_of(proposed).items()}
-            known = {n: v[:, :observed] if model.generative.local(n) else v for n, v in drawn.items()}
-            seen = poutine.trace(poutine.condition(model.guide, data=known)).get_trace(repeat(past, count))
+            latents = {n: s["value"] for n, s in sites_of(proposed).items()}
+            past_latents = {n: v[:, :observed] if model.generative.local(n) else v for n, v in latents.items()}
+            past_guide = poutine.trace(poutine.condition(model.guide, data=past_latents)).get_trace(repeat(past, count))
             local = [n for n in model.generative.variables if model.generative.local(n)]
             future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
-            return total(future) + total(log_densities(seen)) - total(log_densities(proposed))
+            return total(future) + total(log_densities(past_guide)) - total(log_densities(proposed))
 
-        found = importance_mean(log_weights, size, particles, chunk)
-        return replace(found, bound=found.bound + log_det[:, observed:].sum(1).to(found.bound))
+        result = importance_mean(log_weights, size, particles, chunk)
+        return replace(result, bound=result.bound + log_det[:, observed:].sum(1).to(result.bound))

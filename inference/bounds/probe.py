@@ -1,12 +1,12 @@
-"""Test of whether a model uses a latent: forecasts with latents drawn from another distribution.
+"""Test whether a model uses a latent, by forecasts with this latent drawn from another distribution.
 
 If a model has learned to ignore a latent, its futures do not depend on it. With draws from N(50, 50) instead of the
 prior N(0, I), they remain as accurate and as similar to one another (Aliakbarian, Saleh, Salzmann, Petersson and Gould,
 2020, arXiv 1908.00733, section 4.1). The futures of a model that uses the latent become wrong. Compare the diversities:
 
-    models = {"as it is": model, "probed": Redrawn(model, {"z": Normal(50.0, 50**0.5)})}
-    found = dvae.evaluate(models, windows, scores=scores)
-    found.ratio("probed", "as it is", "APD")
+    models = {"as it is": model, "probed": RedrawnModel(model, {"z": Normal(50.0, 50**0.5)})}
+    evaluation = dvae.evaluate(models, windows, scores=scores)
+    evaluation.ratio("probed", "as it is", "APD")
 
 The paper does not state whether the second 50 is a variance, as I in the prior suggests, or a standard deviation; both
 are far outside the prior.
@@ -34,10 +34,10 @@ class RedrawnModel(nn.Module):
             the latent is from it, even where the guide would infer it from the past.
 
     Raises:
-        ValueError: when a name is no latent of the model, or the latent depends on others.
+        ValueError: when a name is not a latent of the model, or the latent has parents.
     """
 
-    likelihood = False  # the scores are not those of the model itself
+    likelihood = False  # no bounds: they would be the original model's
 
     def __init__(self, model: Any, distributions: Mapping[str, Distribution]) -> None:
         super().__init__()
@@ -62,14 +62,14 @@ class RedrawnModel(nn.Module):
         self.generative, self.inference = model.generative, model.inference
 
     def is_drawn(self, means: bool = False) -> bool:
-        """Return the decision of the model."""
+        """Return `is_drawn` of the model."""
         return bool(self.model.is_drawn(means))
 
     def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> Mapping[str, Tensor]:
         """Return the model's forecast, with latents from the other distributions."""
         with self.model.running(), _Redrawing(self.distributions, like(self.model)):
-            found: Mapping[str, Tensor] = self.model.forecast(batch, horizon, samples, **options)
-            return found
+            forecast: Mapping[str, Tensor] = self.model.forecast(batch, horizon, samples, **options)
+            return forecast
 
 
 class _Redrawing(Messenger):

@@ -42,10 +42,9 @@ from .elbo import joint_and_guide, require_data, require_latents, require_likeli
 UNITS = 32
 """Number of draws from the guide for the units."""
 NAT = 1.0
-"""Epsilon of Adam, in nats per deviation: much smaller gradients are followed in proportion, larger ones by sign.
+"""Epsilon of Adam, in nats per deviation: steps are proportional to much smaller gradients, constant for larger ones.
 
-With steps by sign alone, the usual behaviour of Adam, the noise of zero gradients would be followed too, and many edges
-have such gradients.
+With the usual tiny epsilon, steps have a constant size even where the gradient is only noise, as for many edges.
 """
 
 
@@ -69,22 +68,22 @@ class Link:
 
     def moves(self, values: Sequence[Tensor], steps: int) -> Tensor:
         """Return shifts (k, B, S, D) in units, from values (k B, E) of the parent by step."""
-        read = torch.stack([values[s] for s in self.of.tolist()], 1).unflatten(0, (-1, len(self.weight)))
-        read = (read - self.centre) / self.deviation
+        inputs = torch.stack([values[s] for s in self.of.tolist()], 1).unflatten(0, (-1, len(self.weight)))
+        inputs = (inputs - self.centre) / self.deviation
         if steps == 1:
-            return (read.flatten(2).transpose(0, 1) @ self.weight.flatten(1, 2)).transpose(0, 1).unsqueeze(2)
-        each = torch.einsum("kbpe,bped->kbpd", read, self.weight)
-        to = torch.as_tensor(self.to, device=each.device)
-        return each.new_zeros(*each.shape[:2], steps, each.shape[3]).index_add(2, to, each)
+            return (inputs.flatten(2).transpose(0, 1) @ self.weight.flatten(1, 2)).transpose(0, 1).unsqueeze(2)
+        shifts = torch.einsum("kbpe,bped->kbpd", inputs, self.weight)
+        targets = torch.as_tensor(self.to, device=shifts.device)
+        return shifts.new_zeros(*shifts.shape[:2], steps, shifts.shape[3]).index_add(2, targets, shifts)
 
     def by_step(self, steps: int) -> list[Link | None]:
-        """Return one link for each of the steps, None if nothing is read there."""
+        """Return one link for each step, None for a step without a link."""
         counts = np.bincount(self.to, minlength=steps)
-        places = np.split(self.of, counts.cumsum()[:-1])
+        sources_by_step = np.split(self.of, counts.cumsum()[:-1])
         # split rather than slice: the gradient of a slice is as large as the whole tensor
-        tensors = (each.split(counts.tolist(), 1) for each in (self.weight, self.centre, self.deviation))
-        parts = zip(places, *tensors, strict=True)
-        return [Link(self.parent, of * 0, of, *rest) if len(of) else None for of, *rest in parts]
+        tensors = (tensor.split(counts.tolist(), 1) for tensor in (self.weight, self.centre, self.deviation))
+        parts = zip(sources_by_step, *tensors, strict=True)
+        return [Link(self.parent, sources * 0, sources, *rest) if len(sources) else None for sources, *rest in parts]
 
 
 @dataclass(frozen=True)
@@ -104,26 +103,29 @@ class Correction:
     links: tuple[Link, ...]
 
     def __call__(self, parameters: Parameters, values: Mapping[str, Sequence[Tensor]]) -> Parameters:
-        """Return location and scale (k B, S, D), given the guide's own and the latents by step."""
+        """Return corrected location and scale (k B, S, D), from the guide's parameters and the latents by step."""
         if len(parameters[0]) % len(self.unit):
             raise ValueError(
                 f"this guide was fitted to {len(self.unit)} sequences, but the batch has {len(parameters[0])} rows; "
-                "give it the sequences that it was fitted to, in their order"
+                "pass the sequences that it was fitted to, in the same order"
             )
         loc, scale = (each.unflatten(0, (-1, len(self.unit))) for each in parameters)
-        moved = self.shift
+        shift = self.shift
         for link in self.links:
-            moved = moved + link.moves(values[link.parent], loc.shape[2])
-        loc, scale = loc + self.unit * moved, scale * self.stretch.exp()
+            shift = shift + link.moves(values[link.parent], loc.shape[2])
+        loc, scale = loc + self.unit * shift, scale * self.stretch.exp()
         return loc.flatten(0, 1), scale.flatten(0, 1)
 
     def by_step(self) -> list[Correction]:
         """Return one correction for each step."""
         steps = self.unit.shape[1]
         links = zip(*(link.by_step(steps) for link in self.links), strict=True) if self.links else [()] * steps
-        tensors = (each.split(1, 1) for each in (self.unit, self.shift, self.stretch))
+        tensors = (tensor.split(1, 1) for tensor in (self.unit, self.shift, self.stretch))
         parts = zip(*tensors, links, strict=True)
-        return [Correction(unit, shift, stretch, tuple(filter(None, own))) for unit, shift, stretch, own in parts]
+        return [
+            Correction(unit, shift, stretch, tuple(filter(None, step_links)))
+            for unit, shift, stretch, step_links in parts
+        ]
 
     @property
     def free(self) -> list[tuple[Tensor, int]]:
@@ -142,7 +144,7 @@ class CorrectedConditional(nn.Module):
 
     Args:
         own: conditional of the guide.
-        factor: factor with the present parents.
+        factor: factor with all parents that the corrected conditional reads.
         correction: correction of the conditional.
     """
 
@@ -152,33 +154,33 @@ class CorrectedConditional(nn.Module):
         self.parents = [parent.name for parent in factor.parents]
 
     def __getattr__(self, name: str) -> Any:
-        """Return attributes that are not corrected from the guide's conditional."""
+        """Return the attribute of the guide's conditional."""
         return super().__getattr__(name) if name == "own" else getattr(self.own, name)
 
     def forward(self, parents: Mapping[str, Tensor], *arguments: Any) -> Parameters:
         """Return the corrected parameters; same arguments as in `Conditional`."""
         values = {link.parent: _by_step(parents[link.parent]) for link in self.correction.links}
-        own = self.own(parents, *arguments)
+        parameters = self.own(parents, *arguments)
         if self.factor.local:
-            return self.correction(own, values)
-        return _alone(self.correction(_with_step(own), values))
+            return self.correction(parameters, values)
+        return _without_step(self.correction(_with_step(parameters), values))
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """Return the state of the guide's loop, or its parameters by step if it reads no drawn variable."""
-        known = {link.parent: _by_step(given[link.parent]) for link in self.correction.links if link.parent in given}
+        values = {link.parent: _by_step(given[link.parent]) for link in self.correction.links if link.parent in given}
         steps = self.correction.by_step()
         if all(name in given for name in self.own.parents):
-            return tuple(p.unbind(1) for p in self.own(given, batch, length, lengths)), None, known, steps
-        return None, self.own.start(given, batch, length, lengths), known, steps
+            return tuple(p.unbind(1) for p in self.own(given, batch, length, lengths)), None, values, steps
+        return None, self.own.start(given, batch, length, lengths), values, steps
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
         """Return the corrected parameters; same arguments as in `Conditional`."""
-        fixed, inner, known, steps = state
+        fixed, inner, values, steps = state
         if fixed is None:
-            own, inner = self.own.step(inner, t, drawn, count)
+            parameters, inner = self.own.step(inner, t, drawn, count)
         else:
-            own = tuple(p[t] for p in fixed)
-        return _alone(steps[t](_with_step(own), {**drawn, **known})), (fixed, inner, known, steps)
+            parameters = tuple(p[t] for p in fixed)
+        return _without_step(steps[t](_with_step(parameters), {**drawn, **values})), (fixed, inner, values, steps)
 
     def chain(self, *_: Any) -> None:
         """Return None, as no fused loop exists."""
@@ -192,7 +194,7 @@ def _with_step(parameters: Parameters) -> Parameters:
     return tuple(p[:, None] for p in parameters)
 
 
-def _alone(parameters: Parameters) -> Parameters:
+def _without_step(parameters: Parameters) -> Parameters:
     return tuple(p[:, 0] for p in parameters)
 
 
@@ -212,16 +214,15 @@ def semi_amortized_guide(
     """Return the model with a semi-amortized guide, fitted to the bound of each of these sequences (see the module).
 
     Args:
-        model: model with its guide; for a result of this function, the search continues.
+        model: model with its guide, or a result of this function, whose search continues.
         batch: sequences to fit. The returned model accepts only these sequences in this order, or whole repetitions of
             them (`iwae_bound` and `annealed_bound` with a `chunk` that covers all).
-        missing: whether the guide also reads the latents that the posterior depends on and it ignores, in its order of
-            drawing (`audit`).
+        missing: whether the guide also reads, in its order of drawing, the latents that it ignores although the
+            posterior depends on them (`audit`).
         steps: number of steps of Adam, with a learning rate that falls to 0.
         rate: learning rate of the first step, in deviations of the guide; the weights of one location share it.
         draws: number of draws of every sequence in each step.
-        reach: largest distance in steps between local latents with a linear dependency; None for all that the edges
-            allow.
+        reach: largest distance in steps of linear dependencies between local latents; None for no limit.
         seed: seed of the draws.
         progress: function called after each step.
 
@@ -233,8 +234,8 @@ def semi_amortized_guide(
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> x, oracle = model.sample(3, 4)["x"], dvae.Oracle(model, 4)
-        >>> local = dvae.semi_amortized_guide(model, x, missing=True, rate=0.5)
-        >>> (oracle.evidence(x) - dvae.iwae_bound(local, x, 16).bound).abs().max() < 0.05
+        >>> fitted = dvae.semi_amortized_guide(model, x, missing=True, rate=0.5)
+        >>> (oracle.evidence(x) - dvae.iwae_bound(fitted, x, 16).bound).abs().max() < 0.05
         tensor(True)
     """
     if min(steps, draws) < 1 or (reach is not None and reach < 0) or not rate > 0:
@@ -248,25 +249,25 @@ def semi_amortized_guide(
         raise ValueError("sequences of a group share latents and have no separate guide; remove 'group'")
     require_data(model, data)
     with seeded_evaluation(model, seed):
-        found, corrections = _start(model, data, missing, reach)
+        fitted, corrections = _start(model, data, missing, reach)
         rows, free = repeat(data, draws), [each for c in corrections.values() for each in c.free]
-        frozen = _with(found, {name: each.freed(Tensor.detach) for name, each in corrections.items()})
+        frozen = _with_guide(fitted, {name: each.freed(Tensor.detach) for name, each in corrections.items()})
         optimiser = torch.optim.Adam([{"params": [each], "lr": rate / width} for each, width in free], eps=NAT)
-        falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+        scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
         for _ in range(steps):
             with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False), memoizing():
-                joint, own = joint_and_guide(frozen, rows, found.guide(rows))
-                slopes = torch.autograd.grad((own - joint).sum() / draws, [each for each, _ in free])
-            for (each, _), slope in zip(free, slopes, strict=True):
-                each.grad = slope.nan_to_num(0.0, 0.0, 0.0)
+                joint, guide = joint_and_guide(frozen, rows, fitted.guide(rows))
+                gradients = torch.autograd.grad((guide - joint).sum() / draws, [each for each, _ in free])
+            for (each, _), gradient in zip(free, gradients, strict=True):
+                each.grad = gradient.nan_to_num(0.0, 0.0, 0.0)
             optimiser.step()
-            falling.step()
+            scheduler.step()
             progress()
     return frozen
 
 
 def require_local(model: DynamicalVAE) -> None:
-    """Refuse a model without latents that allow semi-amortized guides.
+    """Refuse a model whose latents do not allow semi-amortized guides.
 
     Raises:
         ValueError: when the model has no latents or no likelihood, or a latent is not normal in the guide.
@@ -283,10 +284,10 @@ def require_local(model: DynamicalVAE) -> None:
 
 
 def missing_latents(model: DynamicalVAE) -> dict[str, tuple[Parent, ...]]:
-    """Return for each latent those that its guide ignores and the posterior depends on, in the guide's order."""
-    found = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing_parents
-    lacking = {name: tuple(p for p in parents if p.name in model.latents) for name, parents in found.items()}
-    return {name: parents for name, parents in lacking.items() if parents}
+    """Return for each latent the latents that its posterior depends on and the guide ignores, in the guide's order."""
+    missing = audit(model.generative, model.inference, observed=model.observed, summed=model.summed).missing_parents
+    latents = {name: tuple(p for p in parents if p.name in model.latents) for name, parents in missing.items()}
+    return {name: parents for name, parents in latents.items() if parents}
 
 
 def _start(
@@ -294,46 +295,52 @@ def _start(
 ) -> tuple[DynamicalVAE, dict[str, Correction]]:
     """Return the model with initial corrections, and these corrections."""
     added = missing_latents(model) if missing else {}
-    drawn = _Drawn(model, data)
+    draws = _GuideDraws(model, data)
     corrections = {}
     for name in model.latents:
-        own, factor = model.encoder[name], model.inference.factor(name)
-        now = own.correction if isinstance(own, CorrectedConditional) else drawn.correction(factor, reach)
-        more = drawn.links(replace(factor, parents=added.get(name, ())), reach)
-        corrections[name] = replace(now, links=(*now.links, *more)).freed(lambda t: t.clone().requires_grad_())
-    factors = tuple(replace(f, parents=_joined(f.parents, added.get(f.child, ()))) for f in model.inference.factors)
-    return _with(model, corrections, Factorization("q", factors)), corrections
+        conditional, factor = model.encoder[name], model.inference.factor(name)
+        correction = (
+            conditional.correction if isinstance(conditional, CorrectedConditional) else draws.correction(factor, reach)
+        )
+        links = draws.links(replace(factor, parents=added.get(name, ())), reach)
+        corrections[name] = replace(correction, links=(*correction.links, *links)).freed(
+            lambda t: t.clone().requires_grad_()
+        )
+    factors = tuple(replace(f, parents=_merged(f.parents, added.get(f.child, ()))) for f in model.inference.factors)
+    return _with_guide(model, corrections, Factorization("q", factors)), corrections
 
 
-def _joined(parents: Sequence[Parent], added: Sequence[Parent]) -> tuple[Parent, ...]:
+def _merged(parents: Sequence[Parent], added: Sequence[Parent]) -> tuple[Parent, ...]:
     """Return parents with additional ones; parents of the same name are merged."""
-    found = {parent.name: parent for parent in parents}
+    merged = {parent.name: parent for parent in parents}
     for parent in added:
-        own = found.get(parent.name, parent).relation
-        relation = parent.relation if own is None or parent.relation is None else own | parent.relation
-        found[parent.name] = replace(parent, relation=relation)
-    return tuple(found.values())
+        existing = merged.get(parent.name, parent).relation
+        relation = parent.relation if existing is None or parent.relation is None else existing | parent.relation
+        merged[parent.name] = replace(parent, relation=relation)
+    return tuple(merged.values())
 
 
-def _with(
+def _with_guide(
     model: DynamicalVAE, corrections: Mapping[str, Correction], inference: Factorization | None = None
 ) -> DynamicalVAE:
     """Return a copy of the model with a corrected guide; the model does not change."""
-    found = copy.copy(model)
-    found.inference = inference or model.inference
+    corrected = copy.copy(model)
+    corrected.inference = inference or model.inference
     encoder = {}
     for name, correction in corrections.items():
-        own = model.encoder[name]
+        conditional = model.encoder[name]
         encoder[name] = CorrectedConditional(
-            own.own if isinstance(own, CorrectedConditional) else own, found.inference.factor(name), correction
+            conditional.own if isinstance(conditional, CorrectedConditional) else conditional,
+            corrected.inference.factor(name),
+            correction,
         )
-    found.__dict__.pop("encoder", None)  # present if the guide is the prior
-    found._modules = {**model._modules, "encoder": nn.ModuleDict(encoder)}
-    return found
+    corrected.__dict__.pop("encoder", None)  # present if the guide is the prior
+    corrected._modules = {**model._modules, "encoder": nn.ModuleDict(encoder)}
+    return corrected
 
 
-class _Drawn:
-    """Draws of the guide, and the units computed from them."""
+class _GuideDraws:
+    """Draws of the guide and the units of corrections."""
 
     def __init__(self, model: DynamicalVAE, data: Mapping[str, Any]):
         sites = sites_of(poutine.trace(model.guide).get_trace(repeat(data, UNITS)))
@@ -342,8 +349,8 @@ class _Drawn:
         for name in model.latents:
             site, local = sites[name], model.inference.local(name)
             distribution = site["fn"].steps(site["value"]) if local else site["fn"]
-            for kept, each in ((self.values, site["value"]), (self.units, distribution.stddev)):
-                kept[name] = (each if local else each[:, None]).unflatten(0, (UNITS, -1))
+            for table, value in ((self.values, site["value"]), (self.units, distribution.stddev)):
+                table[name] = (value if local else value[:, None]).unflatten(0, (UNITS, -1))
 
     def correction(self, factor: Factor, reach: int | None) -> Correction:
         unit = self.units[factor.child].mean(0)
@@ -353,7 +360,7 @@ class _Drawn:
         """Return links to the latents among the parents, with zero weights."""
         _, size, _, width = self.values[factor.child].shape
         length = max(value.shape[2] for value in self.values.values())
-        found = []
+        links = []
         for parent in factor.parents:
             if parent.name not in self.values:
                 continue
@@ -361,11 +368,11 @@ class _Drawn:
             if factor.local and parent.local and reach is not None:
                 steps = np.arange(length)
                 mask = mask & (abs(steps[:, None] - steps) <= reach)
-            to, of = np.nonzero(mask)
-            if len(to):
-                values = self.values[parent.name][:, :, of]
-                weight = values.new_zeros(size, len(to), values.shape[-1], width)
+            targets, sources = np.nonzero(mask)
+            if len(targets):
+                values = self.values[parent.name][:, :, sources]
+                weight = values.new_zeros(size, len(targets), values.shape[-1], width)
                 deviation = values.std(0)
                 deviation = torch.where(deviation > 0, deviation, 1.0)  # zero at padding
-                found.append(Link(parent.name, to, of, weight, values.mean(0), deviation))
-        return tuple(found)
+                links.append(Link(parent.name, targets, sources, weight, values.mean(0), deviation))
+        return tuple(links)

@@ -17,12 +17,12 @@ from ...data.batch import Batch
 from ...networks.loop import valid_steps
 from ...program.batch import repeat
 from ...program.model import DynamicalVAE
-from ...program.rollout import Sequence as SequenceLaw
+from ...program.rollout import Sequence as SequenceDistribution
 from ..evaluation.evaluation_windows import on_device_of, refuse_non_finite
 from .elbo import SequenceELBO, iwae_bound, site_log_prob, sites_of
 from .particles import fivo_bound
 
-_GUIDE_DRAWS = 8  # draws to average posterior means; the remaining noise is subtracted
+_GUIDE_DRAWS = 8  # averaged for posterior means; the variance of the remaining noise is subtracted
 
 
 def bounds(
@@ -35,7 +35,7 @@ def bounds(
     parts: Iterable[slice],
 ) -> dict[str, Any]:
     """Return bounds and KL terms in nats per sequence (N,), KL by step (T,), estimates (E, N) and frames (N,)."""
-    found: list[dict[str, Tensor]] = []
+    results: list[dict[str, Tensor]] = []
     steps: dict[str, Tensor] = {}
     for part in parts:
         piece = on_device_of(model, batch.rows(part))
@@ -50,13 +50,14 @@ def bounds(
         for latent in terms.kl.keys() & terms.steps.keys():
             steps[latent] = steps.get(latent, 0) + terms.steps[latent].double().sum(0)
         scores |= {"estimates": values, "frames": terms.frames}
-        found.append({metric: value.double().cpu() for metric, value in scores.items()})
-    whole = {metric: torch.cat([piece[metric] for piece in found], dim=-1) for metric in found[0]}
-    weighted, length = whole.pop("estimates"), whole.pop("frames")
+        results.append({metric: value.double().cpu() for metric, value in scores.items()})
+    merged = {metric: torch.cat([piece[metric] for piece in results], dim=-1) for metric in results[0]}
+    weighted, length = merged.pop("estimates"), merged.pop("frames")
     return {
-        "bounds": {metric: values.numpy() for metric, values in whole.items()},
+        "bounds": {metric: values.numpy() for metric, values in merged.items()},
         "kl_steps": {
-            latent: (total.cpu() / _alive(length, len(total)).clamp(min=1)).numpy() for latent, total in steps.items()
+            latent: (total.cpu() / _count_by_step(length, len(total)).clamp(min=1)).numpy()
+            for latent, total in steps.items()
         },
         "estimates": weighted.numpy(),
         "frames": length.numpy(),
@@ -72,12 +73,12 @@ def filtered(
     parts: Iterable[slice],
 ) -> dict[str, np.ndarray]:
     """Return the FIVO bound in nats per sequence (N,)."""
-    found = []
+    values = []
     for part in parts:
         bound = fivo_bound(model, on_device_of(model, batch.rows(part)), particles).bound
         refuse_non_finite(name, "FIVO bound", bound.isfinite(), keys[part])
-        found.append(bound.double().cpu())
-    return {"FIVO bound": torch.cat(found).numpy()}
+        values.append(bound.double().cpu())
+    return {"FIVO bound": torch.cat(values).numpy()}
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
@@ -94,11 +95,11 @@ def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict
                 valid = valid * valid_steps(piece.lengths, mean.shape[1])[..., None]
             moments = torch.stack([(valid * value).sum(0) for value in (torch.ones_like(mean), mean, mean**2, noise)])
             sums[name] = sums[name] + moments if name in sums else moments
-    found = {}
+    result = {}
     for name, (count, total, squares, noise) in sums.items():
         between = (squares - total**2 / count.clamp(min=1)).sum(0) / (count - 1).clamp(min=0).sum(0)
-        found[name] = (between - noise.sum(0) / count.sum(0)).cpu().numpy()
-    return found
+        result[name] = (between - noise.sum(0) / count.sum(0)).cpu().numpy()
+    return result
 
 
 def _posterior_means(model: DynamicalVAE, batch: Batch) -> dict[str, Tensor]:
@@ -106,7 +107,7 @@ def _posterior_means(model: DynamicalVAE, batch: Batch) -> dict[str, Tensor]:
     means = {}
     for name, site in sites_of(poutine.trace(model.guide).get_trace(batch)).items():
         fn, value = site["fn"], site["value"]
-        local = isinstance(fn, SequenceLaw)
+        local = isinstance(fn, SequenceDistribution)
         means[name] = fn.steps(value).mean if local else fn.mean[:, None]
     return means
 
@@ -115,12 +116,12 @@ def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> di
     """Return each latent's information about the data among the M sequences, (T,), or (1,) if static."""
     batch = on_device_of(model, batch)
     size = length_of(batch)
-    drawn = model.guide(batch) if size else {}
+    latents = model.guide(batch) if size else {}
     totals: dict[str, Tensor] = {}
     counts: dict[str, Tensor] = {}
     for part in parts:
         rows = torch.arange(size)[part]
-        values = {name: value[part].repeat_interleave(size, 0) for name, value in drawn.items()}
+        values = {name: value[part].repeat_interleave(size, 0) for name, value in latents.items()}
         guide = poutine.condition(model.guide, data=values)
         trace = poutine.trace(guide).get_trace(repeat(batch, len(rows)))
         for name, site in sites_of(trace).items():
@@ -130,10 +131,10 @@ def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> di
             if batch.lengths is not None and density.shape[2] > 1:
                 valid = valid_steps(batch.lengths, density.shape[2])
             density = density.masked_fill(~valid, -math.inf)
-            own = density[torch.arange(len(rows)), rows]
+            matched = density[torch.arange(len(rows)), rows]
             mixture = density.logsumexp(1) - valid.sum(0).clamp(min=1).double().log()
-            told = torch.where(valid[part], own - mixture, 0.0).sum(0)
-            totals[name] = totals[name] + told if name in totals else told
+            gain = torch.where(valid[part], matched - mixture, 0.0).sum(0)
+            totals[name] = totals[name] + gain if name in totals else gain
             counts[name] = valid.sum(0).clamp(min=1)
     return {name: (total / counts[name]).cpu().numpy() for name, total in totals.items()}
 
@@ -143,6 +144,6 @@ def length_of(batch: Batch) -> int:
     return len(next(value for value in batch.values() if isinstance(value, Tensor)))
 
 
-def _alive(lengths: Tensor, steps: int) -> Tensor:
+def _count_by_step(lengths: Tensor, steps: int) -> Tensor:
     """Return the number of sequences that reach each step, (T,)."""
     return (lengths[:, None] > torch.arange(steps)).sum(0)

@@ -1,4 +1,4 @@
-"""Checks of a fitted model and its guide."""
+"""Diagnostics of a fitted model and its guide."""
 
 from typing import TYPE_CHECKING
 

@@ -47,9 +47,9 @@ from ..evaluation.result import Result, Table, new_figure, progress_bar
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OWN, ALL = "local ELBO", "local ELBO, all edges"
+OWN, ALL = "semi-amortized ELBO", "semi-amortized ELBO, all edges"
 BOUNDS = ("ELBO", "IWAE", "FIVO", OWN, ALL, "AIS", "upper")
-"""Names of the bounds, from the loosest to the upper one."""
+"""Names of the bounds: lower bounds from the loosest to the tightest, then the upper bound."""
 PARTS = {
     "amortisation": ("ELBO", OWN),
     "missing edges": (OWN, ALL),
@@ -58,8 +58,8 @@ PARTS = {
 }
 """Parts of the gap, each from one bound to another.
 
-"family" is a lower bound of its part, because AIS is a lower bound of the evidence. "unknown" is the bracket, for
-simulated data only.
+"family" is a lower bound of its part, because AIS is a lower bound on the evidence. "unknown" is the width of the
+bracket, for simulated data only.
 """
 WIDE = 0.5
 """Width of a bracket, in nats, that may indicate a missed mode; with two equal modes it is log 2."""
@@ -78,19 +78,19 @@ class Bracket(Result):
         keys: (split, clip, first frame) of every sequence.
         frames: number of frames of every sequence, real and simulated, (N,).
         equations: "generative" and "inference".
-        added: for each latent, the latents that the guide with all edges reads in addition.
+        added: for each latent, the additional parents of the guide with all edges.
         data: fingerprint and description of the windows.
         particles: K of IWAE and FIVO, and number of draws for ELBOs.
         temperatures, chains: numbers of temperatures and chains of annealed importance sampling.
         fitting: number of steps of each semi-amortized guide.
         seed: seed of all draws.
-        notes: bounds that are not available, with reasons, and warnings.
+        notes: bounds that are not available, with reasons; and warnings.
 
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
-        >>> found = dvae.bracket(model, model.sample(4, 4)["x"], temperatures=5, fitting=100, progress=False)
-        >>> gap = found.gap("simulated")
+        >>> result = dvae.bracket(model, model.sample(4, 4)["x"], temperatures=5, fitting=100, progress=False)
+        >>> gap = result.gap("simulated")
         >>> gap["amortisation"].mean > gap["missing edges"].mean
         True
     """
@@ -119,22 +119,22 @@ class Bracket(Result):
         Raises:
             KeyError: when the bound does not exist for these data.
         """
-        known = self.bounds[data]
-        if lacking := [name for name in (bound, above) if name and name not in known]:
-            raise KeyError(f"{data} data have no {lacking[0]!r}; they have {', '.join(known)}")
-        values = known[bound] - (known[above] if above else 0.0)
+        bounds = self.bounds[data]
+        if missing := [name for name in (bound, above) if name and name not in bounds]:
+            raise KeyError(f"{data} data have no {missing[0]!r}; they have {', '.join(bounds)}")
+        values = bounds[bound] - (bounds[above] if above else 0.0)
         weights = self.frames if frame else np.ones(len(values))
-        places = clip_index(self.keys).numpy() if data == "real" else np.arange(len(values))
-        return TwoWayErrors.by_clip(values[None], weights, places).estimate()
+        clips = clip_index(self.keys).numpy() if data == "real" else np.arange(len(values))
+        return TwoWayErrors.by_clip(values[None], weights, clips).estimate()
 
     def gap(self, data: str = "real", *, frame: bool = False) -> dict[str, Estimate]:
-        """Return the known parts of the gap between ELBO and evidence; see the module.
+        """Return the parts of the gap between ELBO and evidence; see the module.
 
-        "family" is a lower limit, because it ends at the lower bound of the evidence. "unknown", for simulated data, is
-        the distance from this bound to the upper one, and so how much larger the family part may be.
+        "family" is a lower limit, because it ends at the lower bound on the evidence. "unknown", for simulated data, is
+        the distance from this bound to the upper one: the family part may be larger by this amount.
         """
-        known = self.bounds[data]
-        parts = {name: ends for name, ends in PARTS.items() if all(end in known for end in ends)}
+        bounds = self.bounds[data]
+        parts = {name: ends for name, ends in PARTS.items() if all(end in bounds for end in ends)}
         return {name: self.estimate(high, low, data, frame=frame) for name, (low, high) in parts.items()}
 
     def table(self) -> Group:
@@ -143,8 +143,8 @@ class Bracket(Result):
 
     def _bounds(self, data: str) -> Table:
         clip, frame = axis_names(self.data)
-        said = f"{len(self.keys)} sequences of {len({*clip_index(self.keys).tolist()})} {clip}s"
-        title = f"{self.equations['generative']}\n{self.equations['inference']}\n{said}" if data == "real" else ""
+        counts = f"{len(self.keys)} sequences of {len({*clip_index(self.keys).tolist()})} {clip}s"
+        title = f"{self.equations['generative']}\n{self.equations['inference']}\n{counts}" if data == "real" else ""
         caption = f"mean ± standard error over sequences{f', clustered by {clip}' if data == 'real' else ''}"
         table = Table(title=title, caption="\n".join([caption, *(self.notes if data == "real" else ())]))
         table.add_column(f"{data} data")
@@ -152,11 +152,11 @@ class Bracket(Result):
             table.add_column(column, justify="right")
         for name in self.bounds[data]:
             above = "–" if name == "ELBO" else format_estimate(self.estimate(name, "ELBO", data))
-            whole, each = (format_estimate(self.estimate(name, data=data, frame=frame)) for frame in (False, True))
-            table.add_row(self._called(name), whole, above, each)
+            total, per_frame = (format_estimate(self.estimate(name, data=data, frame=frame)) for frame in (False, True))
+            table.add_row(self._label(name), total, above, per_frame)
         return table
 
-    def _called(self, name: str) -> str:
+    def _label(self, name: str) -> str:
         if name in ("IWAE", "FIVO"):
             return f"{name}, K = {self.particles}"
         return f"{name}, L = {self.temperatures}, K = {self.chains}" if name in ("AIS", "upper") else name
@@ -169,10 +169,10 @@ class Bracket(Result):
         table.add_column("")
         for data in DATA:
             table.add_column(f"{data} data", justify="right")
-        found = {data: self.gap(data) for data in DATA}
+        gaps = {data: self.gap(data) for data in DATA}
         for name, (low, high) in PARTS.items():
-            if name in found["simulated"]:
-                cells = (format_estimate(found[data][name]) if name in found[data] else "–" for data in DATA)
+            if name in gaps["simulated"]:
+                cells = (format_estimate(gaps[data][name]) if name in gaps[data] else "–" for data in DATA)
                 at_least = ", at least" if name == "family" else ""
                 table.add_row(f"{name}{at_least} ({low} to {high})", *cells)
         return table
@@ -180,7 +180,7 @@ class Bracket(Result):
     def plot(self) -> Figure:
         """Draw all bounds above the ELBO for real and simulated data, the parts of the gap, and the bracket shaded."""
         figure = new_figure(9, 6)
-        panels = figure.subplots(2, 1)  # separate axes: a guide may be far worse on data it was not fitted to
+        panels = figure.subplots(2, 1)  # separate axes, because a guide may be far worse on simulated data
         unknown = self.estimate("upper", "AIS", "simulated").mean
         for panel, data in zip(panels, DATA, strict=True):
             names = list(self.bounds[data])
@@ -195,7 +195,7 @@ class Bracket(Result):
             for place, name in enumerate(names):
                 estimate = self.estimate(name, "ELBO", data)
                 panel.errorbar(estimate.mean, place, xerr=_reach(estimate), fmt="o", color="C7", markersize=5)
-            panel.set_yticks(range(len(names) + 1), [*map(self._called, names), "parts of the gap"], fontsize=8)
+            panel.set_yticks(range(len(names) + 1), [*map(self._label, names), "parts of the gap"], fontsize=8)
             panel.invert_yaxis()
             panel.set_title(f"{data} data", loc="left", fontsize=10)
             panel.grid(axis="x", alpha=0.3)
@@ -216,9 +216,9 @@ class Bracket(Result):
     def check(self) -> None:
         real, simulated = (self.bounds[data] for data in DATA)
         if not {"ELBO", "AIS"} <= real.keys() & simulated.keys() or "upper" not in simulated:
-            raise ValueError("bounds are missing")
+            raise ValueError("bounds are missing; expected ELBO and AIS of real and simulated data, and upper")
         if unknown := (real.keys() | simulated.keys()) - {*BOUNDS}:
-            raise ValueError(f"unknown bounds {', '.join(sorted(unknown))}")
+            raise ValueError(f"unknown bounds {', '.join(sorted(unknown))}; expected some of {', '.join(BOUNDS)}")
         if self.extents != {"sequence": {len(self.keys)}} or not self.keys:
             raise ValueError(f"expected {len(self.keys)} numbers of every bound")
         if not all(np.isfinite(values).all() for values in (self.frames, *real.values(), *simulated.values())):
@@ -266,7 +266,7 @@ def bracket(
     Args:
         model: model with its guide.
         data: windows, x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
-        count: number of sequences, drawn at random; None for all.
+        count: number of sequences to draw at random; None for all.
         particles: K, number of draws of ELBOs and IWAE, and of particles of FIVO.
         temperatures, chains: L and K of annealed importance sampling, as in `annealed_bound`.
         fitting: number of steps of the semi-amortized guides (`semi_amortized_guide`); 0 omits them and the parts of
@@ -285,8 +285,8 @@ def bracket(
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
-        >>> found = dvae.bracket(model, torch.randn(4, 4, 2), temperatures=5, fitting=0, progress=False)
-        >>> list(found.bounds["simulated"])
+        >>> result = dvae.bracket(model, torch.randn(4, 4, 2), temperatures=5, fitting=0, progress=False)
+        >>> list(result.bounds["simulated"])
         ['ELBO', 'IWAE', 'FIVO', 'AIS', 'upper']
     """
     if min(particles, temperatures, chains, batch_size, 1 if count is None else count) < 1 or fitting < 0:
@@ -297,57 +297,57 @@ def bracket(
     require_likelihood(model)
     require_latents(model)
     data = take_split(data, "test")
-    whole, notes = sequences(data).batch, []
-    if whole.group is not None and model.grouped:
+    all_rows, notes = sequences(data).batch, []
+    if all_rows.group is not None and model.grouped:
         raise ValueError("sequences of a group have no separate evidence; remove 'group' from the batch")
     windows = data if isinstance(data, HeldOutWindows) else None
-    size = length_of(whole)
+    size = length_of(all_rows)
     keys = [("data", str(n), 0) for n in range(size)] if windows is None else clusters(windows)
-    chance = torch.Generator().manual_seed(seed)
-    chosen = torch.randperm(size, generator=chance)[:count]
-    batch, keys = whole.rows(chosen), [keys[n] for n in chosen.tolist()]
+    generator = torch.Generator().manual_seed(seed)
+    indices = torch.randperm(size, generator=generator)[:count]
+    batch, keys = all_rows.rows(indices), [keys[n] for n in indices.tolist()]
     parts = [slice(first, first + batch_size) for first in range(0, len(keys), batch_size)]
-    read = [model.read(on_device_of(model, batch.rows(part))) for part in parts]
+    batches = [model.read(on_device_of(model, batch.rows(part))) for part in parts]
     if fitting:
         try:
             require_local(model)
         except ValueError as error:
             fitting = 0
             notes.append(f"no parts of the gap: {error}")
-    refused = next(filter(None, (obstacle(model, part) for part in read)), "")
-    if refused:
-        notes.append(f"no FIVO: {refused}")
-    with seeded_evaluation(model, _seeds(chance, 1)[0]):
-        drawn = [_simulated(model, part) for part in read]
+    reason = next(filter(None, (obstacle(model, part) for part in batches)), "")
+    if reason:
+        notes.append(f"no FIVO: {reason}")
+    with seeded_evaluation(model, _seeds(generator, 1)[0]):
+        simulations = [_simulate(model, part) for part in batches]
     added = missing_latents(model) if fitting else {}
-    work = _Work(model, particles, temperatures, chains, fitting, reach, bool(refused), bool(added))
-    found: dict[str, list[dict[str, Tensor]]] = {name: [] for name in DATA}
-    few = dict.fromkeys(DATA, 0)
+    work = _Work(model, particles, temperatures, chains, fitting, reach, bool(reason), bool(added))
+    results: dict[str, list[dict[str, Tensor]]] = {name: [] for name in DATA}
+    unreliable = dict.fromkeys(DATA, 0)
     with progress_bar(progress) as bar:
         task = bar.add_task("bracket", total=len(parts) * 2 * ((1 + bool(added)) * fitting + 1))
-        for place, (real, (simulated, latents)) in enumerate(zip(read, drawn, strict=True)):
-            for name, some, start in (("real", real, None), ("simulated", simulated, latents)):
-                bounds, effective = work.bounds(some, start, _seeds(chance, 3), lambda: bar.advance(task))
-                few[name] += int((effective < chains / 2).sum())
+        for index, (real, (simulated, latents)) in enumerate(zip(batches, simulations, strict=True)):
+            for name, rows, start in (("real", real, None), ("simulated", simulated, latents)):
+                bounds, effective = work.bounds(rows, start, _seeds(generator, 3), lambda: bar.advance(task))
+                unreliable[name] += int((effective < chains / 2).sum())
                 for bound, values in bounds.items():
-                    refuse_non_finite(bound, f"bound of {name} data", values.isfinite(), keys[parts[place]])
-                found[name].append(bounds)
+                    refuse_non_finite(bound, f"bound of {name} data", values.isfinite(), keys[parts[index]])
+                results[name].append(bounds)
                 bar.advance(task)
     notes += [
         f"AIS of {name} data: less than half of the {chains} chains are effective in {number} of {len(keys)} sequences"
-        for name, number in few.items()
+        for name, number in unreliable.items()
         if number
     ]
     result = Bracket(
         bounds={
             name: {bound: torch.cat([part[bound] for part in all_]).double().cpu().numpy() for bound in all_[0]}
-            for name, all_ in found.items()
+            for name, all_ in results.items()
         },
         keys=keys,
-        frames=torch.cat([_frames(model, part) for part in read]).double().cpu().numpy(),
+        frames=torch.cat([_frames(model, part) for part in batches]).double().cpu().numpy(),
         equations={"generative": model.generative.text, "inference": model.inference.text},
         added={name: [term for parent in parents for term in parent.terms] for name, parents in added.items()},
-        data={} if windows is None else {"fingerprint": windows.fingerprint, **_called(windows)},
+        data={} if windows is None else {"fingerprint": windows.fingerprint, **_axis_words(windows)},
         particles=particles,
         temperatures=temperatures,
         chains=chains,
@@ -359,17 +359,17 @@ def bracket(
     if unknown.mean > max(WIDE, 2 * unknown.sequences):
         notes.append(
             f"on simulated data the upper bound lies {format_estimate(unknown)} nats above AIS. AIS and family may be "
-            "too low by this amount, as when all chains stay in one mode, whatever the spread of the chains is"
+            "too low by this amount, for example if all chains stay in one mode"
         )
     return result
 
 
-def _seeds(chance: torch.Generator, count: int) -> list[int]:
+def _seeds(generator: torch.Generator, count: int) -> list[int]:
     """Return independent seeds, so that a guide is not evaluated with the draws it was fitted with."""
-    return torch.randint(2**31, (count,), generator=chance).tolist()  # type: ignore[no-any-return]
+    return torch.randint(2**31, (count,), generator=generator).tolist()  # type: ignore[no-any-return]
 
 
-def _called(windows: HeldOutWindows) -> dict[str, Any]:
+def _axis_words(windows: HeldOutWindows) -> dict[str, Any]:
     return {"called": list(axis_names(windows.description))} if "called" in windows.description else {}
 
 
@@ -378,14 +378,14 @@ def _frames(model: DynamicalVAE, data: Batch) -> Tensor:
     return torch.full((len(x),), x.shape[1]) if data.lengths is None else data.lengths
 
 
-def _simulated(model: DynamicalVAE, real: Batch) -> tuple[Batch, dict[str, Tensor]]:
-    """Return sequences drawn from the model, as it reads them, of the same lengths and context, and their latents."""
+def _simulate(model: DynamicalVAE, real: Batch) -> tuple[Batch, dict[str, Tensor]]:
+    """Return sequences drawn from the model with the same lengths and context, as it reads them, and their latents."""
     x = real[model.observed[0]]
-    kept = Batch({name: value for name, value in real.items() if name not in (*model.observed, "mask", "log_det")})
-    drawn = model.model(kept, length=x.shape[1] if x.dim() == 3 else None, size=len(x))
-    latents = {name: drawn[name] for name in model.latents}
-    seen = kept | {name: drawn[name] for name in model.observed}
-    return (seen if model.view.keeps_volume else model.read(model.to_data_space(seen, kept))), latents
+    context = Batch({name: value for name, value in real.items() if name not in (*model.observed, "mask", "log_det")})
+    draws = model.model(context, length=x.shape[1] if x.dim() == 3 else None, size=len(x))
+    latents = {name: draws[name] for name in model.latents}
+    simulated = context | {name: draws[name] for name in model.observed}
+    return (simulated if model.view.keeps_volume else model.read(model.to_data_space(simulated, context))), latents
 
 
 @dataclass(frozen=True)
@@ -398,45 +398,45 @@ class _Work:
     chains: int
     fitting: int
     reach: int | None
-    blocked: bool
-    lacking: bool
+    no_filter: bool
+    edges_missing: bool
 
     def bounds(
         self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seeds: Sequence[int], advance: Any
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the bounds (B,) by name, and effective chains (B,); with given latents, also an upper bound.
+        """Return the bounds (B,) by name, and effective chains (B,); with exact latents, also an upper bound.
 
         The draws of all ELBOs have the same seed, so that their differences have less noise.
         """
-        model, found = self.model, {}
-        judging, fitting, annealing = seeds
-        with seeded_evaluation(model, judging):
+        model, bounds = self.model, {}
+        evaluation_seed, fitting_seed, annealing_seed = seeds
+        with seeded_evaluation(model, evaluation_seed):
             weights = self._weights(model, data)
-            found["ELBO"], found["IWAE"] = weights.mean(0), weights.logsumexp(0) - math.log(self.particles)
-            if not self.blocked:
-                found["FIVO"] = fivo_bound(model, data, self.particles, chunk=CHUNK).bound
+            bounds["ELBO"], bounds["IWAE"] = weights.mean(0), weights.logsumexp(0) - math.log(self.particles)
+            if not self.no_filter:
+                bounds["FIVO"] = fivo_bound(model, data, self.particles, chunk=CHUNK).bound
         for name, missing in ((OWN, False), (ALL, True)) if self.fitting else ():
-            if not missing or self.lacking:  # otherwise there is nothing to add
-                how: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": fitting}
-                model = semi_amortized_guide(self.model, data, **how, progress=advance)
-            with seeded_evaluation(model, judging):
-                found[name] = self._weights(model, data).mean(0)
-        how = {"temperatures": self.temperatures, "chains": self.chains, "seed": annealing}
-        how["chunk"] = self.chains * len(found["ELBO"])  # a semi-amortized guide needs all sequences of the batch
-        annealed = annealed_bound(model, data, **how)
-        found["AIS"] = annealed.bound
+            if not missing or self.edges_missing:  # otherwise both guides are the same
+                options: Any = {"missing": missing, "steps": self.fitting, "reach": self.reach, "seed": fitting_seed}
+                model = semi_amortized_guide(self.model, data, **options, progress=advance)
+            with seeded_evaluation(model, evaluation_seed):
+                bounds[name] = self._weights(model, data).mean(0)
+        options = {"temperatures": self.temperatures, "chains": self.chains, "seed": annealing_seed}
+        options["chunk"] = self.chains * len(bounds["ELBO"])  # a semi-amortized guide needs all sequences of the batch
+        annealed = annealed_bound(model, data, **options)
+        bounds["AIS"] = annealed.bound
         if latents is not None:
-            found["upper"] = annealed_bound(model, data, **how, latents=latents).bound
-        return found, annealed.effective
+            bounds["upper"] = annealed_bound(model, data, **options, latents=latents).bound
+        return bounds, annealed.effective
 
     def _weights(self, model: DynamicalVAE, data: AnyBatch) -> Tensor:
         """Return log p(x, z) - log q(z | x) at draws z, (K, B)."""
         size = len(data[model.observed[0]])  # type: ignore[call-overload, index]
         at_once = max(1, CHUNK // size)
-        found = []
+        parts = []
         for first in range(0, self.particles, at_once):
             count = min(at_once, self.particles - first)
             rows = repeat(data, count)
-            joint, own = joint_and_guide(model, rows, model.guide(rows))
-            found.append((joint - own).unflatten(0, (count, size)))
-        return torch.cat(found)
+            joint, guide = joint_and_guide(model, rows, model.guide(rows))
+            parts.append((joint - guide).unflatten(0, (count, size)))
+        return torch.cat(parts)

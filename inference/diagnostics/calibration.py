@@ -69,11 +69,11 @@ class Calibration(Result):
 
     @cached_property
     def p_values(self) -> np.ndarray:
-        """Exact p-values of uniformity, (Q,): at most alpha if and only if the ECDF leaves its envelope at alpha."""
+        """Exact p-values of uniformity, (Q,); at most alpha if and only if the ECDF leaves its envelope at alpha."""
         tails = _tails(len(self.ranks), self.draws)
         below = self.counts.cumsum(1)[:, :-1]
-        least, which = np.unique(tails[np.arange(self.draws), below].min(1), return_inverse=True)
-        return _ecdf_test(least, len(self.ranks), self.draws)[which]
+        least, inverse = np.unique(tails[np.arange(self.draws), below].min(1), return_inverse=True)
+        return _ecdf_test(least, len(self.ranks), self.draws)[inverse]
 
     @property
     def adjusted(self) -> np.ndarray:
@@ -87,16 +87,16 @@ class Calibration(Result):
 
     @property
     def bias(self) -> np.ndarray:
-        """Position of the truth above the guide's mean, in the guide's standard deviations, (Q,); see `spread`."""
+        """Mean of the truth minus the guide's mean, in the guide's standard deviations, (Q,); see `spread`."""
         return self._normals[:, 0]
 
     @property
     def spread(self) -> np.ndarray:
-        """Standard deviation of the truth about the guide's mean relative to the guide's, (Q,); above 1: too narrow.
+        """Standard deviation of the truth about the guide's mean, relative to the guide's, (Q,); above 1: too narrow.
 
-        Bias and spread are of the normal truth that most likely has these ranks among L standard normal draws. They are
-        accurate if guide and posterior are normal. If ranks accumulate at an end, the data do not determine them; a
-        prior with less weight than one simulation keeps them finite.
+        Bias and spread are the mean and deviation of the normal truth that makes these ranks among L standard normal
+        draws most likely. They are accurate if guide and posterior are normal. If ranks accumulate at an end, the data
+        do not determine them; a prior with less weight than one simulation keeps them finite.
         """
         return np.exp(self._normals[:, 1])
 
@@ -114,7 +114,7 @@ class Calibration(Result):
         rejected = int((self.adjusted <= 0.05).sum())
         number = f"{len(self.names)} quantities, {len(self.ranks)} simulations, p = {self.p_value:.2g}"
         if not rejected:
-            return f"nothing speaks against the guide ({number})"
+            return f"no evidence against the guide ({number})"
         return f"the guide is not the posterior: {rejected} of {number}"
 
     def envelope(self, alpha: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -171,14 +171,14 @@ class Calibration(Result):
             for panel in (top, bottom):
                 panel.tick_params(labelsize=7)
             if column == 0:
-                top.set_ylabel("ranks\nover uniform", fontsize=8)
-                bottom.set_ylabel("ECDF\nless uniform", fontsize=8)
+                top.set_ylabel("ranks\n/ uniform", fontsize=8)
+                bottom.set_ylabel("ECDF\n− uniform", fontsize=8)
         for place in range(len(order), rows * columns):
             row, column = divmod(place, columns)
             panels[2 * row, column].set_axis_off()
             panels[2 * row + 1, column].set_axis_off()
-        shown = "" if len(order) == len(self.names) else f" · worst {len(order)} of {len(self.names)}"
-        figure.suptitle(f"{self._title}{shown}", fontsize=9, parse_math=False)
+        selection = "" if len(order) == len(self.names) else f" · worst {len(order)} of {len(self.names)}"
+        figure.suptitle(f"{self._title}{selection}", fontsize=9, parse_math=False)
         figure.supxlabel(f"rank among {self.draws} draws, scaled to [0, 1]", fontsize=8)
         return figure
 
@@ -197,13 +197,17 @@ class Calibration(Result):
     def check(self) -> None:
         count, quantities = self.ranks.shape
         if len(self.names) != quantities or not count or not 1 <= self.draws <= _MOST / max(count, quantities):
-            raise ValueError(f"expected ranks of {len(self.names)} quantities, and few draws, not {self.draws}")
+            raise ValueError(
+                f"expected ranks of {len(self.names)} quantities, at least one simulation and 1 to "
+                f"{_MOST // max(count, quantities, 1)} draws; got {quantities} quantities, {count} simulations and "
+                f"{self.draws} draws"
+            )
         if (self.ranks < 0).any() or (self.ranks > self.draws).any():
             raise ValueError(f"ranks must be between 0 and {self.draws}")
 
     @property
     def _title(self) -> str:
-        return f"simulation-based calibration · {self.equations.get('inference', 'guide of one’s own')}"
+        return f"simulation-based calibration · {self.equations.get('inference', 'custom guide')}"
 
     @cached_property
     def _normals(self) -> np.ndarray:
@@ -249,7 +253,7 @@ def calibrate(
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
-        >>> found = dvae.calibrate(model, 4, simulations=20, draws=19, steps=(2, 4), progress=False)
+        >>> result = dvae.calibrate(model, 4, simulations=20, draws=19, steps=(2, 4), progress=False)
     """
     if min(length, simulations, draws, chunk) < 1:
         raise ValueError(
@@ -260,26 +264,30 @@ def calibrate(
         raise ValueError(
             f"{model.generative} has no latents: its likelihood is exact, and it has no guide to calibrate"
         )
-    kept = list(range(1, length + 1)) if steps is None else list(steps)
-    if not kept or len(set(kept)) < len(kept) or not set(kept) <= set(range(1, length + 1)):
-        raise ValueError(f"steps must be different numbers from 1 to {length}, got {kept}")
+    ranked_steps = list(range(1, length + 1)) if steps is None else list(steps)
+    if (
+        not ranked_steps
+        or len(set(ranked_steps)) < len(ranked_steps)
+        or not set(ranked_steps) <= set(range(1, length + 1))
+    ):
+        raise ValueError(f"steps must be different numbers from 1 to {length}, got {ranked_steps}")
     contexts: Mapping[str, Tensor] = context or {}
     if missing := [name for name in model.context if name not in contexts]:
         raise ValueError(f"the model reads the context {', '.join(missing)}; pass context={{name: values}}")
     infer = guide or model.guide
     at_once = max(1, chunk // draws)
-    ranks, places = [], torch.tensor(kept) - 1
+    ranks, places = [], torch.tensor(ranked_steps) - 1
 
-    def given(turn: Tensor) -> dict[str, Any]:
-        return on_device_of(model, {name: value[turn % len(value)] for name, value in contexts.items()})
+    def context_rows(indices: Tensor) -> dict[str, Any]:
+        return on_device_of(model, {name: value[indices % len(value)] for name, value in contexts.items()})
 
     with seeded_evaluation(model, seed + 1):  # independent of the ranked simulations
-        points = _Points.of(model, given(torch.arange(draws)), draws, length, places)
+        points = _Points.of(model, context_rows(torch.arange(draws)), draws, length, places)
     with seeded_evaluation(model, seed), progress_bar(progress) as bar:
         for start in bar.track(range(0, simulations, at_once), description="simulations"):
-            turn = torch.arange(start, min(start + at_once, simulations))
-            ranks.append(_ranks(model, infer, given(turn), len(turn), length, draws, places, points))
-    names = quantities(model, kept)
+            indices = torch.arange(start, min(start + at_once, simulations))
+            ranks.append(_ranks(model, infer, context_rows(indices), len(indices), length, draws, places, points))
+    names = quantities(model, ranked_steps)
     equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
     return Calibration(torch.cat(ranks).numpy(), (*names, TARP, LOG_JOINT), draws, length, seed, equations)
 
@@ -307,7 +315,7 @@ def envelope(count: int, draws: int, alpha: float = 0.05) -> tuple[np.ndarray, n
 
 @dataclass(frozen=True)
 class _Points:
-    """Simulations that give TARP a point for any data: the latents of the simulation with the nearest data.
+    """Simulations for TARP. The point for some data is the latents of the simulation with the nearest data.
 
     Args:
         data: data (M, F).
@@ -318,13 +326,13 @@ class _Points:
     latents: Tensor
 
     @classmethod
-    def of(cls, model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int, steps: Tensor) -> Self:
+    def of(cls, model: DynamicalVAE, context: Mapping[str, Tensor], count: int, length: int, steps: Tensor) -> Self:
         """Return `count` new simulations."""
-        drawn = _simulated(model, given, count, length)
-        return cls(_data(model, drawn), _coordinates(model, drawn, steps))
+        simulated = _simulate(model, context, count, length)
+        return cls(_data(model, simulated), _coordinates(model, simulated, steps))
 
     def distances(self, model: DynamicalVAE, batch: Mapping[str, Any], latents: Tensor) -> Tensor:
-        """Return distances of latents (B, Q), in standard deviations of each of them in the simulations, (B,)."""
+        """Return distances (B,) of latents (B, Q) from their points, in standard deviations of the simulations."""
         nearest = torch.cdist(_data(model, batch) / _scale(self.data), self.data / _scale(self.data)).argmin(1)
         return ((latents - self.latents[nearest]) / _scale(self.latents)).norm(dim=1)
 
@@ -348,13 +356,13 @@ def _coordinates(model: DynamicalVAE, latents: Mapping[str, Tensor], steps: Tens
     )
 
 
-def _simulated(model: DynamicalVAE, given: Mapping[str, Tensor], count: int, length: int) -> Mapping[str, Tensor]:
+def _simulate(model: DynamicalVAE, context: Mapping[str, Tensor], count: int, length: int) -> Mapping[str, Tensor]:
     """Return latents and data of `count` simulated sequences."""
-    truth = model.sample(count, length, given or None)
-    if wrong := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
+    truth = model.sample(count, length, context or None)
+    if invalid := [name for name in (*model.latents, *model.observed) if not truth[name].isfinite().all()]:
         raise FloatingPointError(
-            f"a free run of {length} steps gave {', '.join(wrong)} that are not finite; simulate fewer steps, "
-            "or check whether the model has been fitted"
+            f"simulations of {length} steps have values of {', '.join(invalid)} that are not finite; simulate fewer "
+            "steps, or check whether the model has been fitted"
         )
     return truth
 
@@ -362,14 +370,14 @@ def _simulated(model: DynamicalVAE, given: Mapping[str, Tensor], count: int, len
 def _ranks(
     model: DynamicalVAE,
     infer: Callable[..., Any],
-    given: Mapping[str, Tensor],
+    context: Mapping[str, Tensor],
     count: int,
     length: int,
     draws: int,
     steps: Tensor,
     points: _Points,
 ) -> Tensor:
-    """Return ranks (B, Q) of B simulations, latents and data, among the guide's draws of their latents."""
+    """Return ranks (B, Q) of the latents of B simulations among the guide's draws of them."""
 
     def quantities(batch: Mapping[str, Any], latents: Mapping[str, Tensor]) -> Tensor:
         """Return all quantities, (B, Q)."""
@@ -377,21 +385,21 @@ def _ranks(
         joint = torch.stack(list(model.log_joint(batch, latents).values())).sum(0)
         return torch.cat([ranked, points.distances(model, batch, ranked)[:, None], joint[:, None]], 1)
 
-    truth = _simulated(model, given, count, length)
-    batch = {**given, **{name: truth[name] for name in model.observed}}
+    truth = _simulate(model, context, count, length)
+    batch = {**context, **{name: truth[name] for name in model.observed}}
     repeated = repeat(batch, draws)
     sites = poutine.trace(infer).get_trace(repeated).nodes
     if missing := [name for name in model.latents if name not in sites]:
-        raise ValueError(f"the guide draws no {', '.join(missing)}; it needs one site for each latent")
-    found: dict[str, Any] = {name: sites[name]["value"] for name in model.latents}
-    drawn = quantities(repeated, found)
-    true = quantities(batch, {name: truth[name] for name in model.latents})
-    return (drawn.unflatten(0, (draws, count)) < true).sum(0).cpu()
+        raise ValueError(f"the guide has no site for {', '.join(missing)}; it needs one for each latent")
+    draws_of_guide: dict[str, Any] = {name: sites[name]["value"] for name in model.latents}
+    drawn_values = quantities(repeated, draws_of_guide)
+    true_values = quantities(batch, {name: truth[name] for name in model.latents})
+    return (drawn_values.unflatten(0, (draws, count)) < true_values).sum(0).cpu()
 
 
 @lru_cache(maxsize=8)
 def _tails(count: int, draws: int) -> np.ndarray:
-    """Return the smaller tail (L, N + 1) of k in a Binomial(N, i / (L + 1)), the distribution of the ranks below i."""
+    """Return the smaller tail (L, N + 1) of k in a Binomial(N, i / (L + 1)), the number of ranks below i."""
     points = np.arange(1, draws + 1)[:, None] / (draws + 1)
     number = np.arange(count + 1.0)
     at_least = np.where(number > 0, scipy.special.bdtrc(np.maximum(number - 1, 0), count, points), 1.0)
@@ -401,9 +409,9 @@ def _tails(count: int, draws: int) -> np.ndarray:
 def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
     """Return P(the smallest tail of a uniform sample's ECDF over all points is at most `least`), elementwise; exact.
 
-    Counts below 1, 2, ... of uniform ranks are a Poisson process conditioned to end at N. The probability to stay
-    within bounds is therefore a chain of convolutions (Säilynoja et al. use binomial steps). `arviz_stats` simulates
-    the same probability, but drops the upper tail of every simulation with no rank below some point.
+    The numbers of uniform ranks below 1, 2, ... are a Poisson process conditioned to end at N. The probability of
+    staying within bounds is therefore a chain of convolutions (Säilynoja et al. use binomial steps). `arviz_stats`
+    simulates the same probability, but drops the upper tail of every simulation with no rank below some point.
     """
     step, size = _poisson(count, count / (draws + 1)), scipy.fft.next_fast_len(2 * count + 1, real=True)
     transform = scipy.fft.rfft(step, size)
@@ -411,15 +419,15 @@ def _ecdf_test(least: np.ndarray, count: int, draws: int) -> np.ndarray:
     within = np.zeros((len(least), count + 1))
     within[:, 0] = 1
     for tails in _tails(count, draws):
-        moved = scipy.fft.irfft(scipy.fft.rfft(within, size) * transform, size)[:, : count + 1]
-        within = np.where(tails > bound, moved, 0.0)
+        convolved = scipy.fft.irfft(scipy.fft.rfft(within, size) * transform, size)[:, : count + 1]
+        within = np.where(tails > bound, convolved, 0.0)
     inside = within @ step[::-1] / _poisson(count, count)[-1]
     # Where rounding hides the difference from 1, the sum over points bounds the probability from above.
     return np.clip(np.where(1 - inside > 1e-10, 1 - inside, 2 * draws * least), 0.0, 1.0)
 
 
 def _poisson(largest: int, mean: float) -> np.ndarray:
-    """Return the probabilities of 0 to `largest`."""
+    """Return Poisson probabilities of 0 to `largest`, (largest + 1,)."""
     number = np.arange(largest + 1)
     return np.exp(scipy.special.xlogy(number, mean) - mean - scipy.special.gammaln(number + 1))
 
@@ -447,7 +455,7 @@ def _likeliest_normal(
 ) -> tuple[np.ndarray, float]:
     """Return mean and log standard deviation of the truth that most likely has these ranks, and the log-likelihood.
 
-    A given value is fixed. Ranks 0 and L are tails: they do not determine how far outside all draws a truth lies.
+    A value that is not None is fixed. Ranks 0 and L do not determine how far outside all draws a truth lies.
     """
     edges, table = _rank_table(draws)
     scores = scipy.special.ndtri((np.arange(draws + 1) + 0.5) / (draws + 1))
@@ -467,8 +475,8 @@ def _likeliest_normal(
     ratio = math.sqrt(counts @ (scores - mean) ** 2 / counts.sum() / (scores**2).mean())
     limits = [(-12.0, 12.0) if bias is None else (bias, bias), (-3.0, 3.0) if log_spread is None else (log_spread,) * 2]
     start = np.clip([mean, math.log(max(ratio, 1.0))], *np.transpose(limits))  # wide, so that all ranks have a gradient
-    found = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits)
-    return found.x, -float(found.fun)
+    optimum = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits)
+    return optimum.x, -float(optimum.fun)
 
 
 def _reading(name: str, counts: np.ndarray, draws: int) -> str:

@@ -38,10 +38,10 @@ class Statistic:
     """Statistic of a sequence.
 
     Args:
-        function: function from x (..., T, D) to (...). For windows with missing entries x is NaN there, also in
+        function: function from x (..., T, D) to (...). For windows with missing entries x is NaN there, as it is in
             replicates.
         unit: unit of the statistic.
-        note: line below the table.
+        note: line printed below the table.
     """
 
     function: Callable[[Tensor], Tensor]
@@ -99,11 +99,11 @@ STATISTICS = {
 }
 """Statistics for any sequences, of observed numbers:
 
-"mean": mean of all numbers. "scale": standard deviation over time. "roughness": root mean square step from frame to
-frame. Both are root mean squares over coordinates. "correlation length": lag at which the autocorrelation, pooled over
-coordinates, falls below 1/e, or T if it never does. "lag-1 correlation": autocorrelation at a lag of 1, and 1 for a
-constant sequence. For counts or positive data, "zeros" is the share of zeros, and "smallest" and "largest" are the
-extremes.
+"mean": mean of all numbers. "scale": standard deviation over time. "roughness": root mean square difference of
+successive frames. Both are root mean squares over coordinates. "correlation length": lag at which the autocorrelation,
+pooled over coordinates, falls below 1/e, or T if it never does. "lag-1 correlation": autocorrelation at a lag of 1, and
+1 for a constant sequence. For counts or positive data, "zeros" is the share of zeros, and "smallest" and "largest" are
+the extremes.
 """
 _OF_DATA = ("mean", "scale", "roughness", "smallest", "largest")
 """Names of statistics in the unit of the data."""
@@ -117,7 +117,10 @@ def default_statistics(windows: HeldOutWindows) -> dict[str, Statistic]:
     """
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
-        unit, note = "scales", "statistics of all columns together are of numbers in their scales, in the training data"
+        unit, note = (
+            "scales",
+            "statistics of all columns together are in the scales of their columns, from the training data",
+        )
     elif len(units) > 1:
         unit, note = "", f"statistics without a unit mix numbers in {', '.join(unit or '1' for unit in units)}"
     else:
@@ -174,7 +177,7 @@ class Check:
         return float(scipy.stats.wasserstein_distance(self.real, self.replicated.ravel()))
 
 
-_SEAM = 2  # observed frames joined to a forecast, so that a jump counts
+_SEAM = 2  # observed frames prepended to a forecast, so that statistics include a jump between them
 PROGRAMS = {
     "forecast": "free-running given what was observed",
     "posterior": "free-running given latents inferred from the whole window",
@@ -229,7 +232,7 @@ class PredictiveChecks(Result):
             "outside: share of windows with a tail area below .05 or above .95",
             f"forecasts of a true model have ½ and, with {self.samples} replicates, {expected:.1%}"
             if self.emission == "drawn"
-            else f"means lack the emission's noise: even a true model's need not have ½ and {expected:.1%}",
+            else f"means have no emission noise, so even a true model need not have ½ and {expected:.1%}",
             *self.notes,
         ]
         table = Table(title=self._title, caption="\n".join(caption))
@@ -256,8 +259,8 @@ class PredictiveChecks(Result):
         panels = figure.subplots(len(programs), len(names), squeeze=False, sharex="col")
         for column, name in enumerate(names):
             checks = [self.checks[model, program, name] for program in programs for model in models[program]]
-            values = [found for check in checks for found in (check.real, check.replicated)]
-            # the outer bins include more extreme values, so that a wild replicate does not flatten the rest
+            values = [array for check in checks for array in (check.real, check.replicated)]
+            # outer bins also contain more extreme values, so that one replicate does not flatten the histogram
             low, high = np.quantile(np.stack([np.quantile(v, (0.005, 0.995)) for v in values]), (0, 1))
             edges = np.linspace(low, high if high > low else low + 1, 41)
             for row, program in enumerate(programs):
@@ -285,20 +288,21 @@ class PredictiveChecks(Result):
     @override
     def summary(self) -> dict[str, Any]:
         """Return distances and tail areas by model, program and statistic."""
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         for (model, program, name), check in self.checks.items():
-            found.setdefault(model, {}).setdefault(program, {})[name] = {
+            result.setdefault(model, {}).setdefault(program, {})[name] = {
                 "wasserstein": check.wasserstein,
                 "tail_area": float(check.tail_areas.mean()),
                 "outside": check.outside,
                 "expected_outside": check.expected_outside,
             }
-        return found
+        return result
 
     @override
     def check(self) -> None:
         if not self.checks or {*self._keys[1]} - {*PROGRAMS}:
-            raise ValueError(f"expected checks by the programs {', '.join(PROGRAMS)}")
+            given = ", ".join(dict.fromkeys(program for _, program, _ in self.checks)) or "none"
+            raise ValueError(f"expected checks of the programs {', '.join(PROGRAMS)}; got {given}")
         for each in self.checks.values():
             if each.replicated.shape != (self.samples, len(each.real)) or not each.real.size:
                 raise ValueError(f"expected {self.samples} replicates of every window")
@@ -307,7 +311,7 @@ class PredictiveChecks(Result):
     def _keys(self) -> tuple[dict[str, list[str]], list[str], list[str]]:
         """Models of each program, programs and statistics."""
         _, programs, names = (list(dict.fromkeys(keys)) for keys in zip(*self.checks, strict=True))
-        models = {p: list(dict.fromkeys(model for model, own, _ in self.checks if own == p)) for p in programs}
+        models = {p: list(dict.fromkeys(model for model, program, _ in self.checks if program == p)) for p in programs}
         return models, programs, names
 
     @property
@@ -331,9 +335,9 @@ def predictive_checks(
     """Replicate windows with one or several models, and compare statistics of real and replicated windows.
 
     There are two kinds of replicates, both free-running. "forecast": the frames after the observed ones. The last two
-    observed frames are joined to them, so that a jump counts. "posterior", the posterior predictive distribution:
-    latents are inferred from the whole window, and all its frames are generated from them. A model without latents has
-    no "posterior".
+    observed frames are prepended, so that statistics include a jump between them. "posterior", the posterior predictive
+    distribution: latents are inferred from the whole window, and all its frames are generated from them. A model
+    without latents has no "posterior".
 
     Missing entries of a window are also missing in its replicates. A window with too few entries for a statistic is not
     counted.
@@ -343,9 +347,9 @@ def predictive_checks(
         windows: `ArrayWindows`, or any `HeldOutWindows`.
         statistics: `Statistic` by name, for example from an application; `default_statistics` by default.
         samples: S, number of replicates of each window; at least 19, so that tail areas below .05 have a probability of
-            a tenth at most.
-        draw_emission: whether replicates are draws of x. Its means have no emission noise: with them, the check is of
-            displayed forecasts rather than of the model.
+            at most a tenth.
+        draw_emission: whether replicates are draws of x. Otherwise they are its means, without emission noise, and the
+            check is of displayed forecasts rather than of the model.
         seed: seed of every model's draws.
         batch_size: number of windows in a batch.
         progress: whether to show a progress bar.
@@ -363,47 +367,49 @@ def predictive_checks(
     models = dict(model) if isinstance(model, Mapping) else {"model": model}
     if samples < 19 or batch_size < 1 or not models:
         raise ValueError(
-            "expected a model, at least 19 samples, for tail areas below .05 to be no more than a tenth, and a "
-            f"batch_size of at least 1; got {len(models)}, {samples} and {batch_size}"
+            "expected at least one model, 19 samples (for tail areas below .05 to have a probability of at most a "
+            f"tenth) and a batch_size of 1; got {len(models)}, {samples} and {batch_size}"
         )
-    held = prepare_windows(windows)
-    windows = held.windows
+    eval_windows = prepare_windows(windows)
+    windows = eval_windows.windows
     statistics = default_statistics(windows) if statistics is None else statistics
     if not statistics:
         raise ValueError("expected at least one statistic to check, got none")
     for each in models.values():
         require_likelihood(each)
-    truth = held.batch.mask_to_nan()
+    truth = eval_windows.batch.mask_to_nan()
     _, frame = axis_names(windows.description)
-    firsts = {"forecast": held.observed - min(_SEAM, held.observed), "posterior": 0}
+    firsts = {"forecast": eval_windows.observed - min(_SEAM, eval_windows.observed), "posterior": 0}
     checks: dict[str, dict[str, dict[str, Check]]] = {label: {} for label in models}
     with progress_bar(progress) as bar:
         for program, first in firsts.items():
             real = _measure(statistics, truth[:, first:], "real windows")
-            told = {name: values.isfinite() for name, values in real.items()}
+            defined = {name: values.isfinite() for name, values in real.items()}
             for label, each in models.items():
                 if program == "posterior" and not each.latents:
                     continue  # nothing is inferred
                 parts: list[dict[str, Tensor]] = []
                 with seeded_evaluation(each, seed):
-                    starts = range(0, len(held.x), batch_size)
+                    starts = range(0, len(eval_windows.x), batch_size)
                     for start in bar.track(starts, description=f"{label}, {program}"):
-                        some = slice(start, start + batch_size)
-                        part = on_device_of(each, held.part(some))
-                        x = _REPLICATES[program](each, part, held.observed, samples, draw_emission).to(held.x)
-                        x = x.masked_fill(truth[some, first:].isnan(), torch.nan)
-                        known = {name: seen[some] for name, seen in told.items()}
-                        parts.append(_measure(statistics, x, f"replicates of {label} ({program})", known))
+                        rows = slice(start, start + batch_size)
+                        part = on_device_of(each, eval_windows.part(rows))
+                        x = _REPLICATES[program](each, part, eval_windows.observed, samples, draw_emission).to(
+                            eval_windows.x
+                        )
+                        x = x.masked_fill(truth[rows, first:].isnan(), torch.nan)
+                        expected = {name: mask[rows] for name, mask in defined.items()}
+                        parts.append(_measure(statistics, x, f"replicates of {label} ({program})", expected))
                 for name, statistic in statistics.items():
                     values, replicated = real[name], torch.cat([part[name] for part in parts], 1)
-                    kept = told[name]
+                    mask = defined[name]
                     unit = statistic.unit.replace("frame", frame)
                     checks[label].setdefault(program, {})[name] = Check(
-                        values[kept].numpy(), replicated[:, kept].numpy(), unit
+                        values[mask].numpy(), replicated[:, mask].numpy(), unit
                     )
     return PredictiveChecks(
         models=checks,
-        data=held.description(),
+        data=eval_windows.description(),
         protocol=plain(asdict(windows.protocol)),
         samples=samples,
         emission="drawn" if draw_emission else "mean",
@@ -412,54 +418,57 @@ def predictive_checks(
     )
 
 
-def _forecast(model: DynamicalVAE, batch: Batch, observed: int, samples: int, drawn: bool) -> Tensor:
+def _forecast(model: DynamicalVAE, batch: Batch, observed: int, samples: int, draw_emission: bool) -> Tensor:
     """Return the last observed frames and the future, (S, B, seam + H, D)."""
     x = batch["x"]
-    seen, horizon = batch.past(observed), x.shape[1] - observed
-    future = model.forecast(seen, horizon, samples, draw_emission=drawn)["x"]
-    return torch.cat([seen["x"][None, :, -_SEAM:].expand(samples, -1, -1, -1), future], 2)
+    past, horizon = batch.past(observed), x.shape[1] - observed
+    future = model.forecast(past, horizon, samples, draw_emission=draw_emission)["x"]
+    return torch.cat([past["x"][None, :, -_SEAM:].expand(samples, -1, -1, -1), future], 2)
 
 
-def _posterior(model: DynamicalVAE, batch: Batch, observed: int, samples: int, drawn: bool) -> Tensor:
+def _posterior(model: DynamicalVAE, batch: Batch, observed: int, samples: int, draw_emission: bool) -> Tensor:
     """Return windows generated from inferred latents, (S, B, T, D)."""
     repeated = repeat(batch, samples)
-    return decode(model, repeated, model.guide(repeated), not drawn).unflatten(0, (samples, -1))
+    return decode(model, repeated, model.guide(repeated), not draw_emission).unflatten(0, (samples, -1))
 
 
 _REPLICATES = {"forecast": _forecast, "posterior": _posterior}
 
 
 def _measure(
-    statistics: Mapping[str, Statistic], x: Tensor, whose: str, told: Mapping[str, Tensor] | None = None
+    statistics: Mapping[str, Statistic], x: Tensor, source: str, defined: Mapping[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
-    """Return statistics (..., N) by name; NaN for windows with too few entries, or where `told` (N,) is False."""
-    found = {}
+    """Return statistics (..., N) by name; they must be finite where `defined` (N,) is True.
+
+    Without `defined`, windows with missing entries may have NaN.
+    """
+    values = {}
     for name, statistic in statistics.items():
-        found[name] = statistic.function(x).double().cpu()
-        if found[name].shape != x.shape[:-2]:
+        values[name] = statistic.function(x).double().cpu()
+        if values[name].shape != x.shape[:-2]:
             raise ValueError(
-                f"the statistic {name} maps {tuple(x.shape)} to {tuple(found[name].shape)}; expected "
+                f"the statistic {name} maps {tuple(x.shape)} to {tuple(values[name].shape)}; expected "
                 f"{tuple(x.shape[:-2])}, one number for each sequence (..., T, D)"
             )
-        nothing = found[name].isnan() & x.isnan().any(-1).any(-1) if told is None else ~told[name]
-        if not (found[name].isfinite() | nothing).all() or (told is None and nothing.all()):
-            error = ValueError if told is None else FloatingPointError
-            raise error(f"the statistic {name} is not finite on {whose} of {x.shape[-2]} frames")
-    return found
+        undefined = values[name].isnan() & x.isnan().any(-1).any(-1) if defined is None else ~defined[name]
+        if not (values[name].isfinite() | undefined).all() or (defined is None and undefined.all()):
+            error = ValueError if defined is None else FloatingPointError
+            raise error(f"the statistic {name} is not finite on {source} of {x.shape[-2]} frames")
+    return values
 
 
 def decode(
     model: DynamicalVAE, batch: Mapping[str, Tensor], latents: Mapping[str, Tensor], mean_emission: bool
 ) -> Tensor:
-    """Return x (B, T, D) run freely from its own past, given context and latents; other latents are drawn.
+    """Return x (B, T, D) of a free run given context and latents; other latents are drawn.
 
     x is in data space, not in the model's view. First frames that are context are kept.
     """
     data = model.read(batch)
-    known = {name: value for name, value in data.items() if name in model.context}
+    context = {name: value for name, value in data.items() if name in model.context}
     length, size = data.get("x", batch["x"]).shape[1], len(batch["x"])
-    made = model.model({**known, **latents}, length=length, size=size, mean_emission=mean_emission)
-    x = model.to_data_space({name: made[name] for name in model.observed}, data)["x"]
+    decoded = model.model({**context, **latents}, length=length, size=size, mean_emission=mean_emission)
+    x = model.to_data_space({name: decoded[name] for name in model.observed}, data)["x"]
     before = batch["x"].shape[1] - length
     return torch.cat([batch["x"][:, :before], x], 1) if before else x
 

@@ -1,4 +1,4 @@
-"""Latents as flat vectors, and the posterior of one sequence in units of the guide's standard deviations."""
+"""Latents as flat vectors, and the posterior of one sequence in the guide's standard deviations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Shapes = Mapping[str, tuple[int, int]]
 """Number of steps and dimension of each latent, by name; 0 steps for a static one."""
 CHUNK = 4096
 """Largest number of rows of a batch in memory."""
-_LEAST = 1e-6
+_MIN_SCALE = 1e-6
 
 
 def joined(values: Values) -> Tensor:
@@ -38,7 +38,7 @@ def split(flat: Tensor, like: Values) -> dict[str, Tensor]:
 
 
 def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
-    """Return names of the single numbers of latents: "w[0]", "z_3[1]" (step from 1, coordinate from 0)."""
+    """Return names of the scalar entries of latents: "w[0]", "z_3[1]" (step from 1, coordinate from 0)."""
     local = [f"_{t}" for t in steps]
     return tuple(
         f"{name}{step}[{d}]"
@@ -49,7 +49,7 @@ def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
 
 
 def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | None) -> list[Batch]:
-    """Return batches of one sequence each, as the model reads them, after checking that posteriors have a score.
+    """Return batches of one sequence each, as the model reads them, if their posteriors have a score.
 
     Args:
         model: the model.
@@ -66,30 +66,30 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
         conditional = model.generator[name]
         if conditional.support is not None or conditional.head.deterministic:
             raise ValueError(
-                f"under the distribution of {conditional.factor}, the latent {name} cannot be any real number. "
-                "Gradients only sample posteriors on the whole line, such as with distributions.Normal()"
+                f"under the distribution of {conditional.factor}, the latent {name} cannot be any real number, but "
+                "gradient-based sampling requires it; use a distribution such as distributions.Normal()"
             )
     data = model.read(batch)
     if model.grouped and data.group is not None:
-        raise ValueError("sequences of a group have one joint posterior; leave 'group' out of the batch")
+        raise ValueError("sequences of a group have one joint posterior; remove 'group' from the batch")
     size = require_data(model, data)
-    chosen = range(size) if sequences is None else sequences
-    if not chosen or not set(chosen) <= set(range(size)):
-        raise ValueError(f"sequences must be some of 0 to {size - 1}, the rows of the batch; got {list(chosen)}")
-    return [rows(data, slice(each, each + 1)) for each in chosen]
+    indices = range(size) if sequences is None else sequences
+    if not indices or not set(indices) <= set(range(size)):
+        raise ValueError(f"sequences must be some of 0 to {size - 1}, the rows of the batch; got {list(indices)}")
+    return [rows(data, slice(index, index + 1)) for index in indices]
 
 
 class Inferred:
     """Latents of one sequence as P numbers u, with draws of the guide and the posterior density up to a constant.
 
-        z = m + s u,    m and s: mean and standard deviation of the guide's draws, number by number
+        z = m + s u,    m and s: mean and standard deviation of each number over the guide's draws
 
     Numbers at padding are excluded, because the posterior does not depend on them.
 
     Args:
         model: model with its guide.
         data: batch of one sequence, as the model reads it.
-        guide: Pyro program of the batch with a site for every latent; None for the model's own.
+        guide: Pyro program of the batch with a site for every latent; None for the model's guide.
         draws: K, number of draws of the guide for m and s.
 
     Raises:
@@ -101,27 +101,27 @@ class Inferred:
         self.model, self.data, self.guide = model, data, guide or model.guide
         self._like = self._of_guide(1)
         self.shapes: Shapes = {name: (v.shape[1] if v.dim() == 3 else 0, v.shape[-1]) for name, v in self._like.items()}
-        there = {name: torch.ones_like(value, dtype=torch.bool) for name, value in self._like.items()}
+        masks = {name: torch.ones_like(value, dtype=torch.bool) for name, value in self._like.items()}
         if data.lengths is not None:
             valid = [(steps, valid_steps(data.lengths, steps)[..., None]) for steps, _ in self.shapes.values()]
-            there = {n: v & ok if steps else v for (n, v), (steps, ok) in zip(there.items(), valid, strict=True)}
-        self.there = joined(there)[0]
+            masks = {n: v & ok if steps else v for (n, v), (steps, ok) in zip(masks.items(), valid, strict=True)}
+        self.valid = joined(masks)[0]
         self.draws = self.drawn(draws)
         if not self.draws.isfinite().all():
             raise FloatingPointError("the guide draws latents that are not finite; check whether it has been fitted")
-        self._elsewhere = joined(self._like)
-        self.center, self.scale = self.draws.mean(0), self.draws.std(0).clamp(min=_LEAST)
+        self._template = joined(self._like)
+        self.center, self.scale = self.draws.mean(0), self.draws.std(0).clamp(min=_MIN_SCALE)
         self._repeated: tuple[int, Any] = 0, None
 
     def drawn(self, n: int) -> Tensor:
         """Return draws z (n, P) of the guide."""
         counts = [min(CHUNK, n - first) for first in range(0, n, CHUNK)]
-        return torch.cat([joined(self._of_guide(count))[:, self.there] for count in counts])
+        return torch.cat([joined(self._of_guide(count))[:, self.valid] for count in counts])
 
     def prior(self, n: int) -> Tensor:
-        """Return draws z (n, P) from the conditionals of the model, which do not use the data of their own step."""
-        drawn = self.model.model(repeat(self.data, n))
-        return joined({name: drawn[name] for name in self.model.latents})[:, self.there]
+        """Return draws z (n, P) from the model's conditionals, which do not use the data of their step."""
+        draws = self.model.model(repeat(self.data, n))
+        return joined({name: draws[name] for name in self.model.latents})[:, self.valid]
 
     def whitened(self, z: Tensor) -> Tensor:
         """Return the numbers u (..., P) of z."""
@@ -131,8 +131,8 @@ class Inferred:
         """Return log p(x, z) of u (R, P), up to a constant, (R,)."""
         if self._repeated[0] != len(u):
             self._repeated = len(u), repeat(self.data, len(u))
-        flat = self._elsewhere.repeat(len(u), 1)
-        flat[:, self.there] = (self.center + self.scale * u).to(flat)  # NUTS converts single precision to double
+        flat = self._template.repeat(len(u), 1)
+        flat[:, self.valid] = (self.center + self.scale * u).to(flat)  # NUTS converts single precision to double
         program = poutine.condition(self.model.model, data=split(flat, self._like))
         with torch.backends.cudnn.flags(enabled=False):  # no gradients of recurrent networks in evaluation mode
             return total(log_densities(poutine.trace(program).get_trace(self._repeated[1])))
@@ -140,22 +140,22 @@ class Inferred:
     def score(self, u: Tensor) -> Tensor:
         """Return the gradient of `log_joint`, (R, P)."""
         parts = []
-        for some in u.split(CHUNK):
+        for chunk in u.split(CHUNK):
             with torch.enable_grad():
-                some = some.detach().requires_grad_()
-                (slope,) = torch.autograd.grad(self.log_joint(some).sum(), [some])
+                chunk = chunk.detach().requires_grad_()
+                (slope,) = torch.autograd.grad(self.log_joint(chunk).sum(), [chunk])
                 parts.append(slope)
         return torch.cat(parts)
 
     def whole(self, values: Tensor) -> Tensor:
         """Return values (..., P) as (..., Q), with NaN at padding."""
-        found = values.new_full((*values.shape[:-1], len(self.there)), math.nan)
-        found[..., self.there] = values
-        return found
+        result = values.new_full((*values.shape[:-1], len(self.valid)), math.nan)
+        result[..., self.valid] = values
+        return result
 
     def _of_guide(self, n: int) -> dict[str, Tensor]:
         sites = poutine.trace(self.guide).get_trace(repeat(self.data, n)).nodes
         if missing := [name for name in self.model.latents if name not in sites]:
-            raise ValueError(f"the guide draws no {', '.join(missing)}; it needs one site for each latent")
+            raise ValueError(f"the guide has no site for {', '.join(missing)}; it needs one for each latent")
         values: dict[str, Any] = {name: sites[name]["value"] for name in self.model.latents}
         return {name: value.detach() for name, value in values.items()}

@@ -3,9 +3,9 @@
     w* = argmax log p(w, seen),    p(w | seen) ~ N(w*, H^-1),    H = -d2 log p(w*, seen) / dw dw
 
 A Pyro program defines the observations. Its sequences are independent, so the sum of their energies E = -log p has the
-gradient of each. Sequences and starts are the rows of one batch, which Adam minimises number by number. The curvatures
-of all rows need as many backward passes as a row has numbers. With these, the last steps are Newton steps. They are
-exact if E is quadratic, and so is the normal; otherwise it is Laplace's approximation.
+gradient of each. Sequences and starts are the rows of one batch, whose energies Adam minimises. The curvatures of all
+rows need as many backward passes as a row has numbers; the last steps are Newton steps that use them. If E is
+quadratic, these steps and the normal are exact; otherwise the normal is Laplace's approximation.
 
 The result reports for each row whether the search has converged (`left`), whether starts agree (`behind`), and whether
 the normal is reliable (`bent`, and k-hat of `evidence`).
@@ -43,8 +43,8 @@ class Descent:
         steps: number of steps of Adam.
         rate: initial learning rate; it falls to 0 along a cosine.
         starts: S, number of starts for each sequence; the lowest result is kept.
-        candidates: number of draws from the prior, and from the guide if there is one. They and the mean of the prior's
-            draws are divided among the starts; each starts at its most probable one.
+        candidates: number of draws from the prior, and from the guide if there is one. These draws and the mean of the
+            prior's are divided among the starts; each start is the most probable of its share.
         renewed: number of steps between calls of `renew`.
         newton: number of Newton steps at the end, each with its own curvature.
 
@@ -74,17 +74,17 @@ class Posterior:
         energy: -log p(w*, seen), in nats, (B,).
         energies: energies that the starts reached, the lowest first, before Newton steps, (S, B).
         course: energies during the search from the start that reached the lowest, (steps, B).
-        left: reduction of the energy by another Newton step, in nats, if the energy were quadratic, (B,); about 0 after
-            convergence.
-        bent: number of directions with less curvature of the energy than with the prior alone, (B,). There the normal
-            is as wide as the prior, because otherwise it would be wider or have no finite width.
+        left: reduction of the energy that another Newton step would give for a quadratic energy, in nats, (B,); about 0
+            after convergence.
+        bent: number of directions in which the energy has less curvature than the prior's, (B,). There the normal is as
+            wide as the prior, because otherwise it would be wider or have no finite width.
         factor: lower triangular factor of the covariance of all latent numbers of a sequence, in the order of `mode`,
             (B, P, P).
 
     Example:
         >>> model = dvae.linear_gaussian_surrogate("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
-        >>> found = dvae.posterior(model.model, {"x": model.sample(5, 4)["x"]}, descent=dvae.Descent(steps=20))
-        >>> bool((found.left < 1e-6).all())  # nats: it has converged
+        >>> result = dvae.posterior(model.model, {"x": model.sample(5, 4)["x"]}, descent=dvae.Descent(steps=20))
+        >>> bool((result.left < 1e-6).all())  # nats: it has converged
         True
     """
 
@@ -103,7 +103,7 @@ class Posterior:
 
     @property
     def behind(self) -> Tensor:
-        """Energy that each start reached above the lowest one, in nats, (S, B)."""
+        """Energy of each start's result above the lowest one, in nats, (S, B)."""
         return self.energies - self.energies[:1]
 
     @property
@@ -113,10 +113,10 @@ class Posterior:
 
     def draw(self, n: int, seed: int = 0) -> dict[str, Tensor]:
         """Return draws (n, B, ...) of each latent from the normal."""
-        return split(joined(self.mode) + self._away(n, torch.Generator().manual_seed(seed)), self.mode)
+        return split(joined(self.mode) + self._deviations(n, torch.Generator().manual_seed(seed)), self.mode)
 
     def guide(self, batch: Any = None) -> dict[str, Tensor]:
-        """Sample the normal as a Pyro guide of the program, on the same batch."""
+        """Sample from the normal as a Pyro guide of the program, on the same batch."""
         with pyro.plate("sequences", len(self.factor)):
             distribution = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
             flat = pyro.sample("_latents", distribution, infer={"is_auxiliary": True})
@@ -141,13 +141,13 @@ class Posterior:
         distribution = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)
 
         def log_weights(count: int) -> Tensor:
-            away = self._away(count, generator)
-            drawn = split((joined(self.mode) + away).flatten(0, 1), self.mode)
-            return -_energy(program, repeat(batch, count), drawn) - distribution.log_prob(away).flatten()
+            deviations = self._deviations(count, generator)
+            latents = split((joined(self.mode) + deviations).flatten(0, 1), self.mode)
+            return -_energy(program, repeat(batch, count), latents) - distribution.log_prob(deviations).flatten()
 
         return importance_mean(log_weights, len(self.factor), particles, chunk)
 
-    def _away(self, n: int, generator: torch.Generator) -> Tensor:
+    def _deviations(self, n: int, generator: torch.Generator) -> Tensor:
         """Return draws (n, B, P) from the normal, minus its mean."""
         noise = torch.randn(n, *self.factor.shape[:-1], generator=generator, dtype=self.factor.dtype)
         return (self.factor @ noise.to(self.factor)[..., None]).squeeze(-1)
@@ -171,11 +171,11 @@ def posterior(
         program: Pyro program of the batch, such as `DynamicalVAE.model`, in evaluation mode. Its latents (B, ...) are
             continuous and unbounded, about as wide as N(0, I), with a log-concave prior such as a normal; every site
             has one log-density for each sequence.
-        batch: tensors (B, ...) by name: the observations, and whatever else the program reads.
+        batch: tensors (B, ...) by name: the observations and other inputs of the program.
         guide: program of the batch that draws some or all latents, as further candidates.
         descent: options of the search.
-        renew: function that updates parts of the batch that depend on the latents, such as which points belong
-            together. It is called with the batch and the latents every `descent.renewed` steps, without gradients.
+        renew: function of the batch and the latents that updates parts of the batch that depend on the latents, such as
+            the correspondence of points. It is called every `descent.renewed` steps, without gradients.
         seed: seed of the candidates.
         chunk: largest number of sequences times starts in memory.
         progress: whether to show a progress bar.
@@ -189,8 +189,8 @@ def posterior(
         >>> model = dvae.linear_gaussian_surrogate("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3}, 4)
         >>> seen = model.sample(5, 4)["x"]
         >>> batch = {"x": seen, "mask": torch.rand(seen.shape) < 0.5}
-        >>> found = dvae.posterior(model.model, batch, descent=dvae.Descent(steps=20))
-        >>> found.mode["w"].shape, found.draw(10)["w"].shape
+        >>> result = dvae.posterior(model.model, batch, descent=dvae.Descent(steps=20))
+        >>> result.mode["w"].shape, result.draw(10)["w"].shape
         (torch.Size([5, 2]), torch.Size([10, 5, 2]))
     """
     descent = descent or Descent()
@@ -198,9 +198,9 @@ def posterior(
     device = _some(batch).device
     with seeded(seed, device), pyro.validation_enabled(False), progress_bar(progress) as bar:
         chunks = [rows(batch, slice(first, first + at_once)) for first in range(0, size, at_once)]
-        task = bar.add_task("looking for modes", total=len(chunks) * (descent.steps + descent.newton + 1))
+        task = bar.add_task("searching for modes", total=len(chunks) * (descent.steps + descent.newton + 1))
         parts = [_Search(program, chunk, guide, descent, renew, partial(bar.advance, task)).run() for chunk in chunks]
-    return parts[0] if len(parts) == 1 else _together(parts)
+    return parts[0] if len(parts) == 1 else _concatenate(parts)
 
 
 def _some(batch: Any) -> Tensor:
@@ -218,19 +218,19 @@ class _Search:
         guide: _Program | None,
         descent: Descent,
         renew: Any,
-        went: Callable[[], object],
+        advance: Callable[[], object],
     ):
-        self.program, self.batch, self.guide, self.descent, self.went = program, batch, guide, descent, went
+        self.program, self.batch, self.guide, self.descent, self.advance = program, batch, guide, descent, advance
         self.size = len(_some(batch))
         self.renew = renew or (lambda batch, values: batch)
-        self.latents: dict[str, Tensor] = {}  # examples of the latents, for their shapes
+        self.latents: dict[str, Tensor] = {}  # example values, for their shapes
 
     def run(self) -> Posterior:
         with torch.no_grad():
             starts = self._starts()
-        ends, course = self._down(starts)
+        ends, course = self._descend(starts)
         batch = repeat(self.batch, len(starts))
-        energies = self._measured(batch, ends.flatten(0, 1)).unflatten(0, starts.shape[:2])
+        energies = self._measure(batch, ends.flatten(0, 1)).unflatten(0, starts.shape[:2])
         finite = energies.isfinite().any(0)
         if not finite.all():
             raise FloatingPointError(
@@ -241,17 +241,17 @@ class _Search:
         best, each = order[0], torch.arange(self.size)
         values, batch = ends[best, each], self.batch
         for round in range(self.descent.newton + 1):
-            batch = self._renewed(batch, values)
+            batch = self._renew(batch, values)
             gradient, curvature = self._curvature(batch, values)
             factor, bent = _root(curvature, self._curvature(batch, values, list(self.latents))[1])
             step = -(factor @ factor.mT @ gradient[..., None]).squeeze(-1)
             if round < self.descent.newton:
-                values = self._lower(batch, values, step)
-            self.went()
+                values = self._line_search(batch, values, step)
+            self.advance()
         left = -(gradient * step).sum(-1) / 2
         return Posterior(
             split(values, self.latents),
-            self._measured(batch, values),
+            self._measure(batch, values),
             energies.gather(0, order),
             course[:, best, each],
             left,
@@ -268,53 +268,55 @@ class _Search:
             if site["type"] == "sample" and not site["is_observed"] and not poutine.util.site_is_subsample(site)
         }
         if not self.latents:
-            raise ValueError("the program has no latents: all its sites are observed in this batch")
-        if wrong := [name for name, value in self.latents.items() if len(value) != self.size]:
             raise ValueError(
-                f"{', '.join(wrong)} has no value for each of {self.size} sequences; latents are drawn in a plate over "
-                "them"
+                "the program has no latents, because all its sites are observed; leave latents out of the batch"
             )
-        drawn = [self._drawn(self.program) for _ in range(self.descent.candidates)]
-        guided = [self._drawn(self.program) | self._drawn(self.guide) for _ in drawn] if self.guide else []
-        every = torch.stack([torch.stack([joined(each) for each in drawn]).mean(0), *map(joined, drawn + guided)])
-        energies = torch.stack([self._measured(self.batch, each) for each in every]).nan_to_num(torch.inf)
+        if invalid := [name for name, value in self.latents.items() if len(value) != self.size]:
+            raise ValueError(
+                f"{', '.join(invalid)} must have one value for each of {self.size} sequences; draw latents in a plate "
+                "over sequences"
+            )
+        draws = [self._draw(self.program) for _ in range(self.descent.candidates)]
+        guided = [self._draw(self.program) | self._draw(self.guide) for _ in draws] if self.guide else []
+        candidates = torch.stack([torch.stack([joined(each) for each in draws]).mean(0), *map(joined, draws + guided)])
+        energies = torch.stack([self._measure(self.batch, each) for each in candidates]).nan_to_num(torch.inf)
         starts, each = self.descent.starts, torch.arange(self.size)
-        return torch.stack([every[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
+        return torch.stack([candidates[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
 
-    def _drawn(self, program: _Program) -> dict[str, Tensor]:
+    def _draw(self, program: _Program) -> dict[str, Tensor]:
         """Return the latents that a program draws."""
         nodes: dict[str, Any] = poutine.trace(program).get_trace(self.batch).nodes
         return {name: nodes[name]["value"] for name in self.latents if name in nodes}
 
-    def _down(self, starts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the results (S, B, P) of Adam from starts (S, B, P), and their energies (steps, S, B) on the way."""
+    def _descend(self, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the results (S, B, P) of Adam from starts (S, B, P), and the energies (steps, S, B) at each step."""
         descent, course = self.descent, []
         batch = repeat(self.batch, len(starts))
         values = starts.flatten(0, 1).clone().requires_grad_()
         adam = torch.optim.Adam([values], descent.rate)
-        falling = torch.optim.lr_scheduler.CosineAnnealingLR(adam, descent.steps)
+        scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(adam, descent.steps)
         for step in range(descent.steps):
             if step % descent.renewed == 0:
-                batch = self._renewed(batch, values.detach())
+                batch = self._renew(batch, values.detach())
             energy = self._energy(batch, values)
             (gradient,) = torch.autograd.grad(energy.sum(), values)
-            values.grad = gradient.nan_to_num(0.0, 0.0, 0.0)  # for a diverged row, so that the others continue
+            values.grad = gradient.nan_to_num(0.0, 0.0, 0.0)  # a diverged row must not stop the others
             adam.step()
-            falling.step()
+            scheduler.step()
             course.append(energy.detach())
-            self.went()
+            self.advance()
         return values.detach().unflatten(0, starts.shape[:2]), torch.stack(course).unflatten(1, starts.shape[:2])
 
     def _energy(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> Tensor:
         return _energy(self.program, batch, split(values, self.latents), sites)
 
-    def _renewed(self, batch: Any, values: Tensor) -> Any:
+    def _renew(self, batch: Any, values: Tensor) -> Any:
         with torch.no_grad():
             return self.renew(batch, split(values, self.latents))
 
-    def _measured(self, batch: Any, values: Tensor) -> Tensor:
+    def _measure(self, batch: Any, values: Tensor) -> Tensor:
         with torch.no_grad():
-            return self._energy(self._renewed(batch, values), values)
+            return self._energy(self._renew(batch, values), values)
 
     def _curvature(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> tuple[Tensor, Tensor]:
         """Return gradients (B, P) and second derivatives (B, P, P) of the energy, or of the part of these sites."""
@@ -322,39 +324,39 @@ class _Search:
         with torch.enable_grad():
             energy = self._energy(batch, values, sites)
             (gradient,) = torch.autograd.grad(energy.sum(), values, create_graph=True)
-            found = [
+            columns = [
                 torch.autograd.grad(part.sum(), values, retain_graph=True, materialize_grads=True)[0]
                 for part in gradient.unbind(-1)
             ]
-        return gradient.detach(), torch.stack(found, -1)
+        return gradient.detach(), torch.stack(columns, -1)
 
-    def _lower(self, batch: Any, values: Tensor, step: Tensor) -> Tensor:
+    def _line_search(self, batch: Any, values: Tensor, step: Tensor) -> Tensor:
         """Return the best of a full, half, quarter or eighth step, or no step if none lowers the energy."""
         shares = step.new_tensor([1.0, 0.5, 0.25, 0.125, 0.0])
-        tried = [values + share * step for share in shares]
-        energies = torch.stack([self._measured(batch, each) for each in tried]).nan_to_num(torch.inf)
-        return torch.stack(tried)[energies.argmin(0), torch.arange(self.size)]
+        candidates = [values + share * step for share in shares]
+        energies = torch.stack([self._measure(batch, each) for each in candidates]).nan_to_num(torch.inf)
+        return torch.stack(candidates)[energies.argmin(0), torch.arange(self.size)]
 
 
 def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str] | None = None) -> Tensor:
-    """Return -log p (B,) of a program's sites, or of some of them, at these values of its latents."""
+    """Return -log p (B,) of a program's sites, or only of `sites`, at these values of its latents."""
     with serialized:
         trace = poutine.trace(poutine.condition(program, data=dict(values))).get_trace(batch)
     trace.compute_log_prob(site_filter=lambda name, _: sites is None or name in sites)
     logs = {name: site["log_prob"] for name, site in trace.nodes.items() if "log_prob" in site}
     size = len(next(iter(values.values())))
-    if wrong := {name: tuple(log.shape) for name, log in logs.items() if log.shape != (size,) and log.dim()}:
+    if invalid := {name: tuple(log.shape) for name, log in logs.items() if log.shape != (size,) and log.dim()}:
         raise ValueError(
-            f"log-densities are {wrong}, expected one for each of {size} sequences; draw in one plate over sequences, "
-            "and declare all other dimensions as one event (`.to_event()`)"
+            f"log-densities have shapes {invalid}, expected one value for each of {size} sequences; draw in one plate "
+            "over sequences, and declare all other dimensions as one event (`.to_event()`)"
         )
     return -torch.stack([log for log in logs.values() if log.dim()]).sum(0)  # plates have no dimensions
 
 
 def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lower roots (B, P, P) of the inverse curvature, and the number of directions that were raised.
+    """Return lower roots (B, P, P) of the inverse curvature, and the number of directions in which it was raised.
 
-    In directions with less curvature than the prior's, the curvature is raised to the prior's.
+    Where the curvature is less than the prior's, it is raised to the prior's.
     """
     kind, curvature, prior = curvature, curvature.double(), prior.double()
     root, failed = torch.linalg.cholesky_ex(prior)
@@ -372,11 +374,11 @@ def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     return (upper * signs[..., None]).mT.to(kind), bent
 
 
-def _together(parts: Sequence[Posterior]) -> Posterior:
+def _concatenate(parts: Sequence[Posterior]) -> Posterior:
     along = {"energies": 1, "course": 1}
-    found: dict[str, Any] = {
+    tensors: dict[str, Any] = {
         field.name: torch.cat([getattr(part, field.name) for part in parts], along.get(field.name, 0))
         for field in fields(Posterior)
         if field.name != "mode"
     }
-    return Posterior({name: torch.cat([part.mode[name] for part in parts]) for name in parts[0].mode}, **found)
+    return Posterior({name: torch.cat([part.mode[name] for part in parts]) for name in parts[0].mode}, **tensors)

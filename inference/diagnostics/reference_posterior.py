@@ -1,9 +1,9 @@
-"""Reference posteriors: comparison of a guide with the posterior, which is exact or sampled by NUTS.
+"""Comparison of a guide with a reference posterior, which is exact or sampled by NUTS.
 
     q(z | x)   versus   p(z | x) ~ p(x, z):   means, standard deviations, correlations, each with its Monte Carlo error
 
 The posterior of a linear-Gaussian model is known (`dvae.Oracle`). For any other model, Pyro's NUTS (Hoffman and Gelman,
-2014, arXiv 1111.4246) samples it, in units of the guide's standard deviations. The chains of a sequence are run as one
+2014, arXiv 1111.4246) samples it, in units of the guide's standard deviations. The chains of a sequence run as one
 chain on the product of copies of its posterior. A step of all chains is then one evaluation of the model, whose cost
 hardly depends on the number of rows. The chains share step sizes and trees, but not momenta or starts. Every other
 chain starts at a draw from the prior, so that R-hat reveals a mode that the guide does not cover.
@@ -79,7 +79,7 @@ class Sampling:
         effective: effective draws of the bulk, (S, Q).
         divergences: number of divergent transitions after the warm-up, (S,).
         evaluations: number of gradients of the model, each of all chains of a sequence, (S,).
-        chains, draws, warmup: number of chains per sequence; of draws and warm-up steps per chain.
+        chains, draws, warmup: number of chains per sequence, of draws per chain, and of warm-up steps per chain.
     """
 
     rhat: Annotated[np.ndarray, Dims("sequence", "quantity")]
@@ -97,16 +97,16 @@ class Sampling:
 
     @property
     def verdict(self) -> str:
-        """Result of the sampling in one sentence."""
+        """Convergence of the reference in one sentence."""
         numbers = f"R-hat up to {np.nanmax(self.rhat):.3f}, effective draws from {np.nanmin(self.effective):.0f}"
         count = int(self.divergences.sum())
-        narrow = f"; {count} divergences: it may have missed where the posterior is narrow" if count else ""
+        narrow = f"; {count} divergences: it may have missed narrow regions of the posterior" if count else ""
         if self.converged.all():
             return f"the reference is by NUTS, which converged ({numbers}){narrow}"
-        odd = f"of {(~self.converged).sum()} of {len(self.converged)} sequences"
+        count = f"{(~self.converged).sum()} of {len(self.converged)} sequences"
         return (
-            f"the reference itself did not converge {odd} ({numbers}){narrow}: take more draws and warm-up before "
-            "anything is said of the guide"
+            f"the reference did not converge for {count} ({numbers}){narrow}. Use more draws and warm-up "
+            "before you interpret the comparison"
         )
 
 
@@ -173,67 +173,69 @@ class ReferencePosterior(Result):
 
     @property
     def pairs(self) -> dict[str, np.ndarray]:
-        """Masks (Q, Q) of pairs of numbers by kind, such as "z, between steps" or "w with z", each pair once."""
+        """Masks (Q, Q) of pairs of numbers by kind, such as "z, between steps" or "w with z"; each pair occurs once."""
         latent, step, _ = self._places
-        there, same = (
+        valid, same_step = (
             np.isfinite(self.lack).any(0) & np.tri(len(latent), k=-1, dtype=bool).T,
             np.equal.outer(step, step),
         )
-        found = {}
+        masks = {}
         for (one, name), (other, after) in combinations_with_replacement(enumerate(self.shapes), 2):
-            both = there & np.logical_and.outer(latent == one, latent == other)
+            both = valid & np.logical_and.outer(latent == one, latent == other)
             if one < other:
-                found[f"{name} with {after}"] = both
+                masks[f"{name} with {after}"] = both
             elif self.shapes[name][0]:
-                found |= {f"{name}, within steps": both & same, f"{name}, between steps": both & ~same}
+                masks |= {f"{name}, within steps": both & same_step, f"{name}, between steps": both & ~same_step}
             else:
-                found[name] = both
-        return {kind: some for kind, some in found.items() if some.any()}
+                masks[name] = both
+        return {kind: mask for kind, mask in masks.items() if mask.any()}
 
     @property
     def verdict(self) -> str:
         """Quality of the reference in one sentence."""
         return (
-            "the reference is exact, as the model is linear-Gaussian"
+            "the reference is exact, because the model is linear-Gaussian"
             if self.sampling is None
             else self.sampling.verdict
         )
 
     def table(self) -> Group:
         """Return tables of bias and deviations by latent, correlations by kind of pair, and convergence."""
-        guide = self.equations.get("inference", "a guide of one’s own")
-        title = f"{guide} beside the posterior of {len(self.sequences)} sequences"
-        moments = Table(title=title, caption="bias in deviations of the reference; noise is what bias has by chance")
-        for column in ("latent", "bias (rms)", "noise (rms)", "largest", "at", "deviation over the reference’s"):
+        guide = self.equations.get("inference", "custom guide")
+        title = f"{guide} compared with the posterior of {len(self.sequences)} sequences"
+        moments = Table(
+            title=title, caption="bias in standard deviations of the reference; noise: its Monte Carlo error"
+        )
+        for column in ("latent", "bias (rms)", "noise (rms)", "largest", "at", "deviation / reference"):
             moments.add_column(column, justify="left" if column in ("latent", "at") else "right", no_wrap=True)
         for place, name in enumerate(self.shapes):
-            own = self._places[0] == place
-            bias, ratio = np.where(own, self.bias, np.nan), np.log(self.ratio[:, own])
+            mask = self._places[0] == place
+            bias, ratio = np.where(mask, self.bias, np.nan), np.log(self.ratio[:, mask])
             worst = np.unravel_index(np.nanargmax(abs(bias)), bias.shape)
-            least, mean, most = (f"{np.exp(of(ratio)):.2f}" for of in (np.nanmin, np.nanmean, np.nanmax))
-            numbers = f"{_rms(bias):.3f}", f"{_rms(self.bias_error[:, own]):.3f}", f"{bias[worst]:+.2f}"
-            moments.add_row(name, *numbers, self._called(*map(int, worst)), f"{mean} ({least} to {most})")
+            least, mean, most = (f"{np.exp(reduce(ratio)):.2f}" for reduce in (np.nanmin, np.nanmean, np.nanmax))
+            numbers = f"{_rms(bias):.3f}", f"{_rms(self.bias_error[:, mask]):.3f}", f"{bias[worst]:+.2f}"
+            moments.add_row(name, *numbers, self._label(*map(int, worst)), f"{mean} ({least} to {most})")
         correlations = Table(title="correlations", caption=self.verdict)
-        for column in ("of", "pairs", "reference (rms)", "guide (rms)", "most lacking", "reference", "guide"):
+        for column in ("of", "pairs", "reference (rms)", "guide (rms)", "largest difference", "reference", "guide"):
             correlations.add_column(
-                column, justify="left" if column in ("of", "most lacking") else "right", no_wrap=True
+                column, justify="left" if column in ("of", "largest difference") else "right", no_wrap=True
             )
-        for kind, some in self.pairs.items():
-            lack = np.where(some, abs(self.lack), np.nan)
+        for kind, pairs in self.pairs.items():
+            lack = np.where(pairs, abs(self.lack), np.nan)
             sequence, one, other = np.unravel_index(np.nanargmax(lack), lack.shape)
             both = [part.correlation for part in (self.reference, self.guide)]
             error = self.reference.correlation_error[sequence, one, other]
             correlations.add_row(
                 kind,
-                str(some.sum()),
-                *(f"{_rms(each[:, some]):.2f}" for each in both),
-                f"{self.names[one]}, {self._called(int(sequence), int(other))}",
+                str(pairs.sum()),
+                *(f"{_rms(each[:, pairs]):.2f}" for each in both),
+                f"{self.names[one]}, {self._label(int(sequence), int(other))}",
                 f"{both[0][sequence, one, other]:+.2f}" + ("" if self.exact else f" ± {error:.2f}"),
                 f"{both[1][sequence, one, other]:+.2f}",
             )
-        return Group(moments, correlations, *([] if self.sampling is None else [self._fared(self.sampling)]))
+        return Group(moments, correlations, *([] if self.sampling is None else [self._convergence(self.sampling)]))
 
-    def _fared(self, sampling: Sampling) -> Table:
+    def _convergence(self, sampling: Sampling) -> Table:
         title = f"NUTS: {sampling.chains} chains of {sampling.draws} draws after {sampling.warmup} of warm-up"
         table = Table(title=title)
         for column in ("sequence", "R-hat", "at", "effective draws", "divergences", "evaluations"):
@@ -258,21 +260,23 @@ class ReferencePosterior(Result):
             panels: number of coordinates with bands.
         """
         latent, step, coordinate = self._places
-        off = self.bias[sequence] ** 2 + 2 * np.log(self.ratio[sequence]) ** 2
+        difference = self.bias[sequence] ** 2 + 2 * np.log(self.ratio[sequence]) ** 2
         rows: dict[tuple[str, str], np.ndarray] = {}
         for place, (name, (steps, size)) in enumerate(self.shapes.items()):
-            own = latent == place
+            mask = latent == place
             rows |= (
-                {(name, f"{name}[{d}]"): own & (coordinate == d) for d in range(size)} if steps else {(name, name): own}
+                {(name, f"{name}[{d}]"): mask & (coordinate == d) for d in range(size)}
+                if steps
+                else {(name, name): mask}
             )
-        shown = sorted(rows.items(), key=lambda row: -float(np.nanmean(off[row[1]])))[:panels]
+        worst = sorted(rows.items(), key=lambda row: -float(np.nanmean(difference[row[1]])))[:panels]
         figure = new_figure(10.0, 6.2)
         top, bottom = figure.subfigures(2, 1, squeeze=False)[:, 0]
-        for panel, ((name, title), some) in zip(top.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        for panel, ((name, title), numbers) in zip(top.subplots(1, len(worst), squeeze=False)[0], worst, strict=True):
             local = self.shapes[name][0] > 0
-            across = (step if local else coordinate)[some]
+            across = (step if local else coordinate)[numbers]
             for part, colour, called in ((self.reference, "0.35", "reference"), (self.guide, "C0", "guide")):
-                mean, deviation = part.mean[sequence, some], part.deviation[sequence, some]
+                mean, deviation = part.mean[sequence, numbers], part.deviation[sequence, numbers]
                 if local:
                     panel.fill_between(
                         across, mean - 2 * deviation, mean + 2 * deviation, color=colour, alpha=0.25, lw=0
@@ -290,9 +294,9 @@ class ReferencePosterior(Result):
         top.axes[0].legend(fontsize=7)
         scatter, *images = bottom.subplots(1, 3)
         for place, name in enumerate(self.shapes):
-            own = latent == place
+            mask = latent == place
             scatter.plot(
-                self.reference.deviation[:, own].ravel(), self.guide.deviation[:, own].ravel(), ".", label=name
+                self.reference.deviation[:, mask].ravel(), self.guide.deviation[:, mask].ravel(), ".", label=name
             )
         ends = [f(part.deviation) for f, part in ((np.nanmin, self.reference), (np.nanmax, self.reference))]
         scatter.plot(ends, ends, color="0.4", linewidth=0.8)
@@ -305,7 +309,7 @@ class ReferencePosterior(Result):
             panel.set_title(f"correlations, {called}", fontsize=8)
             panel.tick_params(labelsize=7)
         figure.colorbar(image, ax=images, shrink=0.8).ax.tick_params(labelsize=7)
-        title = f"sequence {self.sequences[sequence]} · {self.equations.get('inference', 'a guide of one’s own')}"
+        title = f"sequence {self.sequences[sequence]} · {self.equations.get('inference', 'custom guide')}"
         figure.suptitle(f"{title}\n{self.verdict}", fontsize=9, parse_math=False)
         return figure
 
@@ -321,10 +325,13 @@ class ReferencePosterior(Result):
     def check(self) -> None:
         count = sum(max(steps, 1) * size for steps, size in self.shapes.values())
         if count != len(self.names) or min(count, len(self.sequences)) < 1 or min(map(min, self.shapes.values())) < 0:
-            raise ValueError(f"{len(self.names)} names of {count} numbers of {len(self.sequences)} sequences")
+            raise ValueError(
+                f"expected at least one sequence, and a name for each of {count} numbers; got {len(self.sequences)} "
+                f"sequences and {len(self.names)} names"
+            )
         expected = {"sequence": {len(self.sequences)}, "quantity": {count}, "other quantity": {count}}
         if self.extents != expected:
-            raise ValueError(f"expected arrays of {expected}, not of {self.extents}")
+            raise ValueError(f"expected arrays of {expected}, got {self.extents}")
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -338,7 +345,7 @@ class ReferencePosterior(Result):
         latent, step, coordinate = np.array(places).T
         return latent, step, coordinate
 
-    def _called(self, sequence: int, number: int) -> str:
+    def _label(self, sequence: int, number: int) -> str:
         many = len(self.sequences) > 1
         return f"{self.names[number]} of {self.sequences[sequence]}" if many else self.names[number]
 
@@ -371,7 +378,7 @@ def reference_posterior(
         batch: batch as in `DynamicalVAE.model`, which may be ragged or have missing entries and context.
         sequences: indices of sequences in the batch, from 0; all by default.
         guide: Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
-        draws, chains, warmup: NUTS settings: draws per chain, chains per sequence, warm-up steps per chain.
+        draws, chains, warmup: number of draws per chain, chains per sequence and warm-up steps per chain, of NUTS.
         guide_draws: number of draws for the guide's moments.
         seed: seed of all draws.
         progress: whether to show a progress bar.
@@ -384,8 +391,8 @@ def reference_posterior(
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
-        >>> found = dvae.reference_posterior(model, model.sample(3, 4)["x"], sequences=[0, 2])
-        >>> found.exact, found.bias.shape, found.lack.shape
+        >>> result = dvae.reference_posterior(model, model.sample(3, 4)["x"], sequences=[0, 2])
+        >>> result.exact, result.bias.shape, result.lack.shape
         (True, (2, 4), (2, 4, 4))
     """
     if min(draws, guide_draws) < 4 or chains < 2 or warmup < 1:  # arviz needs as many for R-hat
@@ -394,34 +401,34 @@ def reference_posterior(
             f"{warmup} and {guide_draws}"
         )
     with seeded_evaluation(model, seed), progress_bar(progress) as bar:
-        some = some_of(model, batch, sequences)
-        guides, references, fared = [], [], []
-        task = bar.add_task("drawing from posteriors", total=len(some) * (warmup + draws))
-        for data in some:
+        batches = some_of(model, batch, sequences)
+        guides, references, diagnostics = [], [], []
+        task = bar.add_task("drawing from posteriors", total=len(batches) * (warmup + draws))
+        for data in batches:
             inferred = Inferred(model, data, guide, guide_draws)
-            if len(some) * len(inferred.there) ** 2 > _MOST:
+            if len(batches) * len(inferred.valid) ** 2 > _MOST:
                 raise ValueError(
-                    f"{len(some)} sequences with {len(inferred.there)} latent numbers have more correlations than can "
-                    "be estimated; take fewer sequences, or only their first steps"
+                    f"{len(batches)} sequences with {len(inferred.valid)} latent numbers have more than {_MOST} "
+                    "correlations; use fewer sequences, or only their first steps"
                 )
             guides.append(_moments(inferred, inferred.draws[None]))
-            if (known := _exact(model, data, inferred)) is not None:
-                references.append(known)
+            if (exact := _exact(model, data, inferred)) is not None:
+                references.append(exact)
                 continue
-            drawn, divergences, evaluations = _nuts(inferred, draws, chains, warmup, partial(bar.advance, task))
-            references.append(_moments(inferred, drawn))
-            fared.append((*_diagnosed(inferred, drawn), divergences, evaluations))
+            nuts_draws, divergences, evaluations = _nuts(inferred, draws, chains, warmup, partial(bar.advance, task))
+            references.append(_moments(inferred, nuts_draws))
+            diagnostics.append((*_diagnose(inferred, nuts_draws), divergences, evaluations))
     sampling = None
-    if fared:
-        rhat, effective, diverged, evaluated = map(np.array, zip(*fared, strict=True))
+    if diagnostics:
+        rhat, effective, diverged, evaluated = map(np.array, zip(*diagnostics, strict=True))
         sampling = Sampling(rhat, effective, diverged, evaluated, chains, draws, warmup)
     steps = max(steps for steps, _ in inferred.shapes.values())
     return ReferencePosterior(
-        _together(guides),
-        _together(references),
+        _stack(guides),
+        _stack(references),
         inferred.shapes,
         quantities(model, range(1, steps + 1)),
-        tuple(range(len(some)) if sequences is None else sequences),
+        tuple(range(len(batches)) if sequences is None else sequences),
         sampling,
         guide_draws,
         seed,
@@ -433,20 +440,20 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], inferred: Inferred) -> 
     """Return the moments of a linear-Gaussian model, NaN at padding; None for any other model."""
     try:
         mean, covariance = Oracle(model, max(steps for steps, _ in inferred.shapes.values())).posterior(data)
-    except ValueError:  # other networks or distributions, or there is context
+    except ValueError:  # not linear-Gaussian, or with context
         return None
-    mean, covariance = mean[0, inferred.there], covariance.reshape(len(mean.t()), -1)[inferred.there][:, inferred.there]
+    mean, covariance = mean[0, inferred.valid], covariance.reshape(len(mean.t()), -1)[inferred.valid][:, inferred.valid]
     deviation = covariance.diagonal().sqrt()
     correlation = inferred.whole(inferred.whole(covariance / torch.outer(deviation, deviation)).T)
-    mean, deviation, none = map(inferred.whole, (mean, deviation, torch.zeros_like(deviation)))
-    told = (mean, deviation, correlation, none, none)
-    return LatentMoments(*(each.detach().double().cpu().numpy() for each in told))
+    mean, deviation, zero = map(inferred.whole, (mean, deviation, torch.zeros_like(deviation)))
+    moments = (mean, deviation, correlation, zero, zero)
+    return LatentMoments(*(each.detach().double().cpu().numpy() for each in moments))
 
 
 def _nuts(
-    inferred: Inferred, draws: int, chains: int, warmup: int, went: Callable[[], object]
+    inferred: Inferred, draws: int, chains: int, warmup: int, advance: Callable[[], object]
 ) -> tuple[Tensor, int, int]:
-    """Return draws z (C, N, P) of the posterior, the number of divergent transitions, and of evaluations."""
+    """Return draws z (C, N, P) of the posterior, and the numbers of divergent transitions and of evaluations."""
     start = inferred.drawn(chains)
     start[1::2] = inferred.prior(chains)[1::2]
     start = inferred.whitened(start)
@@ -455,8 +462,8 @@ def _nuts(
     ):
         if not log_joint.isfinite().all():
             raise FloatingPointError(
-                f"the log joint is not finite at a draw from the {kind}, where NUTS would start; check whether the "
-                "model has been fitted, and on data of this scale"
+                f"the log joint is not finite at a draw from the {kind}, where NUTS starts; check whether the model "
+                "has been fitted to data of this scale"
             )
     evaluations = 0
 
@@ -466,8 +473,8 @@ def _nuts(
         return -inferred.log_joint(values["u"].unflatten(0, start.shape)).double().sum()
 
     kernel = NUTS(potential_fn=energy)
-    started = {"u": start.flatten()}
-    run = MCMC(kernel, draws, warmup, started, hook_fn=lambda *_: went(), disable_progbar=True)
+    initial = {"u": start.flatten()}
+    run = MCMC(kernel, draws, warmup, initial, hook_fn=lambda *_: advance(), disable_progbar=True)
     with torch.enable_grad():
         run.run()
     u = run.get_samples()["u"].unflatten(1, start.shape).transpose(0, 1)
@@ -482,28 +489,28 @@ def _moments(inferred: Inferred, draws: Tensor) -> LatentMoments:
     flat = values.flatten(0, 1)
     deviation = flat.std(0)
     unit = (flat - flat.mean(0)) / deviation.clamp(min=1e-12)
-    # errors of deviations use the effective number of the squares: NUTS alternates sides, so means have a larger one
+    # Errors of deviations use the effective number of squares, because means have a larger one: NUTS alternates sides.
     squares = (values - flat.mean(0)).square() / (2 * deviation.clamp(min=1e-12))
-    with np.errstate(invalid="ignore"):  # constant chains have no error
+    with np.errstate(invalid="ignore"):  # the error of constant chains is NaN
         errors = [array_stats.mcse(each.numpy(), chain_axis=0, draw_axis=1) for each in (values, squares)]
     across = inferred.whole(inferred.whole(unit.T @ unit / (len(flat) - 1)).T)
-    told = flat.mean(0), deviation, *map(torch.as_tensor, errors)
-    mean, spread, *within = (inferred.whole(each).numpy() for each in told)
+    parts = flat.mean(0), deviation, *map(torch.as_tensor, errors)
+    mean, spread, *within = (inferred.whole(each).numpy() for each in parts)
     return LatentMoments(mean, spread, across.numpy(), *within)
 
 
-def _diagnosed(inferred: Inferred, draws: Tensor) -> Iterator[np.ndarray]:
+def _diagnose(inferred: Inferred, draws: Tensor) -> Iterator[np.ndarray]:
     """Yield R-hat and effective draws of the bulk (Q,) of draws (C, N, P); 1000 and 0 for constant chains."""
     from arviz_stats.base import array_stats
 
     for measure in (array_stats.rhat, array_stats.ess):
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = measure(draws.double().cpu().numpy(), chain_axis=0, draw_axis=1)
-        still = 1000.0 if measure is array_stats.rhat else 0.0
-        yield inferred.whole(torch.as_tensor(np.nan_to_num(found, nan=still, posinf=still))).numpy()
+            values = measure(draws.double().cpu().numpy(), chain_axis=0, draw_axis=1)
+        fallback = 1000.0 if measure is array_stats.rhat else 0.0
+        yield inferred.whole(torch.as_tensor(np.nan_to_num(values, nan=fallback, posinf=fallback))).numpy()
 
 
-def _together(parts: Sequence[LatentMoments]) -> LatentMoments:
+def _stack(parts: Sequence[LatentMoments]) -> LatentMoments:
     return LatentMoments(
         **{field.name: np.stack([getattr(part, field.name) for part in parts]) for field in fields(LatentMoments)}
     )

@@ -10,7 +10,7 @@ in standard deviations of the guide, estimated from separate draws. The bandwidt
 distance between two draws of P such numbers. The score needs no evidence; it is one gradient of the model.
 
 p-values use the wild bootstrap: the mean of h with random signs of the draws has the distribution of KSD^2 for draws
-from the posterior. Sums over sequences are compared with sums, and have more power than single sequences.
+from the posterior. The joint test compares sums over sequences, and has more power than tests of single sequences.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCALED = 1000
-"""Number of draws of the guide for its standard deviations."""
+"""Number of draws from the guide for its standard deviations."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,15 +69,15 @@ class SteinDiscrepancy(Result):
     @property
     def verdict(self) -> str:
         """Result of the test in one sentence."""
-        number = f"p = {self.p_value:.2g} of {len(self.sequences)} sequences together, {self.draws} draws of each"
+        number = f"p = {self.p_value:.2g} for {len(self.sequences)} sequences together, {self.draws} draws of each"
         if self.p_value <= 0.05:
-            alone = f"; {(self.p_values <= 0.05).sum()} of them are told at 5 % by themselves"
-            return f"the guide is not the posterior ({number}{alone})"
-        return f"nothing speaks against the guide ({number})"
+            individual = f"; {(self.p_values <= 0.05).sum()} of them are significant at 5 % on their own"
+            return f"the guide is not the posterior ({number}{individual})"
+        return f"no evidence against the guide ({number})"
 
     def table(self) -> Table:
         """Return a table with a row for each sequence."""
-        guide = self.equations.get("inference", "a guide of one’s own")
+        guide = self.equations.get("inference", "custom guide")
         table = Table(title=f"kernel Stein discrepancy · {guide}", caption=self.verdict)
         for column in ("sequence", "latent numbers", "KSD²", "5 % critical", "p"):
             table.add_column(column, justify="right", no_wrap=True)
@@ -93,8 +93,8 @@ class SteinDiscrepancy(Result):
         panel.plot([str(sequence) for sequence in self.sequences], self.squared / self.critical, "o")
         panel.axhline(1, color="0.4", linewidth=0.8)
         panel.set_xlabel("sequence")
-        panel.set_ylabel("KSD² over its 5 % critical value")
-        figure.suptitle(self.equations.get("inference", "a guide of one’s own"), fontsize=9, parse_math=False)
+        panel.set_ylabel("KSD² / its 5 % critical value")
+        figure.suptitle(self.equations.get("inference", "custom guide"), fontsize=9, parse_math=False)
         return figure
 
     @override
@@ -108,7 +108,10 @@ class SteinDiscrepancy(Result):
     @override
     def check(self) -> None:
         if self.extents != {"sequence": {len(self.sequences)}} or not self.sequences:
-            raise ValueError(f"expected a number for each of {len(self.sequences)} sequences")
+            raise ValueError(
+                f"expected at least one sequence, and a value for each of {len(self.sequences)} sequences; got "
+                f"{self.extents}"
+            )
 
 
 @torch.inference_mode(False)
@@ -147,43 +150,43 @@ def stein_discrepancy(
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
-        >>> found = dvae.stein_discrepancy(model, model.sample(3, 4)["x"])
-        >>> found.p_values.shape, found.p_value < 0.05  # a guide that was not fitted
+        >>> result = dvae.stein_discrepancy(model, model.sample(3, 4)["x"])
+        >>> result.p_values.shape, result.p_value < 0.05  # a guide that was not fitted
         ((3,), True)
     """
     if draws < 2 or bootstrap < 1:
         raise ValueError(f"draws must be at least 2 and bootstrap at least 1, got {draws} and {bootstrap}")
-    found, together = [], torch.zeros(bootstrap + 1, dtype=torch.float64)
+    results, total = [], torch.zeros(bootstrap + 1, dtype=torch.float64)
     with seeded_evaluation(model, seed), progress_bar(progress) as bar:
-        some = some_of(model, batch, sequences)
-        for data in bar.track(some, description="scores of draws"):
+        batches = some_of(model, batch, sequences)
+        for data in bar.track(batches, description="scores of draws"):
             inferred = Inferred(model, data, guide, SCALED)
             u = inferred.whitened(inferred.drawn(draws))
             pairs = _stein(u, inferred.score(u))
             if not pairs.isfinite().all():
                 raise FloatingPointError(
                     "the gradient of the log joint is not finite at a draw of the guide; check whether the model has "
-                    "been fitted, and on data of this scale"
+                    "been fitted to data of this scale"
                 )
             signs = 2.0 * torch.randint(2, (bootstrap + 1, draws)).to(pairs) - 1
             signs[0] = 1  # KSD^2 itself
             means = ((signs @ pairs) * signs).sum(1).cpu() / (draws * (draws - 1))
-            found.append((float(means[0]), float(means.quantile(0.95)), _share(means), u.shape[1]))
-            together += means
-    squared, critical, p_values, numbers = map(np.array, zip(*found, strict=True))
+            results.append((float(means[0]), float(means.quantile(0.95)), _share(means), u.shape[1]))
+            total += means
+    squared, critical, p_values, numbers = map(np.array, zip(*results, strict=True))
     equations = {"generative": model.generative.text} | ({} if guide else {"inference": model.inference.text})
-    which = tuple(range(len(some)) if sequences is None else sequences)
-    tests = squared, critical, p_values, _share(together), numbers
-    return SteinDiscrepancy(*tests, which, draws, bootstrap, seed, equations)
+    indices = tuple(range(len(batches)) if sequences is None else sequences)
+    tests = squared, critical, p_values, _share(total), numbers
+    return SteinDiscrepancy(*tests, indices, draws, bootstrap, seed, equations)
 
 
 def _share(means: Tensor) -> float:
-    """Return the share of all values, the first included, that are not below the first."""
+    """Return the share of values, including the first, that are not below the first."""
     return float((means >= means[0]).double().mean())
 
 
 def _stein(u: Tensor, score: Tensor) -> Tensor:
-    """Return h (K, K) of all pairs of draws u (K, P) with these scores, 0 on the diagonal."""
+    """Return h (K, K) of all pairs of draws u (K, P) with scores (K, P), 0 on the diagonal."""
     u, score = u.double(), score.double()
     width = 2 * u.shape[1]
     base = 1 / (1 + torch.cdist(u, u).square() / width)

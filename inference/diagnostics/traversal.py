@@ -1,4 +1,4 @@
-"""Traversals: the effect of a latent's coordinates on the data."""
+"""Traversals: how a latent's coordinates affect the data."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Traversal:
 
     Attributes:
         latent: name of the latent.
-        coordinates: the C coordinates that were moved, one at a time.
-        offsets: offsets (M,) in units of `scale`; 0 is the latent as inferred.
+        coordinates: the C shifted coordinates, one at a time.
+        offsets: offsets (M,) in units of `scale`; 0 is the inferred latent.
         scale: standard deviation of each coordinate under the prior or the posterior, (C,).
         frames: decoded x, (C, M, B, T, D).
         unit: "prior" or "posterior".
@@ -55,22 +55,22 @@ def traverse(
     draws: int = 256,
     seed: int = 0,
 ) -> Traversal:
-    """Move one coordinate of a latent at a time, for a local latent at all steps alike, and decode.
+    """Decode sequences with one coordinate of a latent shifted at a time, by the same amount at all steps.
 
-    Latents are drawn once from the guide. One coordinate is then shifted and the others are kept. x runs freely from
-    its own past, set to its mean. Decoded motions therefore differ only by the effect of that coordinate on x.
+    Latents are drawn once from the guide. One coordinate is then shifted and the others are kept. x runs freely, and is
+    the mean of its emission. Decoded sequences therefore differ only by the effect of that coordinate on x.
 
     Args:
         model: model with its guide.
         batch: sequences (B, T, D) to start from, or a mapping with context.
-        latent: name of the latent to move.
-        coordinates: coordinates to move; all by default.
+        latent: name of the latent to shift.
+        coordinates: coordinates to shift; all by default.
         span: smallest and largest offset, in standard deviations.
-        steps: M, number of evenly spaced offsets, which must include 0, the latent as inferred.
-        unit: standard deviation that offsets are in: of the prior (over free runs and steps), or of the guide given the
-            batch.
-        free: other latents, drawn from the model with the same noise at each offset, so that they follow the moved one.
-            Required if the latent affects x only through others.
+        steps: M, number of evenly spaced offsets, which must include 0, the inferred latent.
+        unit: standard deviation that is the unit of offsets: of the prior (over free runs and steps), or of the guide
+            given the batch.
+        free: other latents, drawn from the model with the same noise at each offset, so that they follow the shifted
+            one. Required if the latent affects x only through others.
         draws: number of draws for the standard deviation.
         seed: seed of all draws.
 
@@ -79,25 +79,25 @@ def traverse(
 
     Example:
         >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3})
-        >>> found = dvae.traverse(model, torch.randn(4, 5, 3), "w", steps=5)
+        >>> result = dvae.traverse(model, torch.randn(4, 5, 3), "w", steps=5)
     """
     if latent not in model.latents or not set(free) <= set(model.latents) - {latent}:
         raise ValueError(
-            f"the latents are {', '.join(model.latents)}; expected one to move and others to be free, got {latent} "
-            f"and free={tuple(free)}"
+            f"the latents are {', '.join(model.latents)}; expected one of them to shift and others in `free`, got "
+            f"{latent} and free={tuple(free)}"
         )
-    chosen = tuple(range(model.sizes[latent]) if coordinates is None else coordinates)
-    if not chosen or not set(chosen) <= set(range(model.sizes[latent])) or steps < 2 or draws < 2:
+    indices = tuple(range(model.sizes[latent]) if coordinates is None else coordinates)
+    if not indices or not set(indices) <= set(range(model.sizes[latent])) or steps < 2 or draws < 2:
         raise ValueError(
             f"coordinates of {latent} must be from 0 to {model.sizes[latent] - 1}, steps and draws at least 2; "
-            f"got {chosen}, {steps} and {draws}"
+            f"got {indices}, {steps} and {draws}"
         )
     offsets = torch.linspace(*span, steps, dtype=torch.float64)
     offsets[offsets.abs() < 1e-9 * offsets.abs().max()] = 0
     if (offsets != 0).all():
         raise ValueError(
-            f"{steps} offsets from {span[0]:g} to {span[1]:g} leave out 0, the latent as inferred and the reference "
-            "of all others; take an odd number of steps, and a span about 0"
+            f"{steps} offsets from {span[0]:g} to {span[1]:g} do not include 0, the inferred latent; use an odd number "
+            "of steps, and a span that is symmetric about 0"
         )
     if unit not in ("prior", "posterior"):
         raise ValueError(f"unit must be 'prior' or 'posterior', got {unit!r}")
@@ -106,22 +106,22 @@ def traverse(
     if partial := {"lengths", "mask"} & data.keys():
         raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
     with seeded_evaluation(model, seed):
-        scale = _scale(model, data, latent, unit, draws)[list(chosen)]
+        scale = _scale(model, data, latent, unit, draws)[list(indices)]
         torch.manual_seed(seed)
         inferred = model.guide(data)
         offsets = offsets.to(scale)
-        kept = {name: value for name, value in inferred.items() if name not in (*free, latent)}
+        fixed = {name: value for name, value in inferred.items() if name not in (*free, latent)}
         frames = []
-        for coordinate, unit_scale in zip(chosen, scale, strict=True):
-            moved = repeat(inferred[latent], steps).unflatten(0, (steps, -1))
-            moved[..., coordinate] += (offsets * unit_scale).reshape(steps, *[1] * (moved.dim() - 2))
+        for coordinate, unit_scale in zip(indices, scale, strict=True):
+            shifted = repeat(inferred[latent], steps).unflatten(0, (steps, -1))
+            shifted[..., coordinate] += (offsets * unit_scale).reshape(steps, *[1] * (shifted.dim() - 2))
             # Free latents have the same noise at each offset only in separate runs.
-            for group in moved.split(1 if free else steps):
+            for group in shifted.split(1 if free else steps):
                 torch.manual_seed(seed)
-                latents = {**repeat(kept, len(group)), latent: group.flatten(0, 1)}
+                latents = {**repeat(fixed, len(group)), latent: group.flatten(0, 1)}
                 frames.append(decode(model, repeat(data, len(group)), latents, True))
-    shape = (len(chosen), steps, -1)
-    return Traversal(latent, chosen, offsets.cpu(), scale.cpu(), torch.cat(frames).unflatten(0, shape).cpu(), unit)
+    shape = (len(indices), steps, -1)
+    return Traversal(latent, indices, offsets.cpu(), scale.cpu(), torch.cat(frames).unflatten(0, shape).cpu(), unit)
 
 
 def _check_path(model: DynamicalVAE, latent: str, free: Sequence[str]) -> None:
@@ -133,8 +133,8 @@ def _check_path(model: DynamicalVAE, latent: str, free: Sequence[str]) -> None:
     if not moving & set(model.observed):
         readers = {name for name in model.latents if latent in model.generator[name].parents}
         raise ValueError(
-            f"x does not read {latent}, so nothing would move; let the latents on the way be free: "
-            f"free={tuple(sorted(readers))}"
+            f"x does not depend on {latent} directly, so shifting it would change nothing; list the latents that read "
+            f"it in `free`: free={tuple(sorted(readers))}"
         )
 
 

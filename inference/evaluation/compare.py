@@ -2,7 +2,7 @@
 
 Every model is scored teacher-forced on the same sequences: evidence lower bound, IWAE bound with the Pareto diagnostic
 of its weights, optionally the FIVO bound, KL of every latent, and information of the latents about the data.
-Free-running scores come from `evaluate`. Models are ranked by the IWAE bound per frame. `comparison` has the
+Free-running scores come from `evaluate`. Models are ranked by the IWAE bound per frame. `comparison` computes the
 uncertainty of their differences.
 """
 
@@ -71,9 +71,9 @@ def compare(
     nearly always identifies its sequence, so its information would be log M for every model. If q reads only data, this
     is I(x; z_t). If q reads other latents too, it is the information that x adds to them. The contrasts are not
     weighted by how well they explain the past of the latents. It is therefore at least I(x; z_t | past), by the
-    divergence of the two mixtures, and does not vanish when the past already identifies the sequence. Overlapping
-    windows of one clip may be among the contrasts. Nothing distinguishes their common part, so log M cannot be reached
-    among them.
+    divergence of the two mixtures, and does not vanish when the past already identifies the sequence. If overlapping
+    windows of one clip are among the contrasts, nothing distinguishes their common part, and the information stays
+    below log M.
 
     Args:
         models: a model by name, or several that differ only in their training seed.
@@ -84,10 +84,10 @@ def compare(
             mean. `Comparison.to_arviz` needs 25 or more.
         filter_particles: K of the FIVO bound (`fivo_bound`); 0 omits it. For a model without a FIVO bound, such as
             one with a backward guide, a note gives the reason.
-        contrasts: M, number of randomly drawn sequences among which information is measured; all if there are fewer, 0
-            omits it.
-        samples: forecasts per window for the free-running scores; 0 omits these, which take longest. Tensors, batches
-            and whole sequences have none.
+        contrasts: M, number of randomly drawn sequences among which information is measured; all sequences if there are
+            fewer. 0 omits information.
+        samples: number of forecasts per window for the free-running scores, which take longest; 0 omits them. Tensors,
+            batches and whole sequences have none.
         draw_emission: whether forecasts are draws of x (True) or its means (False); None as in `evaluate`.
         seed: seed of every model's draws, and of the choice of contrasts.
         batch_size: number of sequences in a batch.
@@ -100,14 +100,14 @@ def compare(
     Raises:
         ValueError: when `models` is empty, models in one row differ in equations or sizes, a number is out of range,
             the data have no sequences, or windows to forecast are ragged.
-        TypeError: when the data are of another kind, or a value in `models` is no model.
+        TypeError: when the data are of another kind, or a value in `models` is not a model.
         FloatingPointError: when a bound is not finite, naming model and sequence.
 
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
-        >>> found = dvae.compare({"surrogate": model}, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
-        >>> found.ranking
+        >>> result = dvae.compare({"surrogate": model}, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> result.ranking
         ['surrogate']
     """
     if min(particles, estimates, batch_size) < 1 or min(filter_particles, contrasts, samples) < 0:
@@ -117,36 +117,40 @@ def compare(
         )
     data = take_split(data, "test")
     windows = data if isinstance(data, HeldOutWindows) else None
-    whole = windows is not None and windows.protocol.observed is None
-    samples = 0 if windows is None or whole else samples
+    is_whole = windows is not None and windows.protocol.observed is None
+    samples = 0 if windows is None or is_whole else samples
     contenders = _contenders(models)
     labelled = {label: model for label, _, model in _each(contenders)}
-    of: dict[str, str] = {}
+    labels: dict[str, str] = {}
     for label, model in labelled.items():
-        of.setdefault(model.view.measured or "the data", label)
-    if len(of) > 1:
+        labels.setdefault(model.view.measured or "the data", label)
+    if len(labels) > 1:
         raise ValueError(
-            "bounds are comparable only as densities of the same data, but here are "
-            f"{' and '.join(f'bounds of {label}, of {what}' for what, label in of.items())}; evaluate compares "
+            "bounds are comparable only as densities of the same data, but these are "
+            f"{', '.join(f'of {quantity} for {label}' for quantity, label in labels.items())}; use evaluate to compare "
             "forecasts"
         )
     batch = sequences(data).batch
-    alone = batch.group.tolist() if batch.group is not None else range(length_of(batch))
-    keys = [("data", str(n), 0) for n in alone] if windows is None else clusters(windows)
-    chosen = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]
+    sequence_ids = batch.group.tolist() if batch.group is not None else range(length_of(batch))
+    keys = [("data", str(n), 0) for n in sequence_ids] if windows is None else clusters(windows)
+    contrast_indices = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]
     shared: dict[str, Any] = {"seed": seed, "batch_size": batch_size, "progress": progress}
-    free: dict[str, dict[str, Any]] = {label: {} for label in labelled}
+    free_running: dict[str, dict[str, Any]] = {label: {} for label in labelled}
     measures: Sequence[Measure] = ()
     emission = "drawn" if draw_emission else "mean"
     if windows is not None and samples:
-        drawn: dict[str, Any] = {"samples": samples, "draw_emission": draw_emission, "references": False}
+        forecast_options: dict[str, Any] = {"samples": samples, "draw_emission": draw_emission, "references": False}
         measures = [measure for measure in scores(windows) if measure.least <= samples and not measure.bins]
-        made = evaluate(labelled, windows, scores=lambda _: measures, **drawn, **shared)
-        emission = made.emission
-        free = {label: {m.name: np.array(made.rows[label].clip_means[m.name]) for m in measures} for label in labelled}
+        evaluation = evaluate(labelled, windows, scores=lambda _: measures, **forecast_options, **shared)
+        emission = evaluation.emission
+        free_running = {
+            label: {m.name: np.array(evaluation.rows[label].clip_means[m.name]) for m in measures} for label in labelled
+        }
     measured = {
-        label: _measured(label, model, batch, keys, chosen, particles, estimates, filter_particles, **shared)
-        | {"free_running": free[label]}
+        label: _score_model(
+            label, model, batch, keys, contrast_indices, particles, estimates, filter_particles, **shared
+        )
+        | {"free_running": free_running[label]}
         for label, model in labelled.items()
     }
     rows = {}
@@ -170,24 +174,24 @@ def compare(
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
         filter_particles=filter_particles,
-        contrasts=len(chosen),
+        contrasts=len(contrast_indices),
         samples=samples,
         emission=emission,
         seed=seed,
         shown={measure.name: measure.unit for measure in measures if measure.headline},
         better={measure.name: measure.better for measure in measures if measure.headline},
         notes=["no forecasts: whole sequences have no future"]
-        if whole
+        if is_whole
         else list(dict.fromkeys(measure.note for measure in measures if measure.headline and measure.note)),
     )
 
 
-def _measured(
+def _score_model(
     label: str,
     model: DynamicalVAE,
     batch: Batch,
     keys: Sequence[tuple[str, str, int]],
-    chosen: Tensor,
+    contrast_indices: Tensor,
     particles: int,
     estimates: int,
     filter_particles: int,
@@ -196,34 +200,34 @@ def _measured(
     batch_size: int,
     progress: bool,
 ) -> dict[str, Any]:
-    """Return all teacher-forced scores of one model, each group with draws from the seed."""
+    """Return all teacher-forced scores of one model; each group of scores draws from the seed."""
     with progress_bar(progress) as bar:
 
-        def parts(what: str, count: int, size: int) -> Iterator[slice]:
-            for start in bar.track(range(0, count, size), description=f"{label}, {what}"):
+        def parts(kind: str, count: int, size: int) -> Iterator[slice]:
+            for start in bar.track(range(0, count, size), description=f"{label}, {kind}"):
                 yield slice(start, start + size)
 
         with seeded_evaluation(model, seed):
-            found = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
-        found["notes"] = []
-        if filter_particles and (refused := obstacle(model, model.read(on_device_of(model, batch)))):
-            found["notes"].append(f"no FIVO bound: {refused}")
+            scores = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
+        scores["notes"] = []
+        if filter_particles and (reason := obstacle(model, model.read(on_device_of(model, batch)))):
+            scores["notes"].append(f"no FIVO bound: {reason}")
         elif filter_particles:
             with seeded_evaluation(model, seed):
                 pieces = parts("FIVO bound", len(keys), batch_size)
-                found["bounds"] |= filtered(label, model, batch, keys, filter_particles, pieces)
+                scores["bounds"] |= filtered(label, model, batch, keys, filter_particles, pieces)
         with seeded_evaluation(model, seed):
-            found["variances"] = variances(model, batch, parts("active units", len(keys), batch_size))
+            scores["variances"] = variances(model, batch, parts("active units", len(keys), batch_size))
         with seeded_evaluation(model, seed):
-            pieces = parts("information", len(chosen), max(1, _PAIRS // max(1, len(chosen))))
-            found["information"] = information(model, batch.rows(chosen), pieces)
-    return found
+            pieces = parts("information", len(contrast_indices), max(1, _PAIRS // max(1, len(contrast_indices))))
+            scores["information"] = information(model, batch.rows(contrast_indices), pieces)
+    return scores
 
 
 def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> ModelResult:
-    """Return a row from the scores of the models of its seeds; `model` is one of them."""
-    said = {"frames", "notes"}
-    scores = _stack([{key: value for key, value in seed.items() if key not in said} for seed in seeds])
+    """Return a row from the scores of the models of all seeds; `model` is one of these models."""
+    excluded = {"frames", "notes"}
+    scores = _stack([{key: value for key, value in seed.items() if key not in excluded} for seed in seeds])
     equations = {"generative": model.generative.text, "inference": model.inference.text}
     return ModelResult(
         equations, config, **{**scores, "estimates": scores["estimates"].mean(0)}, notes=seeds[0]["notes"]
@@ -239,37 +243,37 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
             raise TypeError(
                 f"{name!r} is a {type(value).__name__}; expected a DynamicalVAE, or a list of them, one for each seed"
             )
-    found: dict[str, list[Any]] = {
+    contenders: dict[str, list[Any]] = {
         name: [value] if isinstance(value, nn.Module) else list(value) for name, value in models.items()
     }
-    if not found or not all(found.values()):
-        empty = next((name for name, versions in found.items() if not versions), None)
-        raise ValueError("expected models to compare: " + (f"{empty!r} has no model" if found else "no models"))
-    for name, versions in found.items():
+    if not contenders or not all(contenders.values()):
+        empty = next((name for name, versions in contenders.items() if not versions), None)
+        raise ValueError("expected models to compare: " + (f"{empty!r} has no model" if contenders else "no models"))
+    for name, versions in contenders.items():
         for version in versions:
             if not isinstance(version, DynamicalVAE):
-                raise TypeError(f"{name!r} holds a {type(version).__name__}; expected a DynamicalVAE for each seed")
+                raise TypeError(f"{name!r} has a {type(version).__name__}; expected a DynamicalVAE for each seed")
             require_likelihood(version)
         first = versions[0]
         for other in versions[1:]:
-            ours, theirs = ((m.generative.text, m.inference.text, dict(m.sizes)) for m in (first, other))
-            if ours != theirs:
+            spec, other_spec = ((m.generative.text, m.inference.text, dict(m.sizes)) for m in (first, other))
+            if spec != other_spec:
                 raise ValueError(
-                    f"the models of {name!r} must differ in their seed only, but one is {ours} and another {theirs}; "
-                    "give them names of their own"
+                    f"the models of {name!r} must differ only in their seed, but one is {spec} and another "
+                    f"{other_spec}; give them different names"
                 )
-    return found
+    return contenders
 
 
 def _each(contenders: Mapping[str, list[Any]]) -> Iterator[tuple[str, str, Any]]:
     """Yield label, name and model of every seed."""
     for name, versions in contenders.items():
-        for place, model in enumerate(versions):
-            yield (name if len(versions) == 1 else f"{name}, model {place + 1}"), name, model
+        for index, model in enumerate(versions):
+            yield (name if len(versions) == 1 else f"{name}, model {index + 1}"), name, model
 
 
 def _fingerprint(batch: Batch) -> str:
-    """Return the SHA-256 of every tensor of the batch: its name, shape, type and values."""
+    """Return the SHA-256 of the names, shapes, types and values of all tensors of the batch."""
     digest = hashlib.sha256()
     for name, value in sorted(batch.leaves().items()):
         values = np.ascontiguousarray(value.cpu().numpy())
@@ -277,7 +281,9 @@ def _fingerprint(batch: Batch) -> str:
     return digest.hexdigest()
 
 
-def _stack(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _stack(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the seeds' arrays, stacked by name."""
-    columns = {key: [one[key] for one in found] for key in found[0]}
-    return {key: _stack(own) if isinstance(own[0], Mapping) else np.stack(own) for key, own in columns.items()}
+    columns = {key: [seed[key] for seed in seeds] for key in seeds[0]}
+    return {
+        key: _stack(values) if isinstance(values[0], Mapping) else np.stack(values) for key, values in columns.items()
+    }

@@ -106,11 +106,11 @@ class Comparison(Result):
         protocol: fields of the windows' protocol; empty for tensors.
         particles: K of the IWAE bound.
         contrasts: M, number of sequences among which information was measured; its upper limit is log M.
-        samples: forecasts per window, 0 without free-running scores.
+        samples: number of forecasts per window, 0 without free-running scores.
         emission: "mean" or "drawn": kind of forecasts.
         seed: seed of every model's draws.
         shown: unit of each free-running score in the table.
-        notes: lines below that table on how to read scores, or why they are missing.
+        notes: lines below that table: how to read scores, or why they are missing.
         better: "lower", "higher" or "" for each score of that table.
         filter_particles: K of the FIVO bound; 0 if it was not computed.
 
@@ -118,8 +118,8 @@ class Comparison(Result):
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
         >>> p, sizes = "p(z_t | z_{t-1}) p(x_t | z_t)", {"z": 1, "x": 2}
         >>> models = {name: dvae.linear_gaussian_surrogate(p, q, sizes, 4) for name, q in pairs.items()}
-        >>> found = dvae.compare(models, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
-        >>> found.difference("smooths", "filters").mean, found.ranking  # doctest: +ELLIPSIS
+        >>> result = dvae.compare(models, torch.randn(6, 4, 2), particles=32, contrasts=0, progress=False)
+        >>> result.difference("smooths", "filters").mean, result.ranking  # doctest: +ELLIPSIS
         (..., [...])
     """
 
@@ -160,7 +160,9 @@ class Comparison(Result):
         return parts[0].estimate(parts[1])
 
     def pairs(self, metric: str = "IWAE bound") -> Pairs:
-        """Return all paired differences in a metric, with p-values adjusted for their number (`many.pairs`).
+        """Return all paired differences in a metric, with p-values adjusted for their number.
+
+        `multiple_comparisons.pairs` describes the adjustment.
 
         Raises:
             KeyError: when a model has no such metric.
@@ -170,7 +172,7 @@ class Comparison(Result):
     def confidence_set(
         self, metric: str = "IWAE bound", level: float = 0.9, *, over_seeds: bool = True
     ) -> ConfidenceSet:
-        """Return the models that may be the best in a metric (`many.confidence_set`).
+        """Return the models that may be the best in a metric (`multiple_comparisons.confidence_set`).
 
         Args:
             metric: a metric of all models.
@@ -179,13 +181,15 @@ class Comparison(Result):
 
         Raises:
             KeyError: when a model has no such metric.
-            ValueError: when a model has one seed, so that nothing is known over seeds, or there is one clip.
+            ValueError: when a model has one seed, so that no error over seeds exists, or there is one clip.
         """
         better = self.better.get(metric, "lower") if metric in self.shown else "higher"
         return confidence_set(self._all(metric), better, level, over_seeds=over_seeds)
 
     def required(self, first: str, second: str, metric: str = "IWAE bound", **options: Any) -> Requirement:
-        """Return how many training seeds and clips would distinguish two models (options as in `many.required`).
+        """Return how many training seeds and clips would distinguish two models.
+
+        `multiple_comparisons.required` has the same options.
 
         Raises:
             KeyError: as `difference`.
@@ -197,14 +201,16 @@ class Comparison(Result):
         return {name: self._parts(name, metric) for name in self.rows}
 
     def join(self, other: Comparison) -> Comparison:
-        """Return this comparison with the rows of another one, of other models on the same sequences and settings.
+        """Return this comparison with the rows of another one, with the same sequences and settings.
 
         Raises:
-            ValueError: when sequences or settings differ, or both have a name.
+            ValueError: when sequences or settings differ, or both have a model of the same name.
         """
-        ours, theirs = ({**vars(each), "rows": None, "frames": None} for each in (self, other))
-        if different := [name for name, value in ours.items() if value != theirs[name]]:
-            raise ValueError(f"comparisons to join may differ in their models alone, not in {', '.join(different)}")
+        settings, other_settings = ({**vars(each), "rows": None, "frames": None} for each in (self, other))
+        if different := [name for name, value in settings.items() if value != other_settings[name]]:
+            raise ValueError(
+                f"comparisons to join may differ only in their models, but differ in {', '.join(different)}"
+            )
         if shared := self.rows.keys() & other.rows.keys():
             raise ValueError(f"both comparisons have a model {', '.join(sorted(shared))}; rename one of them")
         return dataclasses.replace(self, rows={**self.rows, **other.rows})
@@ -241,8 +247,8 @@ class Comparison(Result):
                 panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
             panel.set_ylim(len(ranking) - 0.5, -0.5)
             panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)
-            each, _, frame = self._words
-            panel.set_xlabel(f"nats a {frame} (95 %, thick: over {each}s, thin: over seeds too)", fontsize=9)
+            unit, _, frame = self._words
+            panel.set_xlabel(f"nats a {frame} (95 %, thick: over {unit}s, thin: over {unit}s and seeds)", fontsize=9)
             panel.grid(axis="x", alpha=0.3)
         for place, name in enumerate(ranking):
             if "FIVO bound" in self.rows[name].bounds:
@@ -260,9 +266,9 @@ class Comparison(Result):
                     steps = self.rows[name].kl_steps[latent].mean(0)
                     panel.plot(range(1, len(steps) + 1), steps, color=colours[name])
             panel.set(title=f"KL of {latent} over time", xlabel="step", ylabel="nats a step")
-            drawn = np.concatenate([line.get_ydata() for line in panel.lines])
-            if (top := drawn.max()) > 0:  # the first step may have a hundred times the KL of the others
-                least = max(drawn[drawn > 0].min(), top / 1e5)
+            values = np.concatenate([line.get_ydata() for line in panel.lines])
+            if (top := values.max()) > 0:  # the first step may have a hundred times the KL of the others
+                least = max(values[values > 0].min(), top / 1e5)
                 panel.set(yscale="log", ylim=(least / 1.5, top * 1.5))
         for panel in panels[3 + len(latents) :]:
             panel.set_axis_off()
@@ -275,12 +281,12 @@ class Comparison(Result):
     def _khat_panel(self, panel: Axes, colours: Mapping[str, str]) -> None:
         khats = {name: self.rows[name].bounds["k-hat"] for name in self.ranking}
         khats = {name: khat[~np.isnan(khat)] for name, khat in khats.items() if not np.isnan(khat).all()}
-        known = np.concatenate([np.zeros(1), *khats.values()])
-        left, right = max(-1.0, known.min()), max(1.0, min(3.0, known.max()))
+        values = np.concatenate([np.zeros(1), *khats.values()])
+        left, right = max(-1.0, values.min()), max(1.0, min(3.0, values.max()))
         for name, khat in khats.items():
             beyond = (khat > right).mean()
             label = f"{100 * beyond:.3g} % beyond {right:g}" if beyond else None
-            panel.ecdf(np.minimum(khat, right + 1), color=colours[name], label=label)  # it cannot draw infinity
+            panel.ecdf(np.minimum(khat, right + 1), color=colours[name], label=label)  # ecdf cannot draw infinity
         panel.axvline(KHAT, color="grey", linewidth=0.8, linestyle="--")
         panel.set(title="Pareto k-hat of the weights", xlabel=f"k-hat (unreliable above {KHAT})")
         panel.set(ylabel="share of sequences", xlim=(left, right), ylim=(0, 1.02))
@@ -298,17 +304,17 @@ class Comparison(Result):
         would be a mixture of runs, whose harmonic mean is dominated by the worst of them.) `constant_data` contains
         ELBO, IWAE bound and k-hat by seed, and frames and clip of every sequence.
 
-        The results of `loo` have another meaning here. The sequences were held out, so nothing remains to leave out,
-        and its elpd is the held-out log evidence. Its p ("effective parameters") measures how much the independent
-        estimates differ, in nats, and is Monte Carlo error. As elpd is a harmonic mean over draws, it lies below their
-        mean by about as much. More particles lower both.
+        The results of `loo` have another meaning here. The sequences are held out already, so its elpd is the held-out
+        log evidence. Its p ("effective parameters") measures how much the independent estimates differ, in nats; it is
+        Monte Carlo error. As elpd is a harmonic mean over draws, it is below their mean by about as much. More
+        particles lower both.
 
         Its k-hat is of the harmonic mean's weights. It warns if estimates of a sequence differ by a nat or more, and
         nearly always with fewer than 200 draws. Its standard errors assume independent sequences and ignore seeds; the
         standard errors of `difference` are clustered by clip.
 
         Raises:
-            ValueError: when there are fewer than 25 estimates, which `loo` cannot smooth.
+            ValueError: when there are fewer than 25 estimates, too few for `loo` to smooth.
         """
         from arviz_base import from_dict
 
@@ -318,7 +324,7 @@ class Comparison(Result):
                 raise ValueError(
                     f"arviz fits a Pareto tail to independent estimates of every sequence's log evidence and needs at "
                     f"least {_LOO_DRAWS}, but this comparison has {len(row.estimates)}; compare again with "
-                    "estimates=200 (and fewer particles, as each estimate costs as much as the bound)"
+                    "estimates=200 (and fewer particles, because each estimate costs as much as the bound)"
                 )
             likelihood = row.estimates[None]
             by_seed = {"elbo": "ELBO", "iwae_bound": "IWAE bound", "khat": "k-hat"}
@@ -361,13 +367,15 @@ class Comparison(Result):
     @override
     def check(self) -> None:
         if self.extents["sequence"] != {len(self.keys)}:
-            raise ValueError(f"expected numbers of {len(self.keys)} sequences")
+            raise ValueError(f"expected values of {len(self.keys)} sequences, got {self.extents['sequence']}")
         for name, row in self.rows.items():
             if not {"ELBO", "IWAE bound", "k-hat"} <= row.bounds.keys():
-                raise ValueError(f"{name} has no bounds")
+                raise ValueError(
+                    f"{name} must have ELBO, IWAE bound and k-hat; it has {', '.join(row.bounds) or 'none'}"
+                )
             parts = (row.bounds, row.kl_steps, row.variances, row.information, row.free_running)
             if {row.seeds} != {len(each) for part in parts for each in part.values()}:
-                raise ValueError(f"{name} has scores of different numbers of seeds")
+                raise ValueError(f"all scores of {name} must have {row.seeds} seeds, as its ELBO has")
 
     # Estimates
 
@@ -385,8 +393,8 @@ class Comparison(Result):
     def _parts(self, name: str, metric: str) -> TwoWayErrors:
         row = self._row(name)
         if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
-            known = [known for known in (*row.bounds, *row.free_running) if known != "k-hat"]
-            raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, known)}; it has {', '.join(known)}")
+            names = [each for each in (*row.bounds, *row.free_running) if each != "k-hat"]
+            raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, names)}; it has {', '.join(names)}")
         places = clip_index(self.keys).numpy()
         if metric in row.free_running:
             return TwoWayErrors.of(row.free_running[metric], np.bincount(places, weights=self.frames))
@@ -396,29 +404,29 @@ class Comparison(Result):
 
     @property
     def _words(self) -> tuple[str, str, str]:
-        """Words for the scored unit, for the unit of clustering, and for a frame."""
+        """Words for a scored sequence, for a cluster, and for a frame."""
         clip, frame = axis_names(self.data)
         if self.protocol.get("observed", 0) is None:
             return "whole sequence", clip, frame
         return "window" if "called" in self.data else "sequence", clip, frame
 
     def _title(self) -> str:
-        each, clip, _ = self._words
-        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {each}s"]
-        parts[-1] += "" if each == f"whole {clip}" else f" of {len(set(self._clips))} {clip}s"
+        unit, clip, _ = self._words
+        parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {unit}s"]
+        parts[-1] += "" if unit == f"whole {clip}" else f" of {len(set(self._clips))} {clip}s"
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)
 
     def _bound_table(self) -> Table:
-        each, clip, frame = self._words
+        unit, clip, frame = self._words
         bounds = (f"IWAE bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
         filters = [f"FIVO bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
         table = _table(
             f"{self._title()}\nteacher-forced, nats a {frame}",
             "\n".join(
                 [
-                    f"mean ± standard error over {each}s (clustered by {clip}) ± over seeds",
+                    f"mean ± standard error over {unit}s (clustered by {clip}) ± over seeds",
                     "95 %: from both, by Student's t, in brackets its degrees of freedom",
                     *([] if self.samples else self.notes),
                     *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),
@@ -438,7 +446,7 @@ class Comparison(Result):
         return table
 
     def _latent_table(self) -> Table:
-        limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "left out"
+        limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "not computed"
         table = _table(
             "latents under the guide, teacher-forced",
             f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
@@ -454,11 +462,11 @@ class Comparison(Result):
                     latent,
                     str(scores[f"KL {latent}"]),
                     "–" if math.isnan(active) else f"{units} of {row.variances[latent].shape[-1]}",
-                    self._told(row, latent),
+                    self._information_cell(row, latent),
                 )
         return table
 
-    def _told(self, row: ModelResult, latent: str) -> str:
+    def _information_cell(self, row: ModelResult, latent: str) -> str:
         if latent not in row.information:
             return "–"
         steps = row.information[latent].mean(0)
@@ -488,7 +496,7 @@ class Comparison(Result):
 
 
 def _table(title: str, caption: str, columns: Iterable[str]) -> Table:
-    """Return an empty table whose first column, for names, leaves the width to the numbers."""
+    """Return an empty table with a first column for names; cells fold where the terminal is too narrow."""
     table = Table(title=title, caption=caption)
     table.add_column("", overflow="fold")
     for column in columns:

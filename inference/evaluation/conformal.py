@@ -5,7 +5,7 @@ calibration windows. A band m ± q v, with q a quantile of these distances, cont
 given level, if both are exchangeable (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, arXiv 1604.04173). A band
 simultaneously contains
 
-    every number alone      s = |y_td - m_td| / v_td         a factor for each frame t and coordinate d
+    a single number         s = |y_td - m_td| / v_td         a factor for each frame t and coordinate d
     a frame                 s = max over d                   a factor for each frame
     the whole future        s = max over t and d             one factor
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REGIONS: Mapping[str, tuple[int, ...]] = {"number": (), "frame": (-1,), "future": (-2, -1)}
-"""What a band contains simultaneously, with the dimensions of (..., H, D) over which its distance is the maximum."""
+"""Regions that a band contains simultaneously, with the dimensions of (..., H, D) that are maximised over."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,12 +81,12 @@ class PredictionBands(Result):
     data: Mapping[str, Any]
 
     def apply(self, forecasts: Tensor, region: str = "future") -> tuple[Tensor, Tensor]:
-        """Return the bands of forecasts, which must be made as in the calibration.
+        """Return the bands of forecasts that were made as in the calibration.
 
         Args:
             forecasts: forecasts `(K, B, H, D)` of a model or reference.
-            region: region that a band contains with probability `level`: "number", each number alone; "frame", all
-                numbers of a frame; or the whole "future".
+            region: region that a band contains with probability `level`: "number" for each number separately, "frame"
+                for all numbers of a frame, or "future" for the whole future.
 
         Returns:
             Lower and upper end, `(B, H, D)` each.
@@ -96,59 +96,59 @@ class PredictionBands(Result):
         """
         if region not in REGIONS:
             raise ValueError(
-                f"no prediction bands of a {region!r}{nearest(region, REGIONS)}; known are {', '.join(REGIONS)}"
+                f"no prediction bands of a {region!r}{nearest(region, REGIONS)}; the regions are {', '.join(REGIONS)}"
             )
         shape = self.factors["number"].shape
         if forecasts.ndim != 4 or forecasts.shape[2:] != shape or len(forecasts) != self.samples:
             expected = f"(K, B, H, D) = ({self.samples}, B, {shape[0]}, {shape[1]})"
-            raise ValueError(f"these prediction bands are of forecasts {expected}, not {tuple(forecasts.shape)}")
+            raise ValueError(f"these prediction bands need forecasts {expected}, got {tuple(forecasts.shape)}")
         reach = self._factor(region, forecasts) * self._spread(forecasts.movedim(1, 0))
         return forecasts.mean(0) - reach, forecasts.mean(0) + reach
 
     def scores(self, windows: HeldOutWindows) -> list[Measure]:
         """Return scores for `evaluate`: coverage of the future and width of bands, before and after recalibration.
 
-        Forecasts alone also define a band m ± q v, with q the quantile of the distance of each of them from the others.
-        Shares are of windows of a clip drawn at random: clips are weighted equally, as in the calibration.
+        Before recalibration, the band is m ± q v, with q the quantile of the distances of each forecast from the
+        others. Clips have equal weight in the scores, as in the calibration.
         """
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
-        percent, least = f"{100 * self.level:g} %", {"said": max(3, _fewest(self.level)), "held": 1}
+        percent, least = f"{100 * self.level:g} %", {"said": max(3, _min_count(self.level)), "held": 1}
 
         @lru_cache(maxsize=1)  # shared by all scores of a batch
-        def judged(forecasts: Tensor, truth: Tensor) -> dict[tuple[str, str], tuple[Tensor, Tensor]]:
+        def coverage_and_width(forecasts: Tensor, truth: Tensor) -> dict[tuple[str, str], tuple[Tensor, Tensor]]:
             gaps = truth.isnan()
             spread = self._spread(forecasts)
-            away, own = standardised(forecasts, truth, spread), None
+            distances, own_distances = standardised(forecasts, truth, spread), None
             if forecasts.shape[1] >= least["said"]:
-                own = _own_distances(forecasts, None if self.spread is None else spread).masked_fill(
+                own_distances = _own_distances(forecasts, None if self.spread is None else spread).masked_fill(
                     gaps[:, None], torch.nan
                 )
-            found = {}
+            result = {}
             for region in REGIONS:
-                far, factors = largest_by_region(away, region), {"held": self._factor(region, forecasts)}
-                if own is not None:
-                    factors["said"] = _smallest(largest_by_region(own, region), self.level)
-                for how, factor in factors.items():
+                far, factors = largest_by_region(distances, region), {"held": self._factor(region, forecasts)}
+                if own_distances is not None:
+                    factors["said"] = _smallest(largest_by_region(own_distances, region), self.level)
+                for kind, factor in factors.items():
                     inside = (far <= factor).double().masked_fill(far.isnan(), torch.nan)
                     width = (2 * factor * spread / scales).masked_fill(gaps, torch.nan)
-                    found[how, region] = mean_of_known(inside, (-2, -1)), mean_of_known(width, (-2, -1))
-            return found
+                    result[kind, region] = mean_of_known(inside, (-2, -1)), mean_of_known(width, (-2, -1))
+            return result
 
-        def measure(how: str, region: str, place: int) -> Measure:
+        def measure(kind: str, region: str, place: int) -> Measure:
             name, in_unit = (("", "share"), ("width ", unit))[place]
             return Measure(
-                f"{name}{how} {percent}, {region}",
-                lambda forecasts, truth, past, index: judged(forecasts, truth)[how, region][place],
+                f"{name}{kind} {percent}, {region}",
+                lambda forecasts, truth, past, index: coverage_and_width(forecasts, truth)[kind, region][place],
                 in_unit,
                 better="",
                 pool=clips_alike,
-                least=least[how],
+                least=least[kind],
                 of_draws=True,
-                note="said: bands as wide as forecasts say; held: recalibrated. Of a window of a clip drawn at random",
+                note="said: quantiles of the forecasts alone; held: recalibrated bands. Clips have equal weight",
             )
 
-        return [measure(how, region, place) for place in (0, 1) for region in REGIONS for how in least]
+        return [measure(kind, region, place) for place in (0, 1) for region in REGIONS for kind in least]
 
     def coverage(
         self,
@@ -163,13 +163,13 @@ class PredictionBands(Result):
         Errors are clustered by clip.
 
         Args:
-            model: model whose forecasts the bands are of; or a reference's name.
+            model: model whose forecasts were calibrated, or the name of a reference.
             windows: windows to evaluate on.
             training_windows: training data of some references.
             progress: whether to show a progress bar.
 
         Returns:
-            `scores` of these forecasts; "said" is before, "held" after recalibration.
+            `scores` of these forecasts: "said" before, "held" after recalibration.
         """
         models, references = ({}, [model]) if isinstance(model, str) else (model, [])
         return evaluate(
@@ -190,17 +190,20 @@ class PredictionBands(Result):
         clip, frame = axis_names(self.data)
         title = f"bands of {100 * self.level:g} % · {self.data['windows']} windows of {self.clips} {clip}s"
         table = Table(
-            title=title, caption=f"half the width of a prediction band over the forecasts’ spread, K = {self.samples}"
+            title=title,
+            caption=f"factor: half the width of a band divided by the spread of forecasts, K = {self.samples}",
         )
-        for column in ("holds", "factor", "least", "largest"):
-            table.add_column(column, justify="left" if column == "holds" else "right")
-        shown = {"number": "each number", "frame": f"each {frame}", "future": "the whole future"}
+        for column in ("region", "factor", "smallest", "largest"):
+            table.add_column(column, justify="left" if column == "region" else "right")
+        region_labels = {"number": "each number", "frame": f"each {frame}", "future": "the whole future"}
         for region, factor in self.factors.items():
-            table.add_row(shown[region], *(f"{value:.2f}" for value in (factor.mean(), factor.min(), factor.max())))
+            table.add_row(
+                region_labels[region], *(f"{value:.2f}" for value in (factor.mean(), factor.min(), factor.max()))
+            )
         return table
 
     def plot(self) -> Figure:
-        """Draw factors over the horizon; for single numbers their mean and range over coordinates."""
+        """Draw factors over the horizon, for single numbers as mean and range over coordinates."""
         figure = new_figure(4.5, 3)
         axes = figure.subplots()
         numbers = self.factors["number"]
@@ -210,19 +213,19 @@ class PredictionBands(Result):
             axes.plot(frames, np.broadcast_to(factor, numbers.shape).mean(1), color=f"C{place}", label=region)
         axes.set_ylim(bottom=0)
         axes.set_xlabel(f"{axis_names(self.data)[1]} of the future", fontsize=8)
-        axes.set_ylabel("half width over spread", fontsize=8)
+        axes.set_ylabel("half width / spread", fontsize=8)
         axes.legend(fontsize=8)
         return figure
 
     @override
     def check(self) -> None:
-        _checked(self.level)
+        _check_level(self.level)
         shape = self.factors["number"].shape
-        given = [self.factors[region] for region in REGIONS] + ([] if self.spread is None else [self.spread])
-        if [each.shape for each in given] != [shape, (shape[0], 1), (1, 1), shape][: len(given)]:
+        arrays = [self.factors[region] for region in REGIONS] + ([] if self.spread is None else [self.spread])
+        if [each.shape for each in arrays] != [shape, (shape[0], 1), (1, 1), shape][: len(arrays)]:
             raise ValueError("expected factors (H, D), (H, 1) and (1, 1), and a spread (H, D)")
-        if not all(np.isfinite(each).all() and (each >= 0).all() for each in given):
-            raise ValueError("factors and spreads must be numbers from 0 on")
+        if not all(np.isfinite(each).all() and (each >= 0).all() for each in arrays):
+            raise ValueError("factors and spreads must be finite and at least 0")
 
     def _spread(self, forecasts: Tensor) -> Tensor:
         """Return the spread of forecasts (B, K, H, D): (B, H, D), or the common one (H, D)."""
@@ -249,9 +252,9 @@ def conformal_bands(
     """Calibrate prediction bands around forecasts on windows that the model was not fitted to.
 
     The bands contain the future of new windows with probability `level` if their clips are exchangeable with the
-    calibration clips, for example of the same people and styles. Calibration on clips of one person or style gives no
-    guarantee for another. Later steps of the same sequences are not exchangeable with earlier ones, so windows divided
-    by time are refused.
+    calibration clips, for example if both are of the same people and styles. Calibration on clips of one person or
+    style gives no guarantee for another. Later steps of the same sequences are not exchangeable with earlier ones, so
+    windows divided by time are refused.
 
     Args:
         model: a model (`Forecasting`), or the name of a reference row (`References`).
@@ -271,7 +274,7 @@ def conformal_bands(
 
     Raises:
         ValueError: when the level is invalid or needs more clips, forecasts have no spread, or `groups` and windows
-            differ in number. Also when windows cannot be forecast, or are one part of sequences divided by time.
+            differ in number. Also when windows cannot be forecast, or are part of a split by time.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -280,9 +283,9 @@ def conformal_bands(
         >>> {region: factor.shape for region, factor in bands.factors.items()}
         {'number': (4, 2), 'frame': (4, 1), 'future': (1, 1)}
     """
-    held = prepare_windows(windows)
-    windows, (clip, _) = held.windows, axis_names(held.windows.description)
-    parts = {split for split, _, _ in held.keys} - {"all", "last"}
+    eval_windows = prepare_windows(windows)
+    windows, (clip, _) = eval_windows.windows, axis_names(eval_windows.windows.description)
+    parts = {split for split, _, _ in eval_windows.keys} - {"all", "last"}
     if parts and getattr(windows.protocol, "split", None) == "time":
         raise ValueError(
             f"these windows are the {' and '.join(sorted(parts))} part of {clip}s divided by time (split='time'). "
@@ -291,31 +294,30 @@ def conformal_bands(
             f"other {clip}s, data.windows('all')"
         )
     keys = clusters(windows) if groups is None else [("", group, 0) for group in groups]
-    if len(keys) != len(held.keys):
-        raise ValueError(f"{len(held.keys)} windows need as many groups, not {len(keys)}")
-    places, needed = clip_index(keys), _fewest(_checked(level))
+    if len(keys) != len(eval_windows.keys):
+        raise ValueError(f"groups must have one name for each of {len(eval_windows.keys)} windows, got {len(keys)}")
+    places, required = clip_index(keys), _min_count(_check_level(level))
     clips = int(places.max()) + 1
-    if clips < needed:
-        what, most = f"{clip}s" if groups is None else "groups", math.floor(100 * clips / (clips + 1))
+    if clips < required:
+        unit, highest = f"{clip}s" if groups is None else "groups", math.floor(100 * clips / (clips + 1))
         raise ValueError(
-            f"prediction bands of {100 * level:g} % need {needed} {what} of calibration windows, got {clips}; with "
-            "fewer, the "
-            f"next one is outside the bands too often. Use more, or {most} % at most"
+            f"prediction bands of {100 * level:g} % need at least {required} {unit} of calibration windows, got "
+            f"{clips}; use more, or a level of at most {highest} %"
         )
     with progress_bar(progress) as bar:
 
-        def futures(of: EvaluationWindows, label: str) -> Iterator[tuple[Tensor, Tensor]]:
+        def futures(source: EvaluationWindows, label: str) -> Iterator[tuple[Tensor, Tensor]]:
             """Yield forecasts (B, K, H, D) and true futures by batch."""
             if isinstance(model, str):
                 name = model
-                drawn, forecaster = References(of, samples, seed, training_windows)[model]
+                n_forecasts, forecaster = References(source, samples, seed, training_windows)[model]
             else:
-                name, drawn = type(model).__name__, samples
-                forecaster = forecaster_of(model, of, samples, {"draw_emission": True, **(options or {})})
+                name, n_forecasts = type(model).__name__, samples
+                forecaster = forecaster_of(model, source, samples, {"draw_emission": True, **(options or {})})
             with nullcontext() if isinstance(model, str) else seeded_evaluation(model, seed):
-                for start in bar.track(range(0, len(of.keys), batch_size), description=label):
+                for start in bar.track(range(0, len(source.keys), batch_size), description=label):
                     part = slice(start, start + batch_size)
-                    yield forecasts_of(name, forecaster, drawn, of, part), of.futures[part]
+                    yield forecasts_of(name, forecaster, n_forecasts, source, part), source.futures[part]
 
         spread = None
         if residuals is not None:
@@ -323,16 +325,16 @@ def conformal_bands(
                 truth - forecasts.mean(1) for forecasts, truth in futures(prepare_windows(residuals), "residuals")
             ]
             spread = mean_of_known(torch.cat(errors).square(), 0).sqrt()
-        found, count = [], 0
-        for forecasts, truth in futures(held, "calibration"):
+        batches, count = [], 0
+        for forecasts, truth in futures(eval_windows, "calibration"):
             count = forecasts.shape[1]
-            found.append(standardised(forecasts, truth, _deviations(forecasts) if spread is None else spread))
-    far = torch.cat(found)
+            batches.append(standardised(forecasts, truth, _deviations(forecasts) if spread is None else spread))
+    far = torch.cat(batches)
     factors = {region: quantile(largest_by_region(far, region), places, level) for region in REGIONS}
     if not all(factor.isfinite().all() for factor in factors.values()):
         raise ValueError(
-            "these prediction bands would be infinite: forecasts without spread miss the future, as points do "
-            f"(residuals= takes windows to estimate a spread), or too few {clip}s were observed at some place"
+            "these prediction bands would be infinite: either forecasts have no spread, as point forecasts (pass "
+            f"`residuals`, windows to estimate a spread), or a value was observed in too few {clip}s"
         )
     return PredictionBands(
         level=level,
@@ -342,20 +344,20 @@ def conformal_bands(
         seed=seed,
         options=dict(options or {}),
         clips=clips,
-        data=held.description(),
+        data=eval_windows.description(),
     )
 
 
 def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
-    """Return a value for each clip whose mean weighted by windows is the mean over clips, with its errors.
+    """Return values by clip whose mean, weighted by windows, is the plain mean over clips, with the same errors.
 
     Args:
         values: score of every window, `(N,)`.
         clips: clip of every window, from 0 to C - 1, `(N,)`.
     """
     means, windows = np.array(clip_means(values, clips)), np.bincount(clips.numpy())
-    found: list[float] = (means.mean() + (means - means.mean()) * windows.mean() / windows).tolist()
-    return found
+    result: list[float] = (means.mean() + (means - means.mean()) * windows.mean() / windows).tolist()
+    return result
 
 
 def _deviations(forecasts: Tensor) -> Tensor:
@@ -368,25 +370,25 @@ def standardised(forecasts: Tensor, truth: Tensor, spread: Tensor) -> Tensor:
 
     It is NaN where the future was not observed, and infinite where forecasts without a spread miss it.
     """
-    return _over((truth - forecasts.mean(1)).abs(), spread)
+    return _ratio((truth - forecasts.mean(1)).abs(), spread)
 
 
 def _own_distances(forecasts: Tensor, spread: Tensor | None) -> Tensor:
-    """Return the distance of each of forecasts (B, K, H, D) from the mean of the others, in units of their spread."""
-    count, apart = forecasts.shape[1], forecasts - forecasts.mean(1, keepdim=True)
+    """Return distances (B, K, H, D) of each forecast from the mean of the others, in units of their spread."""
+    count, deviations = forecasts.shape[1], forecasts - forecasts.mean(1, keepdim=True)
     if spread is None:
-        squares = apart.square()
-        left = squares.sum(1, keepdim=True) - count / (count - 1) * squares  # sum of the others, centred
-        spread = (left.clamp(min=0) / (count - 2)).sqrt()
-    return _over(count / (count - 1) * apart.abs(), spread)
+        squares = deviations.square()
+        squares_of_others = squares.sum(1, keepdim=True) - count / (count - 1) * squares  # sum of the others, centred
+        spread = (squares_of_others.clamp(min=0) / (count - 2)).sqrt()
+    return _ratio(count / (count - 1) * deviations.abs(), spread)
 
 
-def _over(distance: Tensor, spread: Tensor) -> Tensor:
+def _ratio(distance: Tensor, spread: Tensor) -> Tensor:
     return torch.where(distance == 0, 0.0, distance / spread)
 
 
 def largest_by_region(distances: Tensor, region: str) -> Tensor:
-    """Return the largest of known distances (..., H, D) in each region; NaN if none is known."""
+    """Return the largest known distance in each region of distances (..., H, D); NaN if none is known."""
     if not REGIONS[region]:
         return distances
     largest = distances.nan_to_num(nan=-1.0, posinf=math.inf).amax(REGIONS[region], keepdim=True)
@@ -394,36 +396,36 @@ def largest_by_region(distances: Tensor, region: str) -> Tensor:
 
 
 def _smallest(distances: Tensor, level: float) -> Tensor:
-    """Return the ⌈(K + 1) level⌉-th smallest (B, ...) of K distances (B, K, ...) exchangeable with another one."""
+    """Return the ⌈(K + 1) level⌉-th smallest (B, ...) of K exchangeable distances (B, K, ...)."""
     return distances.kthvalue(math.ceil(round((distances.shape[1] + 1) * level, 9)), 1).values
 
 
 def quantile(distances: Tensor, places: Tensor, level: float) -> Tensor:
     """Return the quantile (...) of known distances (N, ...) with the weights of hierarchical conformal prediction.
 
-    Infinite if too few clips are known.
+    It is infinite if too few clips have a known distance.
 
     Args:
         distances: distances of windows, NaN if unknown.
         places: clip of every window, (N,).
         level: level of the quantile.
     """
-    known = (~distances.isnan()).flatten(1).double()
-    windows = known.new_zeros(int(places.max()) + 1, known.shape[1]).index_add_(0, places, known)  # by clip
+    is_known = (~distances.isnan()).flatten(1).double()
+    windows = is_known.new_zeros(int(places.max()) + 1, is_known.shape[1]).index_add_(0, places, is_known)  # by clip
     clips = (windows > 0).sum(0)
     ordered, order = distances.flatten(1).nan_to_num(nan=math.inf, posinf=math.inf).sort(0)
-    weights = (known / windows[places].clamp(min=1)).gather(0, order)
+    weights = (is_known / windows[places].clamp(min=1)).gather(0, order)
     reached = weights.cumsum(0) >= level * (clips + 1) - 1e-9
-    found = ordered.gather(0, reached.byte().argmax(0, keepdim=True))[0]
-    return found.masked_fill(~reached.any(0), math.inf).reshape(distances.shape[1:])
+    result = ordered.gather(0, reached.byte().argmax(0, keepdim=True))[0]
+    return result.masked_fill(~reached.any(0), math.inf).reshape(distances.shape[1:])
 
 
-def _fewest(level: float) -> int:
-    """Return the fewest exchangeable numbers with a quantile that bounds another one at this level."""
+def _min_count(level: float) -> int:
+    """Return the smallest number of exchangeable values with a quantile that bounds a new value at this level."""
     return math.ceil(round(level / (1 - level), 9))
 
 
-def _checked(level: float) -> float:
+def _check_level(level: float) -> float:
     if not 0 < level < 1:
         raise ValueError(f"the level of a prediction band must be between 0 and 1, got {level}")
     return level

@@ -48,7 +48,7 @@ def clustered_variance(deviations: np.ndarray) -> float:
 
 
 def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) -> int:
-    """Return how many independent draws give histograms as uncertain as draws that are dependent within clips.
+    """Return the number of independent draws with the same uncertainty of histograms as draws dependent within clips.
 
     The number is one over the root mean square of v / (p (1 - p)) over shares p, with v the clustered variance of the
     observed share. For N independent draws this ratio is 1 / N. With the mean instead of the root mean square, this is
@@ -73,12 +73,12 @@ def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) ->
 def decimals(mean: float, *errors: float) -> int:
     """Return the number of decimals for printing a mean and its errors.
 
-    It is three as in the papers, and four if an error is below 0.001. From a mean of 1000 or an error of 10 on, it is
-    one less for each further digit before the point.
+    It is three, and four if an error is below 0.001. From a mean of 1000 or an error of 10 on, it is one less for each
+    further digit before the point.
     """
-    known = [error for error in errors if 0 < error < math.inf]
-    largest = max([abs(mean) / 100, *known, 1.0] if math.isfinite(mean) else [1.0])
-    return max((4 if known and min(known) < 0.001 else 3) - math.floor(math.log10(largest)), 0)
+    finite = [error for error in errors if 0 < error < math.inf]
+    largest = max([abs(mean) / 100, *finite, 1.0] if math.isfinite(mean) else [1.0])
+    return max((4 if finite and min(finite) < 0.001 else 3) - math.floor(math.log10(largest)), 0)
 
 
 def student_interval(mean: float, error: float, freedom: float, level: float = 0.95) -> tuple[float, float]:
@@ -95,7 +95,7 @@ def student_interval(mean: float, error: float, freedom: float, level: float = 0
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over sequences and seeds with standard errors; NaN for an unknown one (one clip, one seed).
+    """Mean over sequences and seeds with standard errors; an error is NaN if unknown (one clip, one seed).
 
     Args:
         mean: weighted mean.
@@ -115,7 +115,7 @@ class Estimate:
         """Return the confidence interval of the mean by Student's t, from one of the errors; NaN if it is unknown.
 
         Raises:
-            ValueError: when the level is not between 0 and 1, or `error` is none of the three.
+            ValueError: when the level is not between 0 and 1, or `error` is not one of the three.
         """
         return student_interval(self.mean, *self._error(error), level)
 
@@ -123,7 +123,7 @@ class Estimate:
         """Return the two-sided p-value of a zero mean by Student's t, from one of the errors; NaN if it is unknown.
 
         Raises:
-            ValueError: when `error` is none of the three.
+            ValueError: when `error` is not one of the three.
         """
         scale, freedom = self._error(error)
         if scale == 0:
@@ -132,7 +132,7 @@ class Estimate:
 
     def _error(self, name: str) -> tuple[float, float]:
         if name not in _ERRORS:
-            raise ValueError(f"errors are over {', '.join(_ERRORS)}, not {name!r}")
+            raise ValueError(f"error must be one of {', '.join(_ERRORS)}, got {name!r}")
         place = _ERRORS.index(name)
         return (self.sequences, self.seeds, self.total)[place], self.freedom[place]
 
@@ -155,7 +155,7 @@ def _freedom(total: float, *parts: tuple[float, float]) -> float:
 
 @dataclass(frozen=True)
 class TwoWayErrors:
-    """Mean of a model, error contributions of clips (C,), variances of seeds and of the rest, and number of seeds S."""
+    """Mean of a model, error contributions of clips (C,), variances V_seeds and V_rest, and number of seeds S."""
 
     mean: float
     deviations: np.ndarray
@@ -172,18 +172,19 @@ class TwoWayErrors:
         if count < 2:
             return cls(float(by_seed.mean()), common, math.nan, math.nan, count)
         # As in `clustered_variance`, for the seeds' deviations from their common part.
-        rest = sum(clustered_variance(own) for own in deviations - common) / (count * (count - 1))
+        rest = sum(clustered_variance(seed_deviations) for seed_deviations in deviations - common) / (
+            count * (count - 1)
+        )
         return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
 
     @classmethod
     def by_clip(cls, values: np.ndarray, weights: np.ndarray, places: np.ndarray) -> TwoWayErrors:
-        """Return the statistics of values by seed and sequence (S, N) with weights (N,) and the clip (N,) of each
-        sequence.
+        """Return the statistics of values (S, N) by seed and sequence, with weights (N,) and clips (N,) of sequences.
 
-        A value is a sum over its sequence: the mean is the sum of values over the sum of weights.
+        A value is a sum over its sequence, so the mean is the sum of values divided by the sum of weights.
         """
-        whole = np.bincount(places, weights=weights)
-        return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / whole, whole)
+        totals = np.bincount(places, weights=weights)
+        return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / totals, totals)
 
     def estimate(self, other: TwoWayErrors | None = None) -> Estimate:
         """Return the mean, or its paired difference to another model's, with errors as in the module docstring."""

@@ -6,10 +6,9 @@ Two kinds of scores are kept apart. *Free-running*: the model reads the observed
 frame.
 
 Every evaluation includes reference rows that any method should beat, such as repeating the last value; `References`
-lists them. A model without latents, passed as one of the models, is another reference. Some scores need their value for
-the true futures as a comparison. They add a row with the true futures, which no method is expected to beat. All rows
-are scored on the same windows. Windows of one clip overlap, so standard errors are clustered by clip and
-`Evaluation.difference` is paired.
+lists them. A model without latents, passed as one of the models, is another reference. Some scores add a row with the
+true futures for comparison, which no method is expected to beat. All rows are scored on the same windows. Windows of
+one clip overlap, so standard errors are clustered by clip and `Evaluation.difference` is paired.
 """
 
 import dataclasses
@@ -70,10 +69,10 @@ def evaluate(
         batch_size: number of windows in a batch.
         draw_emission: whether forecasts are draws of x (True) or its means (False). Proper scoring rules assess the
             model's predictive distribution only if x is drawn. None for draws, or for means if a score is published for
-            means (`Measure.of_means`); see `DynamicalVAE.is_drawn` for exceptions.
+            means (`Measure.of_means`); `DynamicalVAE.is_drawn` lists exceptions.
         bound_particles: number of particles of the IWAE bound and its k-hat; 0 omits both.
         log_score_particles: number of particles of the log score (`predictive_bound`); 0 omits it.
-        references: whether to add the reference rows that are available; or names of some (`References`).
+        references: whether to add all available reference rows; or the names of some (`References`).
         training_windows: training data of "mean", "climatology" and "nearest neighbours", such as x (N, T, D); without
             it these are omitted.
         season: period of "seasonal", in frames; by default from the windows' description.
@@ -88,8 +87,8 @@ def evaluate(
     Raises:
         TypeError: when a model cannot forecast, or the data do not define which steps are observed.
         ValueError: when windows are ragged or have no step to predict, a forecast has the wrong shape, or `samples` is
-            below one. Also when two scores, or a model and a reference row, have one name, or a requested reference row
-            is not available.
+            below one. Also when two scores, or a model and a reference row, have the same name, or a requested
+            reference row is not available.
         FloatingPointError: when a forecast or bound is not finite, naming method and window.
 
     Example:
@@ -100,14 +99,14 @@ def evaluate(
     """
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
     _check(models, samples, batch_size, bound_particles, log_score_particles)
-    held = prepare_windows(windows)
-    windows = held.windows
+    eval_windows = prepare_windows(windows)
+    windows = eval_windows.windows
     measures = _measures(scores, windows)
     means = any(measure.of_means for measure in measures)
-    drawn = {name: _is_drawn(each, draw_emission, means) for name, each in models.items()}
-    metric_model = _Evaluator(held, measures, bound_particles, log_score_particles)
-    known = References(held, samples, seed, training_windows, season)
-    baselines = _references(references, known, measures)
+    is_drawn = {name: _is_drawn(each, draw_emission, means) for name, each in models.items()}
+    evaluator = _Evaluator(eval_windows, measures, bound_particles, log_score_particles)
+    available = References(eval_windows, samples, seed, training_windows, season)
+    baselines = _references(references, available, measures)
     if clash := models.keys() & baselines.keys():
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
 
@@ -115,30 +114,32 @@ def evaluate(
     with progress_bar(progress) as bar:
 
         def parts(label: str) -> Iterator[slice]:
-            for start in bar.track(range(0, len(held.keys), batch_size), description=label):
+            for start in bar.track(range(0, len(eval_windows.keys), batch_size), description=label):
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
-            scored, histograms = metric_model.forecasts(name, forecaster, count, parts(name))
-            rows[name] = Row(count, scored, histograms=histograms)
+            clip_scores, histograms = evaluator.forecasts(name, forecaster, count, parts(name))
+            rows[name] = Row(count, clip_scores, histograms=histograms)
         for name, each in models.items():
             with seeded_evaluation(each, seed):
-                forecaster = forecaster_of(each, held, samples, {"draw_emission": drawn[name], **(options or {})})
-                scored, histograms = metric_model.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
+                forecaster = forecaster_of(
+                    each, eval_windows, samples, {"draw_emission": is_drawn[name], **(options or {})}
+                )
+                clip_scores, histograms = evaluator.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with seeded_evaluation(each, seed):
-                    scored |= metric_model.bounds(name, each, parts(f"{name}, bound"))
+                    clip_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"))
                 with seeded_evaluation(each, seed):
-                    scored |= metric_model.log_score(name, each, parts(f"{name}, log score"))
+                    clip_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
-            rows[name] = Row(samples, scored, equations, dict((configs or {}).get(name, {})), histograms)
+            rows[name] = Row(samples, clip_scores, equations, dict((configs or {}).get(name, {})), histograms)
 
-    kinds = {"drawn" if each else "mean" for each in drawn.values() or [_is_drawn(None, draw_emission, means)]}
+    kinds = {"drawn" if each else "mean" for each in is_drawn.values() or [_is_drawn(None, draw_emission, means)]}
     return Evaluation(
         rows=rows,
-        metrics=metric_model.metrics(rows),
-        clips=held.clips,
-        data=held.description(),
+        metrics=evaluator.metrics(rows),
+        clips=eval_windows.clips,
+        data=eval_windows.description(),
         protocol=plain(dataclasses.asdict(windows.protocol)),
         samples=samples,
         emission=" or ".join(sorted(kinds)),
@@ -147,12 +148,12 @@ def evaluate(
         log_score_particles=log_score_particles,
         basis={name: value for measure in measures for name, value in measure.basis.items()},
         notes=[
-            *dict.fromkeys([*held.notes, *(measure.note for measure in measures if measure.note)]),
-            *_reservations(measures, samples, [name for name, each in drawn.items() if not each]),
+            *dict.fromkeys([*eval_windows.notes, *(measure.note for measure in measures if measure.note)]),
+            *_forecast_notes(measures, samples, [name for name, each in is_drawn.items() if not each]),
             *(
-                f"{name} draws nothing: its {samples} forecasts of a window are one, which is the best of them"
+                f"{name} is deterministic: its {samples} forecasts of a window are equal, and so is the best of them"
                 for name, each in models.items()
-                if samples > 1 and _certain(each, drawn[name])
+                if samples > 1 and _is_deterministic(each, is_drawn[name])
             ),
             *(
                 f"bounds of {name}: densities of {each.view.measured}"
@@ -171,8 +172,8 @@ def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles:
     for name, each in models.items():
         if not isinstance(each, Forecasting):
             raise TypeError(
-                f"{name!r} is a {type(each).__name__}, not a model that forecasts, such as a DynamicalVAE; see "
-                "dvae.program.protocols.Forecasting for the methods that it needs"
+                f"{name!r} is a {type(each).__name__}; expected a model that forecasts, such as a DynamicalVAE (see "
+                "dvae.program.protocols.Forecasting for the methods that it needs)"
             )
 
 
@@ -184,38 +185,38 @@ def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
         )
     measures = list(scores(windows))
     names = [measure.name for measure in measures]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"scores must have different names; two are called {', '.join(sorted(twice))}")
+    if duplicates := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"scores must have different names, but several are called {', '.join(sorted(duplicates))}")
     return measures
 
 
 def _is_drawn(model: Any, draw_emission: bool | None, means: bool) -> bool:
-    """Return whether a model's forecasts draw the data: the caller's choice, or else the model's for these scores."""
+    """Return whether a model's forecasts draw the data: `draw_emission`, or if None, the model's default."""
     if draw_emission is not None:
         return draw_emission
     return model.is_drawn(means) if isinstance(model, Emitting) else not means
 
 
-def _certain(model: Any, drawn: bool) -> bool:
+def _is_deterministic(model: Any, is_drawn: bool) -> bool:
     """Return whether all forecasts of a window are equal: means of a model without latents."""
-    return isinstance(model, DynamicalVAE) and not (drawn or model.latents or model.summed or model.shared)
+    return isinstance(model, DynamicalVAE) and not (is_drawn or model.latents or model.summed or model.shared)
 
 
-def _reservations(measures: Sequence[Measure], samples: int, of_means: Sequence[str]) -> Iterator[str]:
-    """Yield notes on scores that are not available for these forecasts, or not informative."""
-    if lacking := [f"{measure.name} ({measure.least})" for measure in measures if measure.least > samples]:
-        yield f"left out, as they need more than {samples} forecasts: {', '.join(lacking)}"
-    judged = [each.name for each in measures if each.of_draws and not each.of_means and each.least <= samples]
-    if of_means and judged:
+def _forecast_notes(measures: Sequence[Measure], samples: int, of_means: Sequence[str]) -> Iterator[str]:
+    """Yield notes on scores that are not available or not informative for these forecasts."""
+    if omitted := [f"{measure.name} ({measure.least})" for measure in measures if measure.least > samples]:
+        yield f"left out, as they need more than {samples} forecasts: {', '.join(omitted)}"
+    affected = [each.name for each in measures if each.of_draws and not each.of_means and each.least <= samples]
+    if of_means and affected:
         names = f"forecasts of {', '.join(of_means)}"
-        yield f"{names} are means, which lack the emission's noise and are too narrow for {', '.join(judged)}"
+        yield f"{names} are means without emission noise, and too narrow for {', '.join(affected)}"
 
 
 @dataclass(frozen=True)
 class _Evaluator:
-    """Scores of the rows of one evaluation; values are by clip."""
+    """Computation of the scores of each row, by clip."""
 
-    held: EvaluationWindows
+    eval_windows: EvaluationWindows
     measures: Sequence[Measure]
     bound_particles: int
     log_score_particles: int
@@ -224,78 +225,82 @@ class _Evaluator:
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return scores and histograms of free-running forecasts, where `samples` suffices for them."""
+        """Return the scores and histograms of free-running forecasts that `samples` suffices for."""
         measures = [measure for measure in self.measures if measure.least <= samples]
-        held, found = self.held, []
-        index = torch.arange(len(held.keys))
+        eval_windows, results = self.eval_windows, []
+        index = torch.arange(len(eval_windows.keys))
         for part in parts:
-            forecasts = forecasts_of(name, forecaster, samples, held, part)
-            scored = forecasts, held.futures[part], held.past(part), index[part]
-            found.append({measure.name: measure.function(*scored) for measure in measures})
-        values = _concatenate(found)
-        pooled = {measure.name: np.array(measure.pool(values[measure.name], held.places)) for measure in measures}
-        scores, histograms = ({m.name: pooled[m.name] for m in measures if bool(m.bins) == of} for of in (False, True))
+            forecasts = forecasts_of(name, forecaster, samples, eval_windows, part)
+            arguments = forecasts, eval_windows.futures[part], eval_windows.past(part), index[part]
+            results.append({measure.name: measure.function(*arguments) for measure in measures})
+        values = _concatenate(results)
+        pooled = {
+            measure.name: np.array(measure.pool(values[measure.name], eval_windows.places)) for measure in measures
+        }
+        scores, histograms = (
+            {m.name: pooled[m.name] for m in measures if bool(m.bins) == is_histogram} for is_histogram in (False, True)
+        )
         return scores, histograms
 
     def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
         """Return bounds and KL terms in nats per frame."""
-        found = []
+        results = []
         for part in parts:
-            batch = on_device_of(model, self.held.part(part))
+            batch = on_device_of(model, self.eval_windows.part(part))
             terms = SequenceELBO().terms(model, batch)
             scores = {"ELBO": terms.per_frame}
             scores |= {f"KL {latent}": kl / terms.frames for latent, kl in terms.kl.items()}
             if self.bound_particles:
                 weighted = iwae_bound(model, batch, particles=self.bound_particles)
                 scores |= {"IWAE bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
-            refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.held.keys[part])
-            found.append({metric: values.cpu() for metric, values in scores.items()})
-        return self._means(_concatenate(found))
+            refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.eval_windows.keys[part])
+            results.append({metric: values.cpu() for metric, values in scores.items()})
+        return self._means(_concatenate(results))
 
     def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
         """Return the log score in nats per predicted frame, if it was requested."""
         if not self.log_score_particles:
             return {}
-        found = []
+        results = []
         for part in parts:
-            batch = on_device_of(model, self.held.part(part))
-            bound = predictive_bound(model, batch, self.held.observed, self.log_score_particles).bound
-            refuse_non_finite(name, "log score", bound.isfinite(), self.held.keys[part])
-            found.append({"log score": (bound / self.held.futures.shape[1]).cpu()})
-        return self._means(_concatenate(found))
+            batch = on_device_of(model, self.eval_windows.part(part))
+            bound = predictive_bound(model, batch, self.eval_windows.observed, self.log_score_particles).bound
+            refuse_non_finite(name, "log score", bound.isfinite(), self.eval_windows.keys[part])
+            results.append({"log score": (bound / self.eval_windows.futures.shape[1]).cpu()})
+        return self._means(_concatenate(results))
 
     def metrics(self, rows: Mapping[str, Row]) -> dict[str, Metric]:
         """Return the metrics of all scores in the rows, in the order of the table."""
-        found = {name for row in rows.values() for name in row.clip_means}
-        latents = sorted(name for name in found if name.startswith("KL "))
-        _, frame = axis_names(self.held.windows.description)
+        names = {name for row in rows.values() for name in row.clip_means}
+        latents = sorted(name for name in names if name.startswith("KL "))
+        _, frame = axis_names(self.eval_windows.windows.description)
         bounds = {"log score": LOG_SCORE, **TEACHER_FORCED, **dict.fromkeys(latents, KL)}
         order = {measure.name: measure.metric for measure in self.measures}
         order |= {
             name: dataclasses.replace(each, unit=each.unit.replace("frame", frame)) for name, each in bounds.items()
         }
-        return {name: metric for name, metric in order.items() if name in found}
+        return {name: metric for name, metric in order.items() if name in names}
 
     def _means(self, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        return {name: np.array(clip_means(values, self.held.places)) for name, values in scores.items()}
+        return {name: np.array(clip_means(values, self.eval_windows.places)) for name, values in scores.items()}
 
 
 def _references(
-    asked: bool | Sequence[str], known: References, measures: Sequence[Measure]
+    requested: bool | Sequence[str], available: References, measures: Sequence[Measure]
 ) -> dict[str, tuple[int, Forecaster]]:
     """Return the number of forecasts and the forecaster of each reference row."""
-    futures = known.held.futures
+    futures = available.held.futures
     truths: dict[str, tuple[int, Forecaster]] = {
         measure.truth: (1, lambda part: futures[part][None]) for measure in measures if measure.truth
     }
-    if isinstance(asked, bool):
-        asked = known.usual if asked else []
-        truths = truths if asked else {}
-    return truths | {name: known[name] for name in asked}
+    if isinstance(requested, bool):
+        requested = available.usual if requested else []
+        truths = truths if requested else {}
+    return truths | {name: available[name] for name in requested}
 
 
 def forecaster_of(model: Any, held: EvaluationWindows, samples: int, options: Mapping[str, Any]) -> Forecaster:
-    """Return the function from a slice of windows to a model's K futures, with these options of its `forecast`."""
+    """Return the function from a slice of windows to a model's K futures, with `options` for its `forecast`."""
     horizon = held.futures.shape[1]
     return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
 
@@ -304,13 +309,14 @@ def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: Evaluati
     """Return futures `(B, K, H, D)` of some windows, on the CPU.
 
     Raises:
-        ValueError, FloatingPointError: when forecasts have another shape, or are not finite.
+        ValueError: when forecasts have another shape.
+        FloatingPointError: when forecasts are not finite.
     """
     forecasts = forecaster(part).cpu()
     expected = (samples, *held.futures[part].shape)
     if forecasts.shape != expected:
-        raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, not {tuple(forecasts.shape)}")
-    if not forecasts.sum().isfinite():  # a sum keeps non-finite values, and takes a fortieth of the time
+        raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, got {tuple(forecasts.shape)}")
+    if not forecasts.sum().isfinite():  # 40 times faster than a test of each value
         refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
     return forecasts.movedim(0, 1)
 

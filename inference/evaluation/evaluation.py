@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
-"""Edge for each direction that is better."""
-_MOST_RANKS = 10_000  # the envelope of this many takes a second
+"""Arrow for each direction that is better."""
+_MOST_RANKS = 10_000  # the envelope of so many ranks takes a second
 
 
 @dataclass(frozen=True)
 class Score:
-    """Mean over windows, or a score of the whole set, with its standard error, clustered by clip (NaN for one clip).
+    """Mean over windows, or score of the whole set, with its standard error, clustered by clip (NaN for one clip).
 
     Args:
         mean: mean over windows.
@@ -89,7 +89,7 @@ class Evaluation(Result):
         bound_particles: number of particles of the IWAE bound, 0 if it was not computed.
         seed: seed of every method's draws.
         log_score_particles: number of particles of the log score, 0 if it was not computed.
-        basis: what scores depend on by name, such as the weights of a metric model or a ground truth.
+        basis: inputs of scores by name, such as the weights of a metric model or a ground truth.
         notes: lines below the table on how to read scores.
         options: further arguments of the models' `forecast`.
 
@@ -124,8 +124,8 @@ class Evaluation(Result):
         Raises:
             KeyError: when a method was not evaluated, or one of the two has no such metric.
         """
-        ours, theirs = self._both(first, second, metric)
-        return self._score(metric, ours - theirs)
+        values, other = self._both(first, second, metric)
+        return self._score(metric, values - other)
 
     def ratio(self, first: str, second: str, metric: str) -> Score:
         """Return the ratio of two methods' means in a metric, first by second, with its linearised standard error.
@@ -134,11 +134,11 @@ class Evaluation(Result):
             KeyError: as `difference`.
             ValueError: when the second mean is 0.
         """
-        ours, theirs = self._both(first, second, metric)
-        over, under = (self._score(metric, means).mean for means in (ours, theirs))
-        if not under:
-            raise ValueError(f"the mean {metric} of {second} is 0, so no ratio to it exists")
-        return self._score(metric, over / under + (ours - over / under * theirs) / under)
+        values, other = self._both(first, second, metric)
+        numerator, denominator = (self._score(metric, means).mean for means in (values, other))
+        if not denominator:
+            raise ValueError(f"the mean {metric} of {second} is 0, so the ratio is undefined; use difference")
+        return self._score(metric, numerator / denominator + (values - numerator / denominator * other) / denominator)
 
     def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:
         """Return the values of two methods by clip."""
@@ -146,24 +146,24 @@ class Evaluation(Result):
         for method in (first, second):
             row = self._row(method)
             if metric not in row.clip_means:
-                meant = nearest(metric, row.clip_means)
-                raise KeyError(f"{method!r} has no score {metric!r}{meant}; it has {', '.join(row.clip_means)}")
+                suggestion = nearest(metric, row.clip_means)
+                raise KeyError(f"{method!r} has no score {metric!r}{suggestion}; it has {', '.join(row.clip_means)}")
             means.append(row.clip_means[metric])
         return means
 
     def table(self) -> Table:
         """Return a table of mean ± standard error, a row per metric and a column per method, by kind of score."""
         table = Table(title=self._title(), caption=self._caption())
-        table.add_column("", no_wrap=True)  # on a narrow terminal the numbers wrap, never the names
+        table.add_column("", no_wrap=True)  # on a narrow terminal numbers wrap, and names do not
         for method, row in self.rows.items():
             table.add_column(f"{method}\nK = {row.samples}", justify="right")
         scores = {method: self[method] for method in self.rows}
         for program in ("free-running", "teacher-forced"):
-            found = {name: metric for name, metric in self.metrics.items() if metric.program == program}
-            if found:
+            metrics = {name: metric for name, metric in self.metrics.items() if metric.program == program}
+            if metrics:
                 table.add_section()
                 table.add_row(Text(program, "bold"))
-            for name, metric in found.items():
+            for name, metric in metrics.items():
                 unit = f" ({metric.unit})" if metric.unit else ""
                 values = (str(row[name]) if name in row else "–" for row in scores.values())
                 table.add_row(Text.assemble(name + ARROWS[metric.better], (unit, "dim")), *values)
@@ -196,13 +196,12 @@ class Evaluation(Result):
         return figure
 
     def departure(self, method: str, histogram: str = "PIT", alpha: float = 0.05) -> tuple[np.ndarray, ...]:
-        """Return the difference between the PIT distribution of a method's forecasts and uniform, with a simultaneous
-        band.
+        """Return the difference between a method's PIT distribution and uniform, with a simultaneous band.
 
         The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Their number is the
-        effective number of these dependent ranks, from their spread over clips (`uncertainty.effective_number`). This
-        is an approximation, except for clips of one number each. A curve that leaves the band at any point indicates
-        that forecasts are not calibrated.
+        effective number of these dependent ranks, from their spread over clips (`estimates.effective_number`). This is
+        an approximation, except for clips of one number each. A curve that leaves the band at any point indicates that
+        forecasts are not calibrated.
 
         Returns:
             Points between bins, the share of the PIT below each minus the point itself, and the lower and upper end of
@@ -216,10 +215,10 @@ class Evaluation(Result):
         below, deviations = linearised(shares, np.array(list(self.clips.values())))
         if len(self.clips) == 1:
             return points, below - points, points * np.nan, points * np.nan
-        whole = (self.data["frames"] - self.protocol["observed"]) * self.data["coordinates"]
-        numbers = self.data["windows"] * self.basis.get(histogram, {}).get("numbers", whole)
-        worth = effective_number(points, deviations, min(numbers, _MOST_RANKS))
-        _, low, high = envelope(worth, len(points), alpha)
+        n_values = (self.data["frames"] - self.protocol["observed"]) * self.data["coordinates"]
+        numbers = self.data["windows"] * self.basis.get(histogram, {}).get("numbers", n_values)
+        n_effective = effective_number(points, deviations, min(numbers, _MOST_RANKS))
+        _, low, high = envelope(n_effective, len(points), alpha)
         return points, below - points, low - points, high - points
 
     def plot_calibration(self, histogram: str = "PIT") -> Figure:
@@ -240,15 +239,15 @@ class Evaluation(Result):
         for (top, bottom), method in zip(panels.T, methods, strict=True):
             self._draw(top, method, histogram)
             top.set_title(f"{method}, K = {self.rows[method].samples}", fontsize=8, parse_math=False)
-            points, departs, low, high = self.departure(method, histogram)
+            points, difference, low, high = self.departure(method, histogram)
             bottom.fill_between(points, low, high, color="0.88", step="mid", linewidth=0)
-            bottom.plot(points, departs, color="C0", linewidth=1.2)
+            bottom.plot(points, difference, color="C0", linewidth=1.2)
             bottom.axhline(0, color="0.4", linewidth=0.8)
             for panel in (top, bottom):
                 panel.tick_params(labelsize=7)
         panels[0, 0].set_ylim(bottom=0)
-        panels[0, 0].set_ylabel(f"{histogram}\nover uniform", fontsize=8, parse_math=False)
-        panels[1, 0].set_ylabel("ECDF\nless uniform", fontsize=8)
+        panels[0, 0].set_ylabel(f"{histogram}\n/ uniform", fontsize=8, parse_math=False)
+        panels[1, 0].set_ylabel("ECDF\n− uniform", fontsize=8)
         figure.suptitle(self._title(), fontsize=9, parse_math=False)
         figure.supxlabel(f"{histogram} of the true future among the forecasts", fontsize=8, parse_math=False)
         return figure
@@ -263,37 +262,39 @@ class Evaluation(Result):
         """
         _, frame = axis_names(self.data)
 
-        def at(score: str, names: Iterable[str]) -> dict[int, str]:
+        def by_frame(score: str, names: Iterable[str]) -> dict[int, str]:
             """Return the names of a score by frame."""
-            found = (re.fullmatch(rf"{re.escape(score)}, {re.escape(frame)} (\d+)", name) for name in names)
-            return {int(each[1]): each[0] for each in found if each}
+            matches = (re.fullmatch(rf"{re.escape(score)}, {re.escape(frame)} (\d+)", name) for name in names)
+            return {int(each[1]): each[0] for each in matches if each}
 
-        shown = {name: found for name, row in self.rows.items() if (found := at("PIT", row.histograms))}
-        if not shown:
+        by_method = {method: by_frame("PIT", row.histograms) for method, row in self.rows.items()}
+        by_method = {method: histograms for method, histograms in by_method.items() if histograms}
+        if not by_method:
             raise KeyError("no method has a histogram of a frame; evaluate with scores=over_horizon")
-        columns = max(map(len, shown.values())) + 1
-        figure = new_figure(1 + 1.5 * columns, 0.9 + 1.7 * len(shown))
-        panels = figure.subplots(len(shown), columns, squeeze=False)
-        for (*alone, last), (method, histograms) in zip(panels, shown.items(), strict=True):
-            for panel, (place, name) in zip(alone, histograms.items(), strict=True):
+        columns = max(map(len, by_method.values())) + 1
+        figure = new_figure(1 + 1.5 * columns, 0.9 + 1.7 * len(by_method))
+        panels = figure.subplots(len(by_method), columns, squeeze=False)
+        for (*histogram_panels, coverage_panel), (method, histograms) in zip(panels, by_method.items(), strict=True):
+            for panel, (place, name) in zip(histogram_panels, histograms.items(), strict=True):
                 self._draw(panel, method, name)
-                panel.sharey(alone[0])
+                panel.sharey(histogram_panels[0])
                 panel.set_title(f"{frame} {place}", fontsize=8)
-            alone[0].set_ylim(bottom=0)
-            alone[0].set_ylabel(f"{method}\nPIT over uniform", fontsize=8, parse_math=False)
+            histogram_panels[0].set_ylim(bottom=0)
+            histogram_panels[0].set_ylabel(f"{method}\nPIT / uniform", fontsize=8, parse_math=False)
             scores = self[method]
             for order, level in enumerate((50, 80, 90)):
-                covered = {place: scores[name] for place, name in at(f"coverage {level} %", scores).items()}
+                covered = {place: scores[name] for place, name in by_frame(f"coverage {level} %", scores).items()}
                 means, errors = (
-                    np.array([getattr(each, of) for each in covered.values()]) for of in ("mean", "standard_error")
+                    np.array([getattr(each, attribute) for each in covered.values()])
+                    for attribute in ("mean", "standard_error")
                 )
-                last.fill_between(
+                coverage_panel.fill_between(
                     [*covered], means - 2 * errors, means + 2 * errors, color=f"C{order}", alpha=0.2, linewidth=0
                 )
-                last.plot([*covered], means, color=f"C{order}", linewidth=1.2)
-                last.axhline(level / 100, color=f"C{order}", linewidth=0.8, linestyle=":")
-            last.set_ylim(0, 1)
-            last.set_title(f"coverage by {frame}", fontsize=8, parse_math=False)
+                coverage_panel.plot([*covered], means, color=f"C{order}", linewidth=1.2)
+                coverage_panel.axhline(level / 100, color=f"C{order}", linewidth=0.8, linestyle=":")
+            coverage_panel.set_ylim(0, 1)
+            coverage_panel.set_title(f"coverage by {frame}", fontsize=8, parse_math=False)
         for panel in panels.flat:
             panel.tick_params(labelsize=7)
         figure.suptitle(self._title(), fontsize=9, parse_math=False)
@@ -323,16 +324,16 @@ class Evaluation(Result):
     @override
     def check(self) -> None:
         if self.extents.get("clip", {len(self.clips)}) != {len(self.clips)}:
-            raise ValueError(f"expected numbers of {len(self.clips)} clips")
+            raise ValueError(f"expected values of {len(self.clips)} clips, got {self.extents['clip']}")
         if unknown := {name for row in self.rows.values() for name in row.clip_means} - self.metrics.keys():
             raise ValueError(f"metrics has no entry for {', '.join(sorted(unknown))}")
 
     def _histogram(self, method: str, name: str) -> np.ndarray:
-        found = self._row(method).histograms
-        if name not in found:
-            has = ", ".join(found) or "none"
-            raise KeyError(f"{method!r} has no histogram {name!r}{nearest(name, found)}; it has {has}")
-        return found[name]
+        histograms = self._row(method).histograms
+        if name not in histograms:
+            has = ", ".join(histograms) or "none"
+            raise KeyError(f"{method!r} has no histogram {name!r}{nearest(name, histograms)}; it has {has}")
+        return histograms[name]
 
     def _row(self, method: str) -> Row:
         if method not in self.rows:
@@ -342,8 +343,8 @@ class Evaluation(Result):
         return self.rows[method]
 
     def _score(self, metric: str, clip_means: np.ndarray) -> Score:
-        known = ~np.isnan(clip_means) if self.metrics[metric].partial else slice(None)
-        mean, deviations = linearised(clip_means[known], np.array(list(self.clips.values()))[known])
+        valid = ~np.isnan(clip_means) if self.metrics[metric].partial else slice(None)
+        mean, deviations = linearised(clip_means[valid], np.array(list(self.clips.values()))[valid])
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
     def _caption(self) -> str:

@@ -1,4 +1,4 @@
-"""Models on held-out windows: windows prepared once for all models, and each model run under the same conditions."""
+"""Held-out windows, prepared once for all models, and the conditions under which each model is evaluated."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,7 +48,7 @@ class EvaluationWindows:
         return self.batch.mask()
 
     def part(self, part: slice) -> Batch:
-        """Return some windows, past and future."""
+        """Return past and future of some windows."""
         return self.batch.rows(part)
 
     def past(self, part: slice) -> Batch:
@@ -66,18 +66,18 @@ class EvaluationWindows:
         return clip_index(clusters(self.windows))
 
     def description(self) -> dict[str, Any]:
-        """Return the description of the data, for the result."""
+        """Return the description of the data that a result contains."""
         count, frames, coordinates = self.x.shape
-        found = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
-        return {**found, "coordinates": coordinates, **self._shares, **self.windows.description}
+        description = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
+        return {**description, "coordinates": coordinates, **self._shares, **self.windows.description}
 
     @property
     def notes(self) -> list[str]:
-        """Note on missing values, if there are any."""
+        """Notes on missing values; empty if all values were observed."""
         return [
-            f"observed are {seen['past']:.1%} of the numbers before the present and {seen['future']:.1%} of those "
-            "after it; scores compare with these alone"
-            for seen in self._shares.values()
+            f"{shares['past']:.1%} of the past values and {shares['future']:.1%} of the future values were observed; "
+            "scores use only these"
+            for shares in self._shares.values()
         ]
 
     @property
@@ -100,27 +100,28 @@ def prepare_windows(data: Any) -> EvaluationWindows:
     observed = windows.protocol.observed
     if observed is None:
         raise ValueError(
-            "whole sequences have no future; cut them, with observed and horizon steps, to forecast; compare() "
-            "compares bounds of whole ones"
+            "whole sequences have no future; cut them, with observed and horizon steps, to forecast, or use compare() "
+            "for the bounds of whole sequences"
         )
     if batch.lengths is not None:
-        raise ValueError("evaluation needs windows of one length, but these have lengths")
+        raise ValueError(
+            "evaluation needs windows of equal length; remove 'lengths' from the batch, or cut the windows"
+        )
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
-            f"windows of {batch['x'].shape[1]} frames, {observed} of them observed, have no frame to "
-            "observe or no frame to predict"
+            f"windows must have a frame to observe and a frame to predict, but of {batch['x'].shape[1]} frames "
+            f"{observed} are observed"
         )
-    held = EvaluationWindows(windows, batch, observed, list(windows.keys))
-    if held.mask is not None:
-        for what, mask in (("past", held.mask[:, :observed]), ("future", held.mask[:, observed:])):
+    eval_windows = EvaluationWindows(windows, batch, observed, list(windows.keys))
+    if eval_windows.mask is not None:
+        for part, mask in (("past", eval_windows.mask[:, :observed]), ("future", eval_windows.mask[:, observed:])):
             if (empty := ~mask.flatten(1).any(1)).any():
-                split, name, start = held.keys[int(empty.nonzero()[0])]
+                split, name, start = eval_windows.keys[int(empty.nonzero()[0])]
                 _, frame = axis_names(windows.description)
                 raise ValueError(
-                    f"the {what} of the window at {frame} {start} of {name!r} has no observation "
-                    f"({split}); leave it out"
+                    f"the {part} of the window at {frame} {start} of {name!r} has no observation ({split}); remove it"
                 )
-    return held
+    return eval_windows
 
 
 def clip_index(keys: Sequence[tuple[str, str, int]]) -> Tensor:
@@ -131,7 +132,7 @@ def clip_index(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 
 @contextmanager
 def seeded_evaluation(model: nn.Module, seed: int) -> Iterator[None]:
-    """Use evaluation mode, no gradients and draws from `seed`; restore mode and random state afterwards."""
+    """Use evaluation mode, no gradients and draws from `seed`, and restore mode and random state afterwards."""
     with seeded(seed, next(model.parameters()).device), evaluating(model), torch.no_grad():
         yield
 
@@ -141,10 +142,10 @@ def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
     parameter = next(model.parameters())
     reads = isinstance(model, DynamicalVAE)  # a DynamicalVAE subtracts means before it rounds
 
-    def moved(value: Tensor) -> Tensor:
+    def to_device(value: Tensor) -> Tensor:
         return value.to(parameter.device) if reads or not value.is_floating_point() else value.to(parameter)
 
-    return Batch(batch).map(moved)
+    return Batch(batch).map(to_device)
 
 
 def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
@@ -153,5 +154,5 @@ def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple
         split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
         raise FloatingPointError(
             f"the {what} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
-            "it cannot be left out, since all methods are scored on the same ones"
+            "it cannot be omitted, because all methods are scored on the same windows"
         )

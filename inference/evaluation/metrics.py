@@ -5,15 +5,15 @@ are proper: no forecaster gains by spreading its samples. The Fréchet distance 
 own shapes. Applications add their own errors, such as the best of K samples.
 
 Calibration (coverage, PIT) depends on the rank of each number of the truth among the K numbers of the samples. If
-forecasts are calibrated, the truth is exchangeable with the samples. Its rank, random among ties, is then uniform from
-0 to K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1. This is
+forecasts are calibrated, the truth is exchangeable with the samples. Its rank, random among ties, is then uniform on 0
+to K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K + 1), V uniform on 0 to 1. This is
 uniform on 0 to 1 for every K, and also for discrete data (Czado, Gneiting and Held 2009). Shares and moments are
-expectations over V, so nothing is drawn. Their values for calibrated forecasts are exact for every K.
+expectations over V, without draws. Their values for calibrated forecasts are exact for every K.
 
 Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`; the result
 has the leading shape `(...)`. Functions accept torch tensors and numpy arrays and return a tensor. NaN in a truth was
-not observed and is not counted, nor is a frame without observations. The value for a data set is the plain mean over
-its windows. Every function raises ValueError for shapes that do not fit. Windows are scored one after another, so
+not observed and is ignored. Frames without observations are ignored, too. The value for a data set is the plain mean
+over its windows. Every function raises ValueError for shapes that do not fit. Windows are scored one after another, so
 memory does not grow with their number.
 """
 
@@ -64,13 +64,12 @@ def energy_score(samples: Array, truth: Array, diversity: Array | None = None) -
         distance = displacement(x.flatten(1), y.flatten()).mean()
         return distance - mean_pairwise_distance(x) / 2 if diversity is None else distance
 
-    found = per_window(over_observed(score), *as_pair(samples, truth))
-    return found if diversity is None else found - torch.as_tensor(diversity) / 2
+    result = per_window(over_observed(score), *as_pair(samples, truth))
+    return result if diversity is None else result - torch.as_tensor(diversity) / 2
 
 
 def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
-    """Return the CRPS of each number, averaged over frames and coordinates; proper, lower is better (Gneiting and
-    Raftery).
+    """Return the CRPS of each number, averaged over frames and coordinates; proper, lower is better.
 
     CRPS = mean_k |X_k - y| - 1/2 mean_{j<k} |X_j - X_k|, the unbiased ("fair") estimate, whose expectation does not
     depend on K: integral of (P(X <= u) - 1[y <= u])^2 du. It is the energy score of one number, and ignores dependence
@@ -89,8 +88,8 @@ def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
         errors = errors[:, ~y.flatten().isnan()] if y.isnan().any() else errors
         # When sorted, number i is the larger one in i pairs and the smaller one in K - 1 - i.
         signs = 2 * torch.arange(count, dtype=x.dtype, device=x.device) - (count - 1)
-        apart = (signs @ errors.sort(0).values).mean() / max(1, count * (count - 1) / 2)
-        return errors.abs().mean() - apart / 2
+        spread = (signs @ errors.sort(0).values).mean() / max(1, count * (count - 1) / 2)
+        return errors.abs().mean() - spread / 2
 
     return per_window(score, *as_pair(samples, truth))
 
@@ -115,10 +114,10 @@ def probability_integral_transform(samples: Array, truth: Array, uniform: Array)
     uniform = torch.as_tensor(uniform, device=truth.device).double()
     if uniform.shape != truth.shape or not ((uniform >= 0) & (uniform <= 1)).all():
         raise ValueError(
-            f"a truth of shape {shape_of(truth)} needs as many uniform draws, from 0 to 1; got "
+            f"uniform draws must have the shape {shape_of(truth)} of the truth and be from 0 to 1; got "
             f"{shape_of(uniform)} from {uniform.min():g} to {uniform.max():g}"
         )
-    low, ties = _places(samples, truth)
+    low, ties = _ranks(samples, truth)
     return (low + uniform * ties) / (samples.shape[-3] + 1)
 
 
@@ -133,7 +132,7 @@ def pit_mean(samples: Array, truth: Array) -> Tensor:
         Mean `(...)`, in double precision.
     """
     samples, truth = as_pair(samples, truth)
-    low, ties = _places(samples, truth)
+    low, ties = _ranks(samples, truth)
     return mean_of_known(low + ties / 2, (-2, -1)) / (samples.shape[-3] + 1)
 
 
@@ -145,7 +144,7 @@ def pit_variance(samples: Array, truth: Array) -> Tensor:
     (K + 1)^2. Shapes as in `pit_mean`.
     """
     samples, truth = as_pair(samples, truth)
-    low, ties = _places(samples, truth)
+    low, ties = _ranks(samples, truth)
     count = samples.shape[-3] + 1
     return mean_of_known(12 * (low + ties / 2 - count / 2).square() + ties.square(), (-2, -1)) / count**2
 
@@ -164,11 +163,11 @@ def pit_histogram(samples: Array, truth: Array, bins: int = 20) -> Tensor:
     samples, truth = as_pair(samples, truth)
     if bins < 1:
         raise ValueError(f"a histogram needs at least 1 bin, got {bins}")
-    low, ties = _places(samples, truth)
+    low, ties = _ranks(samples, truth)
     edges = [edge * (samples.shape[-3] + 1) / bins for edge in range(1, bins)]
     inner = [mean_of_known(((edge - low) / ties).clamp(0, 1), (-2, -1)) for edge in edges]
-    whole = torch.where(low.isnan().all(-1).all(-1), torch.nan, 1.0).to(low)
-    return torch.stack([*inner, whole], -1).diff(dim=-1, prepend=whole[..., None] * 0)
+    total = torch.where(low.isnan().all(-1).all(-1), torch.nan, 1.0).to(low)
+    return torch.stack([*inner, total], -1).diff(dim=-1, prepend=total[..., None] * 0)
 
 
 def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 20) -> Tensor:
@@ -183,7 +182,7 @@ def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 2
     Args:
         samples: samples `(..., K, T, D)`.
         truth: truth `(..., T, D)`; numbers that were not observed do not count in distances.
-        reference: the point `(..., T, D)`; distances are Euclidean, over all numbers, in their units.
+        reference: point `(..., T, D)`; distances are Euclidean, over all numbers, in their units.
         bins: number of bins.
 
     Returns:
@@ -195,8 +194,8 @@ def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 2
     def distance(values: Tensor, point: Tensor, gaps: Tensor) -> Tensor:
         return torch.where(gaps, 0.0, values - point).flatten(-2).norm(dim=-1)[..., None, None]
 
-    there = distance(truth, reference, missing).masked_fill(missing.all(-1, True).all(-2, True), torch.nan)
-    return pit_histogram(distance(samples, reference.unsqueeze(-3), missing.unsqueeze(-3)), there, bins)
+    true_distance = distance(truth, reference, missing).masked_fill(missing.all(-1, True).all(-2, True), torch.nan)
+    return pit_histogram(distance(samples, reference.unsqueeze(-3), missing.unsqueeze(-3)), true_distance, bins)
 
 
 def coverage(samples: Array, truth: Array, level: float) -> Tensor:
@@ -226,8 +225,8 @@ def coverage(samples: Array, truth: Array, level: float) -> Tensor:
         ValueError: when the level is not between 0 and 1.
     """
     samples, truth = as_pair(samples, truth)
-    end, count = _beyond(samples, level), samples.shape[-3] + 1
-    low, ties = _places(samples, truth)
+    end, count = _ranks_outside(samples, level), samples.shape[-3] + 1
+    low, ties = _ranks(samples, truth)
     inside = ((low + ties).clamp(max=count - end) - low.clamp(min=end)).clamp(min=0) / ties
     return mean_of_known(inside, (-2, -1))
 
@@ -249,7 +248,7 @@ def interval_width(samples: Array, level: float) -> Tensor:
         ValueError: when the level is not between 0 and 1.
     """
     samples = as_samples(samples)
-    end = max(_beyond(samples, level), 1.0) - 1  # counted from 0
+    end = max(_ranks_outside(samples, level), 1.0) - 1  # counted from 0
     first, ordered = int(end), samples.sort(-3).values
     spread = ordered.flip(-3) - ordered
     widths = spread[..., first, :, :]
@@ -287,10 +286,10 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     count, scores = samples.shape[-3], []
     windows = samples.reshape(-1, count, steps, size), truth.reshape(-1, steps, size)
     for x, y in zip(*(part.split(max(1, CACHED // (count * steps * size))) for part in windows), strict=True):
-        seen, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # by frame
-        missing = bool((seen < size).any())
-        # Coordinates first, so that subtracted values are contiguous. The pairs of one coordinate stay in the cache,
-        # all D * D pairs at once would not.
+        n_observed, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # by frame
+        missing = bool((n_observed < size).any())
+        # Coordinates first, so that subtracted values are contiguous. The pairs of one coordinate fit in the cache; all
+        # D * D pairs would not.
         x, y = (part.movedim(-1, 0).contiguous() for part in (x, y))
         for i in range(size - 1):
             forecast = (x[i + 1 :] - x[i]).abs_().pow_(order)
@@ -300,7 +299,7 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
             if count > 1:  # `Tensor.var` takes nine times as long as everything else
                 errors -= forecast.sub_(mean.unsqueeze(2)).square_().sum(2) / (count * (count - 1))
             total = total + (torch.where(actual.isnan(), 0.0, errors) if missing else errors).sum((0, 2))
-        scores.append(total / ((seen * (seen - 1)).sum(-1) // 2).clamp(min=1))
+        scores.append(total / ((n_observed * (n_observed - 1)).sum(-1) // 2).clamp(min=1))
     return torch.cat(scores).reshape(lead)
 
 
@@ -320,7 +319,7 @@ def frechet_distance(features: Array, other: Array) -> Tensor:
     sets = [torch.as_tensor(each).double() for each in (features, other)]
     if any(each.ndim != 2 or len(each) < 2 for each in sets) or sets[0].shape[1] != sets[1].shape[1]:
         raise ValueError(
-            "the Fréchet distance needs features (N, F) and (M, F), N and M at least 2, not "
+            "the Fréchet distance needs features (N, F) and (M, F), N and M at least 2, got "
             f"{shape_of(sets[0])} and {shape_of(sets[1])}"
         )
     moments = [moment for each in sets for moment in (each.mean(0), each.T.cov().reshape(2 * [each.shape[1]]))]
@@ -356,23 +355,23 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 
 
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
-    """Return the Fréchet distance between features of true and generated windows, as a jackknife pseudo-value per clip.
+    """Return the Fréchet distance between features of true and generated windows, as jackknife pseudo-values of clips.
 
-    The pseudo-values are those of `jackknife_pseudo_values`.
+    `jackknife_pseudo_values` defines these values.
 
     Args:
         real: features `(N, F)` of the true futures.
         generated: features `(N, K, F)` of the generated futures.
         places: clip of every window, from 0 to C - 1, `(N,)`.
     """
-    centre = real.mean(0)  # far from 0, second moments would cancel
+    centre = real.mean(0)  # second moments lose digits far from 0
     sets = _moments_without_clips(real[:, None] - centre, places), _moments_without_clips(generated - centre, places)
     distance = gaussian_frechet_distance(*sets[0], *sets[1])
     return jackknife_pseudo_values(distance[0], distance[1:], places)
 
 
 def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
-    """Return the distance of a whole set of windows as a jackknife pseudo-value of each clip.
+    """Return the distance of a set of windows as a jackknife pseudo-value of each clip.
 
     The pseudo-value is d + (1/w - 1) (d - d') (Busing, Meijer and van der Leeden 1999). d' is the distance without the
     clip, and w the clip's share of the windows. A common constant is added so that the mean over windows is d, because
@@ -390,15 +389,15 @@ def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> t
 
 
 def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Return means (1 + C, F) and covariances (1 + C, F, F) of (N, K, F).
+    """Return means (1 + C, F) and covariances (1 + C, F, F) of features (N, K, F).
 
-    The first is of all windows, the others without each of C > 1 clips.
+    The first are of all windows; each of the others omits the windows of one of C > 1 clips.
     """
 
     def sums(values: Tensor) -> Tensor:
         by_clip = values.new_zeros(int(places.max()) + 1, *values.shape[1:]).index_add_(0, places, values)
-        whole = by_clip.sum(0, keepdim=True)
-        return torch.cat([whole, whole - by_clip]) if len(by_clip) > 1 else whole
+        total = by_clip.sum(0, keepdim=True)
+        return torch.cat([total, total - by_clip]) if len(by_clip) > 1 else total
 
     count = sums(features.new_full((len(features), 1), features.shape[1]))
     mean = sums(features.sum(1)) / count
@@ -410,35 +409,35 @@ CACHED = 2**17
 """Number of values that fit in a processor's cache."""
 
 
-def _places(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the number of samples below the truth, and of possible ranks: one plus one for each tie, (..., T, D)."""
+def _ranks(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the number of samples below the truth, and the number of possible ranks (ties plus one), (..., T, D)."""
     actual = truth.unsqueeze(-3)
     low, equal = (compared.sum(-3).double() for compared in (samples < actual, samples == actual))
     return low.masked_fill(truth.isnan(), torch.nan), equal + 1
 
 
-def _beyond(samples: Tensor, level: float) -> float:
-    """Return how many of the K + 1 ranks lie on either side of a central interval."""
+def _ranks_outside(samples: Tensor, level: float) -> float:
+    """Return the number of the K + 1 ranks on each side of a central interval; it may be fractional."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval must be between 0 and 1, got {level}")
-    found = (samples.shape[-3] + 1) * (1 - level) / 2  # for .9 and K = 19 not exactly 1
-    return float(round(found)) if math.isclose(found, round(found)) else found
+    count = (samples.shape[-3] + 1) * (1 - level) / 2  # for .9 and K = 19 not exactly 1
+    return float(round(count)) if math.isclose(count, round(count)) else count
 
 
 def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a score of distances restricted to the observed part of a truth (T, D).
+    """Return a score of distances that ignores missing values of a truth (T, D).
 
-    It uses frames with observations, with 0 at missing numbers.
+    It uses frames with observations, and sets missing numbers of samples and truth to 0.
     """
 
-    def counted(samples: Tensor, truth: Tensor) -> Tensor:
+    def observed_score(samples: Tensor, truth: Tensor) -> Tensor:
         missing = truth.isnan()
         if missing.any():
-            told = ~missing.all(-1)
-            samples, truth = (torch.where(missing, 0.0, values)[..., told, :] for values in (samples, truth))
+            frames = ~missing.all(-1)
+            samples, truth = (torch.where(missing, 0.0, values)[..., frames, :] for values in (samples, truth))
         return score(samples, truth)
 
-    return counted
+    return observed_score
 
 
 def displacement(samples: Tensor, truth: Tensor) -> Tensor:
@@ -449,9 +448,9 @@ def displacement(samples: Tensor, truth: Tensor) -> Tensor:
 def mean_pairwise_distance(samples: Tensor) -> Tensor:
     """Return the mean distance over pairs of (K, T, D), each a vector of T * D numbers."""
     rows = samples.flatten(1)
-    if rows.isnan().any():  # the mean square over common numbers is used for all; NaN if no two samples share any
-        apart = [(rows[k + 1 :] - row).square().nanmean(1) for k, row in enumerate(rows[:-1])]
-        return (rows.shape[1] * torch.cat(apart)).sqrt().nanmean()
+    if rows.isnan().any():  # scale the mean square over common numbers to all; NaN if no two samples share any
+        squares = [(rows[k + 1 :] - row).square().nanmean(1) for k, row in enumerate(rows[:-1])]
+        return (rows.shape[1] * torch.cat(squares)).sqrt().nanmean()
     return torch.pdist(rows).mean() if len(rows) > 1 else samples.new_zeros(())
 
 
@@ -459,8 +458,8 @@ def per_window(score: Callable[..., Tensor], samples: Tensor, *truth: Tensor) ->
     """Apply a score to each window and restore the leading shape."""
     lead = samples.shape[:-3]
     windows = [part.reshape(-1, *part.shape[len(lead) :]) for part in (samples, *truth)]
-    found = torch.stack([score(*window) for window in zip(*windows, strict=True)])
-    return found.reshape((*lead, *found.shape[1:]))
+    scores = torch.stack([score(*window) for window in zip(*windows, strict=True)])
+    return scores.reshape((*lead, *scores.shape[1:]))
 
 
 def as_samples(samples: Array) -> Tensor:
@@ -468,8 +467,8 @@ def as_samples(samples: Array) -> Tensor:
     samples = torch.as_tensor(samples)
     if samples.ndim < 3:
         raise ValueError(
-            f"samples must be (..., K, T, D), but have shape {shape_of(samples)}; "
-            "one forecast (T, D) needs an axis for K = 1"
+            f"samples must be (..., K, T, D), got shape {shape_of(samples)}; add an axis K = 1 to a single forecast "
+            "(T, D)"
         )
     if not samples.numel():
         raise ValueError(f"expected samples (..., K, T, D) with no size 0, got shape {shape_of(samples)}")
@@ -484,14 +483,14 @@ def as_pair(samples: Array, truth: Array) -> tuple[Tensor, Tensor]:
     if truth.shape != expected:
         raise ValueError(
             f"samples (..., K, T, D) of shape {shape_of(samples)} need a truth (..., T, D) of shape "
-            f"{tuple(expected)}, not {shape_of(truth)}; a model's forecasts (K, B, T, D) need "
-            "samples.movedim(0, 1) first"
+            f"{tuple(expected)}, got {shape_of(truth)}; for a model's forecasts (K, B, T, D), pass "
+            "samples.movedim(0, 1)"
         )
     return as_same_type(samples, truth)
 
 
 def as_same_type(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both in the wider of their types."""
+    """Return both tensors in the wider of their types."""
     dtype = torch.promote_types(samples.dtype, truth.dtype)
     return samples.to(dtype), truth.to(dtype)
 

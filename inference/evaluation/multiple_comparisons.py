@@ -8,11 +8,11 @@ the more models it contains. `required` computes the power of a paired differenc
 
 Errors are computed as in `estimates`: over clips, which models share, and over training seeds, which they do not.
 Variances over few seeds are uncertain, and if they are small by chance, differences look significant that are not. The
-null distribution of the confidence set therefore draws variances first, each the measured one times f over chi-squared
-with its f degrees of freedom. For a single difference this is Student's t (the fiducial distribution of Behrens and
-Fisher). The paper's block bootstrap is not possible with two or three seeds. Each pair has its own null distribution,
-and the smallest of these p-values is compared with its null distribution (Westfall and Young, 1993); the paper uses the
-largest t of all pairs.
+null distribution of the confidence set therefore draws variances first: each is the measured one times f divided by a
+chi-squared draw with its f degrees of freedom. For a single difference this is Student's t (the fiducial distribution
+of Behrens and Fisher). The paper's block bootstrap is not possible with two or three seeds. Each pair has its own null
+distribution, and the smallest of these p-values is compared with its null distribution (Westfall and Young, 1993); the
+paper uses the largest t of all pairs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .result import Displayed, Table
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
-    """Return p-values adjusted for all hypotheses by Holm's step-down procedure; a NaN stays NaN and is not counted.
+    """Return p-values adjusted for all hypotheses by Holm's step-down procedure; NaN stays NaN and is not counted.
 
     Args:
         p_values: unadjusted p-values (N,).
@@ -43,12 +43,12 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
     >>> holm([0.01, 0.04, 0.03]).round(2).tolist()
     [0.03, 0.06, 0.06]
     """
-    found = np.array(p_values, dtype=float)
-    known = np.flatnonzero(~np.isnan(found))
-    ascending = known[np.argsort(found[known], kind="stable")]
+    adjusted = np.array(p_values, dtype=float)
+    indices = np.flatnonzero(~np.isnan(adjusted))
+    ascending = indices[np.argsort(adjusted[indices], kind="stable")]
     factors = np.arange(len(ascending), 0, -1)
-    found[ascending] = np.minimum(np.maximum.accumulate(factors * found[ascending]), 1.0)
-    return found
+    adjusted[ascending] = np.minimum(np.maximum.accumulate(factors * adjusted[ascending]), 1.0)
+    return adjusted
 
 
 @dataclass(frozen=True, repr=False)
@@ -87,11 +87,11 @@ def pairs(contenders: Mapping[str, TwoWayErrors]) -> Pairs:
     Returns:
         Differences of each model with all later ones; p-values are NaN if a model has one seed.
     """
-    found = {
+    differences = {
         (first, second): contenders[first].estimate(contenders[second]) for first, second in combinations(contenders, 2)
     }
-    adjusted = holm([estimate.p_value() for estimate in found.values()])
-    return Pairs(found, dict(zip(found, map(float, adjusted), strict=True)))
+    adjusted = holm([estimate.p_value() for estimate in differences.values()])
+    return Pairs(differences, dict(zip(differences, map(float, adjusted), strict=True)))
 
 
 @dataclass(frozen=True, repr=False)
@@ -116,7 +116,8 @@ class ConfidenceSet(Displayed):
         """Return a table with a row for each model, those that may be the best first."""
         table = Table(
             title=f"models that may be the best, at {100 * self.level:g} %",
-            caption=f"p: of none being the worse, when it would be left out; in the set from {1 - self.level:.3g} on",
+            caption=f"p: of no difference between the models left when this one is dropped; in the set if p ≥ "
+            f"{1 - self.level:.3g}",
         )
         for name in ("model", "p", "in the set"):
             table.add_column(name, justify="right" if name == "p" else "left")
@@ -151,19 +152,20 @@ def confidence_set(
     """
     if not contenders or not 0 < level < 1 or draws < 1:
         raise ValueError(
-            f"a confidence set needs models and a level between 0 and 1, got {len(contenders)} models at {level}"
+            f"a confidence set needs at least one model and draw and a level between 0 and 1, got {len(contenders)} "
+            f"models, {draws} draws and a level of {level}"
         )
     if better not in ("lower", "higher"):
-        raise ValueError(f"the best model needs a score that is better 'lower' or 'higher', got {better!r}")
+        raise ValueError(f"better must be 'lower' or 'higher', got {better!r}")
     names, rows = list(contenders), list(contenders.values())
     if over_seeds and (single := [name for name in names if math.isnan(contenders[name].seeds)]):
         raise ValueError(
-            f"{', '.join(single)} has one training seed, which gives no error over seeds; give more, or take "
-            "over_seeds=False for these very weights"
+            f"{', '.join(single)} has one training seed, so no error over seeds exists; pass more seeds, or "
+            "over_seeds=False to compare only these weights"
         )
     clips = _check(contenders)
     if clips < 2:
-        raise ValueError("all windows are of one clip, so no error over clips exists; give more clips")
+        raise ValueError("all windows are of one clip, so no error over clips exists; pass more clips")
     means = np.array([row.mean for row in rows]) * (1 if better == "lower" else -1)
     deviations = np.stack([row.deviations for row in rows]) * math.sqrt(clips / (clips - 1))
     between, rest = (
@@ -173,22 +175,24 @@ def confidence_set(
 
     random = np.random.default_rng(seed)
     wider = np.sqrt((clips - 1) / random.chisquare(clips - 1, (draws, 1)))
-    together = wider * (random.standard_normal((draws, clips)) @ deviations.T)
+    common_errors = wider * (random.standard_normal((draws, clips)) @ deviations.T)
     variances = np.maximum(between * freedom / random.chisquare(freedom, (draws, len(rows))) - rest, 0)
-    drawn = together + np.sqrt(variances) * random.standard_normal((draws, len(rows)))
+    errors = common_errors + np.sqrt(variances) * random.standard_normal((draws, len(rows)))
 
-    worse, other = (places.ravel() for places in np.indices((len(rows), len(rows))))  # all ordered pairs of models
-    null = drawn[:, worse] - drawn[:, other]
+    worse, other = (index.ravel() for index in np.indices((len(rows), len(rows))))  # all ordered pairs of models
+    null = errors[:, worse] - errors[:, other]
     single = (null >= means[worse] - means[other]).mean(0)
     null = scipy.stats.rankdata(-null, "max", axis=0) / draws
-    left, p_values, running = np.ones(len(rows), bool), {}, 0.0
-    while left.sum() > 1:
-        (pairs_left,) = np.nonzero(left[worse] & left[other] & (worse != other))
-        worst = pairs_left[np.lexsort(((means[other] - means[worse])[pairs_left], single[pairs_left]))[0]]
-        running = max(running, float((null[:, pairs_left].min(1) <= single[worst]).mean()))
+    remaining, p_values, running = np.ones(len(rows), bool), {}, 0.0
+    while remaining.sum() > 1:
+        (remaining_pairs,) = np.nonzero(remaining[worse] & remaining[other] & (worse != other))
+        worst = remaining_pairs[
+            np.lexsort(((means[other] - means[worse])[remaining_pairs], single[remaining_pairs]))[0]
+        ]
+        running = max(running, float((null[:, remaining_pairs].min(1) <= single[worst]).mean()))
         p_values[names[worse[worst]]] = running
-        left[worse[worst]] = False
-    p_values[names[int(left.argmax())]] = 1.0
+        remaining[worse[worst]] = False
+    p_values[names[int(remaining.argmax())]] = 1.0
     return ConfidenceSet(p_values, level)
 
 
@@ -200,7 +204,7 @@ def _check(rows: Mapping[str, TwoWayErrors]) -> int:
     """
     counts = {name: len(row.deviations) for name, row in rows.items()}
     if len(set(counts.values())) > 1:
-        raise ValueError(f"scores to compare must be on the same clips, but have {counts}")
+        raise ValueError(f"scores to compare must be on the same clips, but their numbers of clips are {counts}")
     for name, row in rows.items():
         if not (math.isfinite(row.mean) and np.isfinite(row.deviations).all()):
             raise ValueError(f"the score of {name} is not finite: its mean is {row.mean}")
@@ -209,15 +213,15 @@ def _check(rows: Mapping[str, TwoWayErrors]) -> int:
 
 @dataclass(frozen=True, repr=False)
 class Requirement(Displayed):
-    """Numbers of seeds and clips that are needed to distinguish two models.
+    """Numbers of seeds and clips needed to distinguish two models.
 
     Attributes:
         difference: difference to detect.
         power: probability of detecting it.
         level: level of the two-sided interval that must exclude 0.
-        clips: number of clips for each number of training seeds per model, infinite if no number is enough.
-        now: present numbers of clips, and of seeds of the two models.
-        achieved: power with the present numbers; for the measured difference it follows from the p-value and adds no
+        clips: number of clips for each number of training seeds per model; infinite if no number is enough.
+        now: present numbers of clips and of each model's seeds.
+        achieved: power with the present numbers. For the measured difference it follows from the p-value and adds no
             information.
     """
 
@@ -232,19 +236,19 @@ class Requirement(Displayed):
         """Return a table with a row for each number of seeds."""
         clips, *seeds = self.now
         table = Table(
-            title=f"to find a difference of {number(self.difference, 4)} with a probability of {100 * self.power:g} %",
-            caption=f"with {clips} clips and {' and '.join(map(_seeds, seeds))} it is {100 * self.achieved:.0f} %, "
-            f"at a level of {100 * self.level:g} %",
+            title=f"to detect a difference of {number(self.difference, 4)} with a power of {100 * self.power:g} %",
+            caption=f"power with {clips} clips and {' and '.join(map(_seeds, seeds))}: {100 * self.achieved:.0f} %, at "
+            f"a level of {100 * self.level:g} %",
         )
-        for name in ("seeds of each", "clips"):
+        for name in ("seeds per model", "clips"):
             table.add_column(name, justify="right")
-        for count, needed in self.clips.items():
-            table.add_row(str(count), f"{needed:.0f}" if math.isfinite(needed) else "no number is enough")
+        for count, n_clips in self.clips.items():
+            table.add_row(str(count), f"{n_clips:.0f}" if math.isfinite(n_clips) else "no number is enough")
         return table
 
 
 def _seeds(count: int) -> str:
-    return "none that is trained" if count == sys.maxsize else f"{count} seeds"
+    return "no training" if count == sys.maxsize else f"{count} seeds"
 
 
 def required(
@@ -274,7 +278,7 @@ def required(
     """
     if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(
-            f"power and level must be between 0 and 1 and seeds whole numbers from 2 on, not {power}, {level}, "
+            f"power and level must be between 0 and 1 and seeds whole numbers of at least 2, got {power}, {level} and "
             f"{[*seeds]}"
         )
     count = _check({"the first": first, "the second": second})
@@ -282,28 +286,28 @@ def required(
     sought = abs(measured.mean if difference is None else difference)
     if math.isnan(measured.total) or not 0 < sought < math.inf:
         raise ValueError(
-            "both models need two seeds or more and several clips, and a finite difference that is not 0: "
-            f"it is {sought}, with a standard error of {measured.total}"
+            "both models need at least two seeds and two clips, and a finite difference that is not 0; got "
+            f"{sought}, with a standard error of {measured.total}"
         )
     rows = (first, second)
     rest = [row.rest * row.count * count for row in rows]  # variances of single seeds and clips
-    own = [max(row.count * row.seeds - r / count, 0.0) for row, r in zip(rows, rest, strict=True)]
+    seed_variances = [max(row.count * row.seeds - r / count, 0.0) for row, r in zip(rows, rest, strict=True)]
     common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
 
     def reached(clips: int, *numbers: int) -> float:
-        """Return the mean power over the errors and degrees of freedom that `TwoWayErrors.estimate` may measure."""
-        both = [*zip(rest, own, numbers, strict=True)]
+        """Return the power, averaged over errors and degrees of freedom that `TwoWayErrors.estimate` may return."""
+        both = [*zip(rest, seed_variances, numbers, strict=True)]
         over = (common + sum(r / n for r, _, n in both)) / clips
         between = [(o + r / clips) / n for r, o, n in both]
         shared = sum(r / n for r, _, n in both) / clips
         of_clips, *others = _ranks()
-        found = over * scipy.special.chdtri(clips - 1, of_clips) / (clips - 1)
+        clip_variance = over * scipy.special.chdtri(clips - 1, of_clips) / (clips - 1)
         of_seeds = [
             v * scipy.special.chdtri(n - 1, ranks) / (n - 1)
             for v, (*_, n), ranks in zip(between, both, others, strict=True)
         ]
-        total = np.maximum(found + sum(of_seeds) - shared, np.maximum(found, sum(of_seeds)))
-        uncertain = found**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True))
+        total = np.maximum(clip_variance + sum(of_seeds) - shared, np.maximum(clip_variance, sum(of_seeds)))
+        uncertain = clip_variance**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             freedom = np.maximum(np.nan_to_num(total**2 / uncertain, nan=1e9), min(clips, *numbers) - 1)
         beyond = scipy.special.stdtrit(np.minimum(freedom, 1e9), (1 + level) / 2) * np.sqrt(total)
@@ -329,10 +333,10 @@ def required(
 
 
 FEWEST, MOST_CLIPS = 5, 10**7
-"""Fewest clips with an estimate of errors, and the number above which no number counts as enough."""
+"""Smallest number of clips with an estimate of errors, and the number above which the search for more stops."""
 
 
 @cache
 def _ranks() -> np.ndarray:
-    """Return quasi-random ranks of the variances over clips and over two models' seeds, for averaging the power."""
+    """Return quasi-random ranks of the variances over clips and over two models' seeds, to average the power over."""
     return scipy.stats.qmc.Halton(3, seed=0).random(2000).T

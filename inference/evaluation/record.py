@@ -34,9 +34,9 @@ class Dims:
     """Mark of an array, or of a mapping to arrays.
 
     Args:
-        names: names of the dimensions. Arrays that share one may differ in its size.
-        name: name of the variable, where "{0}" is the last key and "{1}" the one before. By default all fields and
-            keys.
+        names: names of the dimensions. Arrays may differ in the size of a common dimension.
+        name: name of the variable, where "{0}" is the last key and "{1}" the one before. By default it consists of all
+            fields and keys.
         kind: type of the numbers.
     """
 
@@ -45,8 +45,8 @@ class Dims:
     kind: type
 
     def __init__(self, *names: str, name: str = "", kind: type = float) -> None:
-        for own, value in (("names", names), ("name", name), ("kind", kind)):
-            object.__setattr__(self, own, value)
+        for attribute, value in (("names", names), ("name", name), ("kind", kind)):
+            object.__setattr__(self, attribute, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Flat:
     Args:
         variables: variables by name.
         models: names of the models, in the order of the dimension "model".
-        attributes: everything else, as JSON types. They contain the shape of each array in its place.
+        attributes: everything else, as JSON types, with the shape of each array in its place.
         sizes: sizes of the arrays, by dimension.
     """
 
@@ -82,7 +82,7 @@ class Flat:
 
 
 def plain(value: Any) -> Any:
-    """Return the value as JSON types: tuples and arrays become lists, NaN None, and infinity a text."""
+    """Return the value as JSON types: tuples and arrays become lists, NaN becomes None, and infinity a text."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -100,11 +100,11 @@ def flatten(result: Any) -> Flat:
     Raises:
         TypeError: when an array has other dimensions than its field declares.
     """
-    found: dict[_Path, dict[str | None, np.ndarray]] = {}
+    arrays_by_path: dict[_Path, dict[str | None, np.ndarray]] = {}
     marks: dict[_Path, Dims] = {}
     models: dict[str, None] = {}
 
-    def of(value: Any, hint: Any, path: _Path, model: str | None) -> Any:
+    def convert(value: Any, hint: Any, path: _Path, model: str | None) -> Any:
         mark, hint = _marked(hint)
         if value is None:
             return None
@@ -112,28 +112,28 @@ def flatten(result: Any) -> Flat:
             within = Annotated[np.ndarray, mark] if isinstance(mark, Dims) else (*get_args(hint), Any, Any)[1]
             if mark == MODELS:
                 models.update(dict.fromkeys(value))
-                return {key: of(item, within, path, key) for key, item in value.items()}
-            return {str(key): of(item, within, (*path, str(key)), model) for key, item in value.items()}
+                return {key: convert(item, within, path, key) for key, item in value.items()}
+            return {str(key): convert(item, within, (*path, str(key)), model) for key, item in value.items()}
         if isinstance(mark, Dims):
             array: np.ndarray = np.asarray(value, mark.kind)
             if array.ndim != len(mark.names):
-                raise TypeError(f"{'.'.join(path)} has the shape {array.shape}; its dimensions are {mark.names}")
-            found.setdefault(path, {})[model] = array
+                raise TypeError(f"{'.'.join(path)} must have the dimensions {mark.names}, got the shape {array.shape}")
+            arrays_by_path.setdefault(path, {})[model] = array
             marks[path] = mark
             return list(array.shape)
         if is_dataclass(value) and not isinstance(value, type):
             hints = _hints(type(value))
-            return {name: of(getattr(value, name), hint, (*path, name), model) for name, hint in hints.items()}
+            return {name: convert(getattr(value, name), hint, (*path, name), model) for name, hint in hints.items()}
         return plain(value)
 
-    attributes = of(result, type(result), (), None)
+    attributes = convert(result, type(result), (), None)
     sizes: dict[str, set[int]] = {}
-    for path, arrays in found.items():
+    for path, arrays in arrays_by_path.items():
         for array in arrays.values():
             for name, size in zip(marks[path].names, array.shape, strict=True):
                 sizes.setdefault(name, set()).add(size)
     variables: dict[str, Variable] = {}
-    for path, arrays in found.items():
+    for path, arrays in arrays_by_path.items():
         mark = marks[path]
         name = mark.name.format(*reversed(path)) if mark.name else " ".join(path)
         name = " ".join(path) if name in variables else name
@@ -156,72 +156,72 @@ def unflatten(kind: Any, record: Flat) -> Any:
     """
     variables = {each.path: each for each in record.variables.values()}
 
-    def of(value: Any, hint: Any, path: _Path, model: str | None) -> Any:
+    def convert(value: Any, hint: Any, path: _Path, model: str | None) -> Any:
         mark, hint = _marked(hint, value)
-        said = ".".join(path) or "the result"
+        label = ".".join(path) or "the result"
         if value is None and hint is NoneType:
             return None
         if isinstance(mark, Dims) and not isinstance(value, Mapping):
-            return _array(value, mark, variables.get(path), record.models.index(model) if model else None, said)
+            return _array(value, mark, variables.get(path), record.models.index(model) if model else None, label)
         arguments = get_args(hint)
         if isinstance(mark, Dims) or get_origin(hint) in (dict, Mapping):
             if not isinstance(value, Mapping):
-                raise TypeError(f"{said} is not an object")
+                raise TypeError(f"{label} must be an object, got {type(value).__name__}")
             within = Annotated[np.ndarray, mark] if isinstance(mark, Dims) else arguments[1]
             of_models = mark == MODELS
             return {
-                key: of(item, within, path if of_models else (*path, key), key if of_models else model)
+                key: convert(item, within, path if of_models else (*path, key), key if of_models else model)
                 for key, item in value.items()
             }
         if is_dataclass(hint):
             hints = _hints(hint)  # type: ignore[arg-type]
             if not isinstance(value, Mapping) or value.keys() != hints.keys():
-                raise TypeError(f"{said} must have the fields {', '.join(hints)}")
-            return hint(**{name: of(value[name], within, (*path, name), model) for name, within in hints.items()})  # type: ignore[operator]
+                raise TypeError(f"{label} must have the fields {', '.join(hints)}")
+            return hint(**{name: convert(value[name], within, (*path, name), model) for name, within in hints.items()})  # type: ignore[operator]
         if get_origin(hint) in (list, tuple):
             if not isinstance(value, list):
-                raise TypeError(f"{said} is not a list")
+                raise TypeError(f"{label} must be a list, got {type(value).__name__}")
             each = arguments if arguments[1:] and arguments[1] is not Ellipsis else arguments[:1] * len(value)
             if len(each) != len(value):
-                raise ValueError(f"{said} has {len(value)} entries; it must have {len(each)}")
-            entries = [of(item, within, path, model) for item, within in zip(value, each, strict=True)]
+                raise ValueError(f"{label} must have {len(each)} entries, got {len(value)}")
+            entries = [convert(item, within, path, model) for item, within in zip(value, each, strict=True)]
             return tuple(entries) if get_origin(hint) is tuple else entries
         if hint is float and (value is None or value in ("inf", "-inf")):
             return float(value or "nan")
-        if (error := problem(said, value, hint)) is not None:
+        if (error := problem(label, value, hint)) is not None:
             raise error
         return value
 
-    return of(record.attributes, kind, (), None)
+    return convert(record.attributes, kind, (), None)
 
 
-def _array(shape: Any, mark: Dims, variable: Variable | None, place: int | None, said: str) -> np.ndarray:
-    if variable is None or variable.dims != ((MODELS, *mark.names) if place is not None else mark.names):
-        raise ValueError(f"{said} has no numbers of dimensions {mark.names}")
+def _array(shape: Any, mark: Dims, variable: Variable | None, model_index: int | None, label: str) -> np.ndarray:
+    if variable is None or variable.dims != ((MODELS, *mark.names) if model_index is not None else mark.names):
+        raise ValueError(f"{label} has no values with dimensions {mark.names}")
     if not isinstance(shape, list) or len(shape) != len(mark.names) or not all(type(size) is int for size in shape):
-        raise ValueError(f"{said} has no shape")
+        raise ValueError(f"{label} has no shape of {len(mark.names)} whole numbers")
     if 0 in shape and min(shape) == 0:  # nested lists in JSON lose the other sizes
         return np.zeros(shape, mark.kind)
-    data = variable.data if place is None else variable.data[place]
+    data = variable.data if model_index is None else variable.data[model_index]
     if data.ndim != len(shape) or not all(0 < size <= most for size, most in zip(shape, data.shape, strict=True)):
-        raise ValueError(f"{said} is not of the shape {shape}")
+        raise ValueError(f"{label} must have the shape {shape}")
     data = data[tuple(map(slice, shape))]
-    found: np.ndarray = data.astype(mark.kind)
-    if mark.kind is not float and (found != data).any():
-        raise ValueError(f"{said} has numbers that are not whole")
-    return found
+    array: np.ndarray = data.astype(mark.kind)
+    if mark.kind is not float and (array != data).any():
+        raise ValueError(f"{label} must have whole numbers")
+    return array
 
 
 def _padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if array.shape == shape:
         return array
-    whole = np.full(shape, math.nan)
-    whole[tuple(map(slice, array.shape))] = array
-    return whole
+    padded = np.full(shape, math.nan)
+    padded[tuple(map(slice, array.shape))] = array
+    return padded
 
 
 def _marked(hint: Any, value: Any = True) -> tuple[Any, Any]:
-    """Return the mark of a type (`Dims` or `MODELS`), and the type without it; for a value of None, NoneType."""
+    """Return the mark of a type (`Dims` or `MODELS`), and the type without it (NoneType if the value is None)."""
     mark = None
     while True:
         if get_origin(hint) in (Union, UnionType) and NoneType in get_args(hint):

@@ -22,9 +22,9 @@ from .evaluation_windows import EvaluationWindows
 Forecaster = Callable[[slice], Tensor]
 """Function from a slice of windows to forecasts (K, B, H, D)."""
 OF_ARRAYS = ("last value", "nearest neighbours")
-"""Reference rows of windows without named columns."""
+"""Default reference rows of windows without named columns."""
 OF_TABLES = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
-"""Reference rows of windows with named columns."""
+"""Default reference rows of windows with named columns."""
 
 _EXACT = "donot_use_mm_for_euclid_dist"
 
@@ -53,25 +53,26 @@ def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: T
 
     Args:
         first, second: points, with any value at a missing coordinate.
-        seen, also: masks `(N, D)` and `(M, D)`, True where coordinates of each were observed; None for all.
+        seen, also: masks `(N, D)` of `first` and `(M, D)` of `second`, True where observed; None for all.
     """
     if seen is None and also is None:
         # Matrix-product distances would be too inexact for poses far from the origin, or at a threshold.
         return torch.cdist(first, second, compute_mode=_EXACT)
-    here = torch.ones_like(first, dtype=torch.bool) if seen is None else seen
-    there = torch.ones_like(second, dtype=torch.bool) if also is None else also
-    ours, theirs = here.to(first), there.to(second)
-    centre = (torch.where(there, second, 0.0).sum(0) / theirs.sum(0).clamp(min=1)).double()  # otherwise digits cancel
-    a, b = (torch.where(m, x.double() - centre, 0.0) for m, x in ((here, first), (there, second)))
-    ours, theirs = ours.double(), theirs.double()
-    shared = ours @ theirs.T
-    squares = a.square() @ theirs.T + ours @ b.square().T - 2 * a @ b.T
-    found = (squares.clamp(min=0) * (first.shape[-1] / shared)).sqrt()
-    return torch.where(shared > 0, found, torch.inf).to(first)
+    first_mask = torch.ones_like(first, dtype=torch.bool) if seen is None else seen
+    second_mask = torch.ones_like(second, dtype=torch.bool) if also is None else also
+    first_weights, second_weights = first_mask.to(first), second_mask.to(second)
+    # Far from 0, differences of squares would lose digits.
+    centre = (torch.where(second_mask, second, 0.0).sum(0) / second_weights.sum(0).clamp(min=1)).double()
+    a, b = (torch.where(m, x.double() - centre, 0.0) for m, x in ((first_mask, first), (second_mask, second)))
+    first_weights, second_weights = first_weights.double(), second_weights.double()
+    shared = first_weights @ second_weights.T
+    squares = a.square() @ second_weights.T + first_weights @ b.square().T - 2 * a @ b.T
+    result = (squares.clamp(min=0) * (first.shape[-1] / shared)).sqrt()
+    return torch.where(shared > 0, result, torch.inf).to(first)
 
 
 def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Tensor:
-    """Repeat the last observed frame: the forecast that any method should beat.
+    """Repeat the last observed frame, a forecast that any method should beat.
 
     Args:
         observed: observed frames `(B, O, D)`.
@@ -86,46 +87,46 @@ def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Te
 
 
 def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = None) -> Tensor:
-    """Repeat the last period: every value is the one a whole number of periods earlier.
+    """Repeat the last observed period.
 
     Args:
         observed: observed frames `(B, O, D)`.
         horizon: H, number of frames to predict.
         season: number of frames in a period, at most O; 1 repeats the last value.
-        mask: `(B, O, D)`, True where a coordinate was observed. A value that is missing in the last period comes from
-            the latest period with it, or else from linear interpolation in time.
+        mask: `(B, O, D)`, True where a coordinate was observed. A value that is missing in the last period is taken
+            from the latest period that has it, or else from linear interpolation in time.
 
     Returns:
         One forecast, `(1, B, H, D)`.
 
     Raises:
-        ValueError: when the season is not from 1 to O.
+        ValueError: when the season is not between 1 and O.
     """
     frames = observed.shape[1]
     if not 1 <= season <= frames:
-        raise ValueError(f"a season must be from 1 to the {frames} observed frames, got {season}")
+        raise ValueError(f"season must be between 1 and the {frames} observed frames, got {season}")
     last = interpolate_missing(observed, mask)[:, -season:]
     if mask is not None:
         periods = frames // season * season
-        x, seen = (each[:, -periods:].unflatten(1, (-1, season)).movedim(1, 2) for each in (observed, mask))
-        last = torch.where(seen.any(2), interpolate_missing(x, seen)[:, :, -1], last)
+        x, observed_mask = (each[:, -periods:].unflatten(1, (-1, season)).movedim(1, 2) for each in (observed, mask))
+        last = torch.where(observed_mask.any(2), interpolate_missing(x, observed_mask)[:, :, -1], last)
     return last[None, :, torch.arange(horizon) % season]
 
 
 def climatology(futures: Tensor, count: int, samples: int, seed: int = 0) -> Callable[[slice], Tensor]:
-    """Return a forecaster that draws futures of training windows at random, whatever the past.
+    """Return a forecaster that draws futures of training windows at random and ignores the past.
 
     Args:
         futures: futures `(N, H, D)` of training windows.
         count: number of windows to forecast.
-        samples: K, number of draws for each of them, independent and with replacement.
+        samples: K, number of independent draws per window, with replacement.
         seed: seed of the draws.
 
     Returns:
         Function from a slice of the windows to `(K, B, H, D)`.
     """
-    drawn = torch.randint(len(futures), (samples, count), generator=torch.Generator().manual_seed(seed))
-    return lambda part: futures[drawn[:, part]]
+    indices = torch.randint(len(futures), (samples, count), generator=torch.Generator().manual_seed(seed))
+    return lambda part: futures[indices[:, part]]
 
 
 def nearest_neighbours(
@@ -141,8 +142,8 @@ def nearest_neighbours(
         observed: observed frames `(B, O, D)`.
         training: training windows `(N, O + H, D)` with as many observed frames.
         samples: K, number of neighbours.
-        mask, training_mask: masks of both, True where a coordinate was observed. Poses are from `last_places`, and
-            missing values of futures are interpolated.
+        mask, training_mask: masks of `observed` and `training`, True where a coordinate was observed. Poses are from
+            `last_places`, and missing values of futures are interpolated.
 
     Returns:
         `(K, B, H, D)`, the closest neighbour first.
@@ -153,20 +154,20 @@ def nearest_neighbours(
     frames, size = observed.shape[1:]
     if training.ndim != 3 or training.shape[2] != size or training.shape[1] <= frames:
         raise ValueError(
-            f"training windows must be (N, T, {size}) with T above the {frames} observed frames, but have "
-            f"shape {tuple(training.shape)}"
+            f"training windows must be (N, T, {size}) with T above the {frames} observed frames, got shape "
+            f"{tuple(training.shape)}"
         )
     if len(training) < samples:
-        raise ValueError(f"{samples} neighbours need as many training windows, got {len(training)}; use fewer")
-    here = last_places(Batch(x=observed) | ({} if mask is None else {"mask": mask}), frames)
-    there = last_places(Batch(x=training) | ({} if training_mask is None else {"mask": training_mask}), frames)
-    nearest = distances(here[0], there[0], here[1], there[1]).topk(samples, largest=False).indices
-    return interpolate_missing(training, training_mask)[nearest.T, frames:]
+        raise ValueError(f"{samples} neighbours need as many training windows, got {len(training)}; use fewer samples")
+    poses = last_places(Batch(x=observed) | ({} if mask is None else {"mask": mask}), frames)
+    training_poses = last_places(Batch(x=training) | ({} if training_mask is None else {"mask": training_mask}), frames)
+    indices = distances(poses[0], training_poses[0], poses[1], training_poses[1]).topk(samples, largest=False).indices
+    return interpolate_missing(training, training_mask)[indices.T, frames:]
 
 
 @dataclass(frozen=True)
 class References:
-    """Forecasters without a model, by name: `references["mean"]` is the number of its forecasts and a `Forecaster`.
+    """Forecasters without a model. `references["mean"]` is the number of forecasts of "mean", and its `Forecaster`.
 
     | name | forecasts | needs |
     |---|---|---|
@@ -176,7 +177,7 @@ class References:
     | climatology | K futures of training windows, drawn at random for each window | training windows |
     | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
 
-    Windows may rename some of these in `windows.references`, {name: one of these}, which are then the default rows.
+    Windows may rename some of them by `windows.references`, {new name: name}, which are then the default rows.
 
     All but the last two are point forecasts: their energy score is a distance, their CRPS an absolute error, and they
     have no intervals. Climatology is the distribution of futures without knowledge of the past.
@@ -199,7 +200,7 @@ class References:
     season: int | None = None
 
     def missing_requirement(self, name: str) -> str:
-        """Return the missing requirement of a reference; empty if the reference is available.
+        """Return what a reference still requires; empty if it is available.
 
         Raises:
             ValueError: when the reference does not exist.
@@ -213,18 +214,18 @@ class References:
         if name in ("mean", "climatology", "nearest neighbours"):
             return "" if self.training is not None else "training windows"
         if name == "seasonal" and not 1 <= (self._period or 0) <= self.held.observed:
-            given = f", not {self._period}" if self._period else ""
-            return f"a season of 1 to {self.held.observed} frames, which are observed{given}"
+            got = f", got {self._period}" if self._period else ""
+            return f"a season between 1 and the {self.held.observed} observed frames{got}"
         return ""
 
     def __getitem__(self, name: str) -> tuple[int, Forecaster]:
-        if needed := self.missing_requirement(name):
-            raise ValueError(f"the reference row {name!r} needs {needed}")
+        if requirement := self.missing_requirement(name):
+            raise ValueError(f"the reference row {name!r} needs {requirement}")
         return self._makers[self._names.get(name, name)]()
 
     @property
     def usual(self) -> list[str]:
-        """Default rows of an evaluation: defined by the windows, or else by their kind, if available."""
+        """Available default rows of an evaluation: the names in the windows, or else the rows for their kind."""
         names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
         return [name for name in names if not self.missing_requirement(name)]
 
@@ -247,14 +248,14 @@ class References:
         return 1, lambda part: last_value(*self._past(part))
 
     def _seasonal(self) -> tuple[int, Forecaster]:
-        def again(part: slice) -> Tensor:
+        def forecast(part: slice) -> Tensor:
             x, horizon, mask = self._past(part)
             return seasonal(x, horizon, self._period or 1, mask)
 
-        return 1, again
+        return 1, forecast
 
     def _mean(self) -> tuple[int, Forecaster]:
-        mean = mean_of_known(self._known.mask_to_nan(), (0, 1))
+        mean = mean_of_known(self._training_batch.mask_to_nan(), (0, 1))
         return 1, lambda part: mean.expand(1, len(self.held.x[part]), self._horizon, -1)
 
     def _climatology(self) -> tuple[int, Forecaster]:
@@ -266,11 +267,11 @@ class References:
         training, gaps = self._training
         count = min(self.samples, len(training))
 
-        def remembered(part: slice) -> Tensor:
+        def forecast(part: slice) -> Tensor:
             x, _, mask = self._past(part)
             return nearest_neighbours(x, training, count, mask, gaps)
 
-        return count, remembered
+        return count, forecast
 
     @property
     def _horizon(self) -> int:
@@ -285,12 +286,12 @@ class References:
         return past["x"], self._horizon, past.mask()
 
     @cached_property
-    def _known(self) -> Batch:
+    def _training_batch(self) -> Batch:
         return sequences(take_split(self.training, "train")).batch
 
     @cached_property
     def _training(self) -> tuple[Tensor, Tensor | None]:
         """Training windows, cut to the length of those to forecast, and their mask."""
-        listed, frames = self._known, self.held.x.shape[1]
-        mask = listed.mask()
-        return listed["x"][:, :frames], None if mask is None else mask[:, :frames]
+        batch, frames = self._training_batch, self.held.x.shape[1]
+        mask = batch.mask()
+        return batch["x"][:, :frames], None if mask is None else mask[:, :frames]

@@ -35,22 +35,22 @@ class Table(rich.table.Table):
 
     def __init__(self, *, title: str = "", caption: str = "", **options: Any) -> None:
         super().__init__(**options)
-        self.title = Text(_shown(title), "table.title") if title else None
-        self.caption = Text(_shown(caption), "table.caption") if caption else None
+        self.title = Text(_escaped(title), "table.title") if title else None
+        self.caption = Text(_escaped(caption), "table.caption") if caption else None
 
     @override
     def add_column(self, header: RenderableType = "", *arguments: Any, **options: Any) -> None:
-        super().add_column(_as_it_is(header), *arguments, **options)
+        super().add_column(_literal(header), *arguments, **options)
 
     @override
     def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
-        super().add_row(*map(_as_it_is, cells), **options)
+        super().add_row(*map(_literal, cells), **options)
 
 
 class PlainConsole(Console):
     """Console that prints text literally: paths, names and messages contain no markup and no emoji.
 
-    It stops printing when the reader closes the pipe, as in `dvae evaluate RUN | head`. The command continues.
+    It stops printing if the reader closes the pipe, as in `dvae evaluate RUN | head`; the command continues.
     """
 
     unread: ClassVar[bool] = False
@@ -61,24 +61,24 @@ class PlainConsole(Console):
 
     @override
     def render_str(self, text: str, **options: Any) -> Text:
-        return super().render_str(_shown(text), **options)
+        return super().render_str(_escaped(text), **options)
 
     @override
     def on_broken_pipe(self) -> None:
         PlainConsole.unread = self.quiet = True
         self.print()  # a quiet console empties its buffer
-        with suppress(OSError), open(os.devnull, "wb") as nowhere:  # the rest of Python's buffer is written there
+        with suppress(OSError), open(os.devnull, "wb") as nowhere:  # receives the rest of Python's buffer
             os.dup2(nowhere.fileno(), self.file.fileno())
 
 
-def _as_it_is(cell: Any) -> Any:
-    return Text(_shown(cell)) if isinstance(cell, str) else cell
+def _literal(cell: Any) -> Any:
+    return Text(_escaped(cell)) if isinstance(cell, str) else cell
 
 
-def _shown(text: str) -> str:
-    """Return the text with visible escape characters, so that it cannot control the terminal.
+def _escaped(text: str) -> str:
+    """Return the text with escape characters made visible, so that it cannot control the terminal.
 
-    Rich drops the other control characters.
+    Rich drops other control characters.
     """
     return text.replace("\x1b", r"\x1b")
 
@@ -96,7 +96,7 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 def literal_text(texts: "Iterable[matplotlib.text.Text]") -> None:
-    """Make matplotlib draw texts literally: dollar signs in a name enclose no formula."""
+    """Make matplotlib draw texts literally, so that dollar signs in a name do not start a formula."""
     for text in texts:
         text.set_parse_math(False)
 
@@ -105,7 +105,7 @@ class Displayed:
     """Base class that displays its `table` in a terminal and in a notebook."""
 
     def table(self) -> RenderableType:
-        """Return the main values with their uncertainty."""
+        """Return a table of the main values with their uncertainty."""
         raise NotImplementedError
 
     def __rich__(self) -> RenderableType:
@@ -135,7 +135,7 @@ class Result(Displayed):
     """
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of the table as JSON types, for readers of the file without this library."""
+        """Return the numbers of the table as JSON types, for reading the file without this library."""
         return {}
 
     def labels(self) -> dict[str, Sequence[str]]:
@@ -146,7 +146,7 @@ class Result(Displayed):
         """Refuse fields that contradict each other, as in an altered file.
 
         Raises:
-            ValueError: naming the fields.
+            ValueError: with the names of these fields.
         """
 
     @property
@@ -162,26 +162,26 @@ class Result(Displayed):
         """
         import xarray as xr
 
-        found = flatten(self)
-        stacked = {MODELS: found.models} if found.models else {}
+        flat = flatten(self)
+        stacked = {MODELS: flat.models} if flat.models else {}
         return xr.Dataset(
-            {name: (each.dims, each.data) for name, each in found.variables.items()},
+            {name: (each.dims, each.data) for name, each in flat.variables.items()},
             {name: (name, np.array(values, dtype=str)) for name, values in {**stacked, **self.labels()}.items()},
-            found.attributes,
+            flat.attributes,
         )
 
     def document(self) -> dict[str, Any]:
         """Return everything as JSON types: a summary, variables with their dimensions, and all attributes."""
-        found = flatten(self)
+        flat = flatten(self)
         return {
             "kind": type(self).__name__,
             "summary": plain(self.summary()),
-            "models": found.models,
+            "models": flat.models,
             "variables": {
                 name: {"dims": each.dims, "path": each.path, "data": plain(each.data)}
-                for name, each in found.variables.items()
+                for name, each in flat.variables.items()
             },
-            "attributes": found.attributes,
+            "attributes": flat.attributes,
         }
 
     @classmethod
@@ -193,16 +193,16 @@ class Result(Displayed):
         """
         try:
             if document["kind"] != cls.__name__:
-                raise ValueError(f"its kind is {reprlib.repr(document['kind'])}")
+                raise ValueError(f"expected the kind {cls.__name__}, got {reprlib.repr(document['kind'])}")
             variables = {
                 str(name): Variable(tuple(each["dims"]), np.array(each["data"], float), tuple(each["path"]))
                 for name, each in document["variables"].items()
             }
-            found: Self = unflatten(cls, Flat(variables, document["models"], document["attributes"]))
-            found.check()
+            result: Self = unflatten(cls, Flat(variables, document["models"], document["attributes"]))
+            result.check()
         except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
-            raise ValueError(f"this was not written by {cls.__name__}.to_json: {error!r}") from error
-        return found
+            raise ValueError(f"the document was not written by {cls.__name__}.to_json: {error!r}") from error
+        return result
 
     def to_json(self) -> str:
         """Return `document` as text."""
@@ -218,11 +218,11 @@ class Result(Displayed):
         try:
             document = json.loads(text)
         except (RecursionError, ValueError) as error:
-            raise ValueError(f"this was not written by {cls.__name__}.to_json: {error!r}") from error
+            raise ValueError(f"the document was not written by {cls.__name__}.to_json: {error!r}") from error
         return cls.of(document)
 
     def save(self, path: str | Path) -> None:
-        """Write `to_json()` to a file, which replaces an older one only when it is complete.
+        """Write `to_json()` to a file; an existing file is replaced only when the new one is complete.
 
         Raises:
             OSError, ValueError: when it cannot be written.
@@ -235,7 +235,7 @@ class Result(Displayed):
         """Read the file that `save` wrote.
 
         Raises:
-            OSError, ValueError: when the file is missing, no plain file, or no result of this kind.
+            OSError, ValueError: when the file is missing, not a plain file, or not a result of this kind.
         """
         return cls.from_json(files.read(path, LARGEST, links=True).decode())
 
@@ -245,14 +245,14 @@ class Result(Displayed):
         Raises:
             OSError, ValueError: when it cannot be written.
         """
-        found = self.dataset
-        found.attrs = {name: json.dumps(value) for name, value in found.attrs.items()}
+        dataset = self.dataset
+        dataset.attrs = {name: json.dumps(value) for name, value in dataset.attrs.items()}
         with files.atomic_write(path) as file:
-            file.write(found.to_netcdf())
+            file.write(dataset.to_netcdf())
 
 
 def progress_bar(shown: bool) -> Progress:
-    """Return a progress bar that disappears at the end; hidden where it cannot move (notebooks need ipywidgets)."""
+    """Return a progress bar that disappears at the end, hidden where it cannot be updated (as without ipywidgets)."""
     console = Console()
     moves = find_spec("ipywidgets") is not None if console.is_jupyter else console.is_terminal
     return Progress(

@@ -7,9 +7,9 @@ is a function of the evaluated windows:
     dvae.evaluate(model, windows, scores=lambda windows: [*proper(windows), speed])
 
 `proper` returns proper scoring rules, and `calibrated` adds coverage, sharpness, PIT and TARP, for data of any kind.
-`by_column` scores every column alone, in its own unit, `by_frame` scores some frames, and `over_horizon` assesses
-calibration at these. Bounds, k-hat, KL and the log score need the model instead of forecasts; `dvae.evaluate` has
-options for them.
+`by_column` scores each column separately, in its own unit, `by_frame` scores single frames, and `over_horizon` assesses
+calibration at single frames. Bounds, k-hat, KL and the log score need the model instead of forecasts; `dvae.evaluate`
+has options for them.
 """
 
 import math
@@ -61,25 +61,25 @@ def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
         clips: clip of every window, from 0 to C - 1, `(N,)`.
     """
     places = clips.numpy()
-    found: list[Any] = (_sums(values.double().numpy(), places).T / np.bincount(places)).T.tolist()
-    return found
+    means: list[Any] = (_sums(values.double().numpy(), places).T / np.bincount(places)).T.tolist()
+    return means
 
 
 def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
-    """Return clip values of a score that is NaN for some windows; their mean is over the other windows.
+    """Return clip values of a score that is NaN for some windows; their mean is the mean over the other windows.
 
     The value of a clip is R + N / M (s_c - R m_c) / n_c. Here m_c of its n_c windows have a score, with the sum s_c. M
     is the number of such windows among all N, and R the mean over these M. This is a linearised ratio of sums, which
     gives the errors of a ratio (Cochran 1977). All clips are NaN if no window has a score.
     """
-    places, known = clips.numpy(), ~values.isnan().numpy()
-    if not known.any():
+    places, valid = clips.numpy(), ~values.isnan().numpy()
+    if not valid.any():
         return clip_means(values, clips)
-    windows, counted = np.bincount(places), _sums(known, places)
+    windows, counts = np.bincount(places), _sums(valid, places)
     sums = _sums(values.nan_to_num().double().numpy(), places)
-    ratio = sums.sum(0) / counted.sum(0)
-    found: list[Any] = (ratio + ((sums - ratio * counted).T / windows).T * (len(places) / counted.sum(0))).tolist()
-    return found
+    ratio = sums.sum(0) / counts.sum(0)
+    means: list[Any] = (ratio + ((sums - ratio * counts).T / windows).T * (len(places) / counts.sum(0))).tolist()
+    return means
 
 
 def _sums(values: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -98,17 +98,18 @@ class Measure:
             windows among all; it returns the score `(B,)`, on the CPU. Futures are NaN where they were not observed.
             The past has x `(B, O, D)`, its mask if there is one, and context.
         unit, better, partial: see `Metric`.
-        pool: function of the scores of all windows, `(N, ...)`, and the clip of each; it returns a value for each clip,
-            whose mean weighted by windows is the score. A score of the whole set returns pseudo-values, a histogram
-            lists of shares.
-        headline: whether a comparison shows it in its table.
+        pool: function of the scores of all windows, `(N, ...)`, and their clips; it returns a value for each clip. The
+            mean of these, weighted by windows, is the score. A score of the whole set returns pseudo-values, a
+            histogram lists of shares.
+        headline: whether the table of a comparison contains it.
         truth: name of a reference row that forecasts the true futures, if the score needs it as a comparison.
-        note: line below the table.
-        basis: what the score depends on by name, such as a seed or the weights of a metric model, as JSON types, for
-            the result.
-        bins: 0 for a score; for a histogram, the number of its bins. A histogram is in `Row.histograms` and in no
-            table, and `function` returns shares `(B, bins)`.
-        least: fewest forecasts of a window for this score; rows with fewer, such as point forecasts, omit it.
+        note: line printed below the table.
+        basis: inputs of the score by name, as JSON types, such as a seed or the weights of a metric model; the result
+            contains them.
+        bins: number of bins of a histogram, 0 for a score. A histogram is in `Row.histograms` and in no table, and
+            `function` returns shares `(B, bins)`.
+        least: smallest number of forecasts of a window for this score; rows with fewer, such as point forecasts, omit
+            it.
         of_draws: whether it scores the distribution of the data; a note warns if forecasts are means.
         of_means: whether it is published for means of the emission. Forecasts are then means by default; otherwise they
             are draws.
@@ -146,25 +147,29 @@ CRPS = Measure("CRPS", paired(metrics.continuous_ranked_probability_score), head
 
 
 def proper(windows: HeldOutWindows) -> list[Measure]:
-    """Return proper scoring rules of the whole future, of dependence between coordinates, and of single numbers.
+    """Return proper scoring rules for the whole future, for dependence between coordinates, and for single numbers.
 
     If the windows name columns that share a unit, scores are in this unit. If the windows define the scales of columns,
     scores are of scaled numbers without a unit. A single column has no dependence to score.
     """
     columns = columns_of(windows)
-    alone = (len(columns) or windows.all()["x"].shape[-1]) == 1
-    return [_of_all(measure, windows) for measure in (ENERGY, VARIOGRAM, CRPS) if not (alone and measure is VARIOGRAM)]
+    is_single = (len(columns) or windows.all()["x"].shape[-1]) == 1
+    return [
+        _of_all(measure, windows) for measure in (ENERGY, VARIOGRAM, CRPS) if not (is_single and measure is VARIOGRAM)
+    ]
 
 
 def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
     """Return the score of all columns together, in the unit of the data."""
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
-        note = "scores of all columns together are of numbers in the scales of their columns, in the training data"
+        note = "scores of all columns together are in the scales of their columns, from the training data"
         means = windows.description.get("means", [0.0] * len(scales))
         return replace(measure, function=_in_scales(measure.function, means, scales), unit="scales", note=note)
-    mixed = f"scores without a unit mix numbers in {', '.join(unit or '1' for unit in units)}; by_column has them apart"
-    shared: dict[str, Any] = {"note": mixed} if len(units) > 1 else {"unit": next(iter(units), "")}
+    mixed_note = (
+        f"scores without a unit mix numbers in {', '.join(unit or '1' for unit in units)}; by_column separates them"
+    )
+    shared: dict[str, Any] = {"note": mixed_note} if len(units) > 1 else {"unit": next(iter(units), "")}
     return replace(measure, **shared)
 
 
@@ -172,8 +177,8 @@ def _in_scales(
     function: Callable[..., Tensor], means: Sequence[float], scales: Sequence[float]
 ) -> Callable[..., Tensor]:
     def scaled(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        less, by = torch.tensor([means, scales], dtype=torch.float64).to(truth)
-        forecasts, truth, x = ((values - less) / by for values in (forecasts, truth, past["x"]))
+        offset, scale = torch.tensor([means, scales], dtype=torch.float64).to(truth)
+        forecasts, truth, x = ((values - offset) / scale for values in (forecasts, truth, past["x"]))
         return function(forecasts, truth, {**past, "x": x}, index)
 
     return scaled
@@ -184,8 +189,8 @@ LEVELS = (0.5, 0.8, 0.9, 0.95)
 _CALIBRATED: dict[str, Any] = {
     "better": "",
     "of_draws": True,
-    "note": "calibrated forecasts cover as much as the level says, and their PIT has mean ½ and variance 1 twelfth; "
-    "above 1 they are too narrow or off, below it too wide",
+    "note": "for calibrated forecasts, coverage equals the level, and the PIT has mean ½ and variance 1 (in twelfths); "
+    "a larger variance means too narrow or biased forecasts, a smaller one too wide ones",
 }
 
 
@@ -205,7 +210,7 @@ def width_at(level: float) -> Measure:
 
 
 def samples_needed(level: float) -> int:
-    """Return the fewest samples that define a central interval of this level with samples outside."""
+    """Return the smallest number of samples whose central interval of this level has samples outside."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval must be between 0 and 1, got {level}")
     return math.ceil(round(2 / (1 - level) - 1, 9))
@@ -249,12 +254,12 @@ def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         return metrics.tarp_histogram(forecasts / scale, truth / scale, points[index], BINS)
 
-    told = {"TARP": {"numbers": 1, "seed": seed}}  # numbers per window
-    return Measure("TARP", function, "share", **_CALIBRATED, bins=BINS, least=BINS - 1, basis=told)
+    basis = {"TARP": {"numbers": 1, "seed": seed}}  # numbers per window
+    return Measure("TARP", function, "share", **_CALIBRATED, bins=BINS, least=BINS - 1, basis=basis)
 
 
 def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
-    """Return a score of every column alone, named "CRPS, speed".
+    """Return a score for each column separately, named like "CRPS, speed".
 
     Args:
         measure: score for any number of columns, such as `CRPS` or `width_at(0.9)`. If its unit is "", the column's
@@ -270,29 +275,29 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
         ['CRPS, speed', 'CRPS, load']
     """
 
-    def of(place: int) -> Measure:
+    def column_measure(place: int) -> Measure:
         column = slice(place, place + 1)
 
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             if truth.shape[-1] != len(columns):
                 raise ValueError(
-                    f"x has {truth.shape[-1]} columns, but {len(columns)} were given ({', '.join(columns)})"
+                    f"expected a name for each of {truth.shape[-1]} columns, got {len(columns)} ({', '.join(columns)})"
                 )
             past = Batch(past)
             mask = past.mask()
-            seen = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
-            return measure.function(forecasts[..., column], truth[..., column], past | seen, index)
+            column_past = {"x": past["x"][..., column]} | ({} if mask is None else {"mask": mask[..., column]})
+            return measure.function(forecasts[..., column], truth[..., column], past | column_past, index)
 
         return _part(measure, function, lambda truth: truth[..., column])
 
     return [
-        replace(of(place), name=f"{measure.name}, {name}", unit=measure.unit or unit)
+        replace(column_measure(place), name=f"{measure.name}, {name}", unit=measure.unit or unit)
         for place, (name, unit) in enumerate(columns.items())
     ]
 
 
 def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> list[Measure]:
-    """Return a score at some single frames of the future, named "PIT, frame 30", for `Evaluation.plot_horizon`.
+    """Return a score for single frames of the future, named like "PIT, frame 30", for `Evaluation.plot_horizon`.
 
     Args:
         measure: score for any number of frames.
@@ -307,29 +312,31 @@ def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> l
         ['CRPS, frame 1', 'CRPS, frame 30']
     """
 
-    def of(place: int) -> Measure:
+    def frame_measure(place: int) -> Measure:
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             if not 1 <= place <= truth.shape[-2]:
-                raise ValueError(f"{frame} {place} is not one of the {truth.shape[-2]} of the future, counted from 1")
+                raise ValueError(
+                    f"{frame}s must be between 1 and {truth.shape[-2]}, the length of the future; got {place}"
+                )
             return measure.function(forecasts[..., place - 1 : place, :], truth[..., place - 1 : place, :], past, index)
 
         return _part(measure, function, lambda truth: truth[..., place - 1 : place, :])
 
-    return [replace(of(place), name=f"{measure.name}, {frame} {place}") for place in frames]
+    return [replace(frame_measure(place), name=f"{measure.name}, {frame} {place}") for place in frames]
 
 
 def _part(
     measure: Measure, function: Callable[[Tensor, Tensor, Batch, Tensor], Tensor], part: Callable[[Tensor], Tensor]
 ) -> Measure:
-    """Return a score of a part of the future, for the windows where some of this part was observed."""
+    """Return a score of a part of the future; it is NaN for windows where nothing of this part was observed."""
 
-    def known(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
-        found = function(forecasts, truth, past, index)
-        nothing = part(truth).isnan().all(-1).all(-1)
-        return found.masked_fill(nothing.reshape(-1, *[1] * (found.ndim - 1)), torch.nan)
+    def part_score(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
+        scores = function(forecasts, truth, past, index)
+        unobserved = part(truth).isnan().all(-1).all(-1)
+        return scores.masked_fill(unobserved.reshape(-1, *[1] * (scores.ndim - 1)), torch.nan)
 
     pool = means_of_those_that_count if measure.pool is clip_means else measure.pool
-    return replace(measure, function=known, pool=pool)
+    return replace(measure, function=part_score, pool=pool)
 
 
 def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -> list[Measure]:
@@ -342,8 +349,8 @@ def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -
     horizon = windows.all()["x"].shape[1] - windows.protocol.observed
     frames = frames or sorted({round(place) for place in np.linspace(1, horizon, 6)})
     _, frame = axis_names(windows.description)
-    alone = [*map(coverage_at, (0.5, 0.8, 0.9)), PIT]
-    return [*calibrated(windows), *(each for measure in alone for each in by_frame(measure, frames, frame))]
+    measures = [*map(coverage_at, (0.5, 0.8, 0.9)), PIT]
+    return [*calibrated(windows), *(each for measure in measures for each in by_frame(measure, frames, frame))]
 
 
 Scores = Callable[[HeldOutWindows], Sequence[Measure]]

@@ -6,11 +6,11 @@
     last.state.safetensors  optimiser, random number generators and the state of an objective
     state.json         step, best step and bound, status, and the SHA-256 of the three files above
 
-`state.json` is the commit record. New files are first written completely under a temporary name, then `state.json` is
-replaced, then they are renamed. If a run is killed at any time, the files that match `state.json` are on the disk.
+`state.json` is the commit record. New files are first written completely under temporary names, then `state.json` is
+replaced, then the files are renamed. If a run is killed at any time, files that match `state.json` are on the disk.
 
-The directory may come from an untrusted source. Its files are opened as in `files`, never through a link, and read only
-up to the size that the model implies.
+The directory may come from an untrusted source. Its files are opened as in `files`, never through a link, and are read
+only up to the size that the model implies.
 """
 
 import hashlib
@@ -52,7 +52,7 @@ ENDED: tuple[str, ...] = ("finished", "stopped early")
 STATUSES: tuple[str, ...] = ("running", *ENDED, "interrupted", "failed")
 
 # fields of state.json, each with a test of its value and a description of valid values
-_NUMBER = "a whole number from 0"
+_NUMBER = "a whole number of at least 0"
 _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "step": (lambda value: _count(value), _NUMBER),
     "best_step": (lambda value: value is None or _count(value), f"{_NUMBER} or null"),
@@ -62,10 +62,10 @@ _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
         "a finite number or null",
     ),
     "waited": (lambda value: _count(value), _NUMBER),
-    "status": (lambda value: value in STATUSES, "one of the known ones"),
+    "status": (lambda value: value in STATUSES, f"one of {', '.join(STATUSES)}"),
     "optimizer": (lambda value: value in OPTIMISERS, f"one of {', '.join(OPTIMISERS)}"),
     "per": (lambda value: value is ... or (isinstance(value, str) and value.isidentifier()), "a word"),
-    "processor_seconds": (lambda v: isinstance(v, float) and 0 <= v < math.inf, "a number from 0"),
+    "processor_seconds": (lambda v: isinstance(v, float) and 0 <= v < math.inf, "a number of at least 0"),
 }
 
 
@@ -103,23 +103,23 @@ class Run:
         """Step, best step and bound, status, and the fingerprints of the checkpoint's files.
 
         Raises:
-            CheckpointError: when the file is missing or damaged, or has no fingerprint of a file of the checkpoint.
+            CheckpointError: when the file is missing or damaged, or a fingerprint is missing.
         """
         state = self._json(STATE)
         fingerprints = state.get("fingerprints")
-        wrong = [
-            f"{name} missing or not {sound}"
-            for name, (test, sound) in _STORED.items()
+        invalid = [
+            f"{name} missing or not {valid}"
+            for name, (test, valid) in _STORED.items()
             if not test(state.get(name, ...))
         ]
         if not isinstance(fingerprints, dict) or not all(isinstance(value, str) for value in fingerprints.values()):
             problem = "its fingerprints are not an object of texts"
         elif unknown := fingerprints.keys() - {BEST, LAST, OPTIMISER}:
             problem = f"it has a fingerprint of {min(unknown)[:50]!r}, which is not a file of a checkpoint"
-        elif lacking := {LAST, *([BEST] if state.get("best_step") is not None else [])} - fingerprints.keys():
-            problem = f"it has no fingerprint of {' and '.join(sorted(lacking))}"
-        elif wrong:
-            problem = ", ".join(wrong)
+        elif missing := {LAST, *([BEST] if state.get("best_step") is not None else [])} - fingerprints.keys():
+            problem = f"it has no fingerprint of {' and '.join(sorted(missing))}"
+        elif invalid:
+            problem = ", ".join(invalid)
         else:
             return state
         raise CheckpointError(f"{self.path / STATE} is damaged: {problem}; copy the run directory whole, or fit again")
@@ -131,14 +131,13 @@ class Run:
         Raises:
             CheckpointError: when another process has locked it.
         """
-        with files.create_folder(self.path), self._opened_lock() as file:
+        with files.create_folder(self.path), self._open_lock() as file:
             if fcntl is not None:
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError as error:
                     raise CheckpointError(
-                        f"{self.path} is being fitted by another process; wait for it or stop it, or choose another "
-                        "directory"
+                        f"another process is fitting {self.path}; wait for it, stop it, or choose another directory"
                     ) from error
             try:
                 yield
@@ -147,8 +146,8 @@ class Run:
                     (self.path / LOCK).unlink(missing_ok=True)
                 raise
 
-    def _opened_lock(self) -> BinaryIO:
-        with _refusing():
+    def _open_lock(self) -> BinaryIO:
+        with _checkpoint_errors():
             return files.open_plain(self.path / LOCK, os.O_RDWR | os.O_CREAT)
 
     def _write_new(self, name: str, content: bytes) -> None:
@@ -168,11 +167,11 @@ class Run:
         os.replace(self.path / f"{CONFIG}.new", self.path / CONFIG)
 
     def commit(self, state: Mapping[str, Any], contents: Mapping[str, bytes]) -> None:
-        """Replace files by `contents`, and `state.json` with them; other files of earlier commits stay."""
+        """Replace `state.json` and the files in `contents`; other files of earlier commits stay."""
         self.path.mkdir(parents=True, exist_ok=True)
         fingerprints = self.state["fingerprints"] if self.exists else {}
         for name in fingerprints:
-            self._settle(name, fingerprints[name])
+            self._finish_commit(name, fingerprints[name])
         for name, content in contents.items():
             self._write_new(name, content)
         fingerprints |= {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
@@ -187,20 +186,20 @@ class Run:
         """Return a file of the checkpoint, of at most `most` bytes, after checking its fingerprint.
 
         Raises:
-            CheckpointError: when the file is missing, no plain file, too large, or its fingerprint differs.
+            CheckpointError: when the file is missing, not a plain file or too large, or its fingerprint differs.
         """
         expected = self.state["fingerprints"].get(name)
         if expected is None:
-            raise CheckpointError(f"{self.path / STATE} lists no {name}; the run has not written it")
-        self._settle(name, expected, most)
+            raise CheckpointError(f"{self.path / STATE} does not list {name}: the run has not written it yet")
+        self._finish_commit(name, expected, most)
         path = self.path / name
         if (content := _content(path, most)) is None:
             raise CheckpointError(f"{path} is missing; copy the run directory whole, or fit again")
-        found = hashlib.sha256(content).hexdigest()
-        if found != expected:
+        actual = hashlib.sha256(content).hexdigest()
+        if actual != expected:
             raise CheckpointError(
                 f"{path} is damaged or from another run: {STATE} expects SHA-256 {expected[:12]}…, the file "
-                f"of {len(content)} bytes has {found[:12]}…; copy the run directory whole, or fit again"
+                f"of {len(content)} bytes has {actual[:12]}…; copy the run directory whole, or fit again"
             )
         return content
 
@@ -211,10 +210,10 @@ class Run:
             CheckpointError: when the file is missing.
         """
         name = BEST if BEST in self.state["fingerprints"] else LAST
-        self._settle(name, self.state["fingerprints"][name])
+        self._finish_commit(name, self.state["fingerprints"][name])
         path = self.path / name
         try:
-            with _refusing(), files.open_plain(path) as file:
+            with _checkpoint_errors(), files.open_plain(path) as file:
                 return os.fstat(file.fileno()).st_size
         except FileNotFoundError:
             raise CheckpointError(f"{path} is missing; copy the run directory whole, or fit again") from None
@@ -223,11 +222,11 @@ class Run:
         """Return the optimiser and random number states of the last checkpoint, on the CPU, by their paths.
 
         Raises:
-            CheckpointError: when the file has more bytes than `most`, or is no safetensors file.
+            CheckpointError: when the file has more bytes than `most`, or is not a safetensors file.
         """
         return _tensors(self.read(OPTIMISER, most), self.path / OPTIMISER)
 
-    def _settle(self, name: str, expected: str, most: int = LARGEST_WEIGHTS) -> None:
+    def _finish_commit(self, name: str, expected: str, most: int = LARGEST_WEIGHTS) -> None:
         """Rename a committed file if the process was killed between commit and renaming."""
         new = self.path / f"{name}.new"
         content = _content(new, most)
@@ -237,7 +236,7 @@ class Run:
     def _json(self, name: str) -> dict[str, Any]:
         path = self.path / name
         try:
-            with _refusing():
+            with _checkpoint_errors():
                 content = json.loads(files.read(path, LARGEST_TEXT))
         except FileNotFoundError:
             raise CheckpointError(
@@ -246,14 +245,14 @@ class Run:
             ) from None
         except NotADirectoryError:
             raise CheckpointError(
-                f"{self.path} is a file and not a run directory; leave it out, or give the folder that fit wrote"
+                f"{self.path} is a file, not a run directory; pass the folder that fit wrote"
             ) from None
         except (ValueError, RecursionError) as error:
             raise CheckpointError(f"{path} is damaged, it is not JSON ({error}); fit again") from error
         if _depth(content) > 32:
             raise CheckpointError(f"{path} is damaged, it is nested deeper than any that fit writes; fit again")
         if not isinstance(content, dict):
-            raise CheckpointError(f"{path} is damaged, it holds no JSON object but {type(content).__name__}; fit again")
+            raise CheckpointError(f"{path} is damaged: expected a JSON object, got {type(content).__name__}; fit again")
         return content
 
 
@@ -263,7 +262,7 @@ def weights(model: nn.Module) -> dict[str, Tensor]:
 
 
 def save_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
-    """Write a model's weights to a safetensors file, which replaces an older one only when it is complete."""
+    """Write a model's weights to a safetensors file; an existing file is replaced only when the new one is complete."""
     with files.atomic_write(path) as file:
         file.write(save_tensors(weights(model)))
 
@@ -277,7 +276,7 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
             directory, fingerprints are checked.
 
     Raises:
-        CheckpointError: when the file is missing, damaged or of another model, or contains a number that is not finite.
+        CheckpointError: when the file is missing, damaged or of another model, or a weight is not finite.
     """
     path = Path(path)
     most = state_bytes(model)
@@ -286,8 +285,8 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
     run = Run(path.parent)
     if run.exists and (path.name in (BEST, LAST) or path.name in run.state["fingerprints"]):
         content = run.read(path.name, most)
-    elif (found := _content(path, most, links=True)) is not None:
-        content = found
+    elif (weights_file := _content(path, most, links=True)) is not None:
+        content = weights_file
     else:
         raise CheckpointError(f"{path} does not exist; give a run directory or a safetensors file")
     model.load_state_dict(read_weights(model, content, path))
@@ -302,13 +301,13 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
     tensors = _tensors(content, path)
     _check_names_and_shapes(model, tensors, path)
     for name, value in model.state_dict().items():
-        found = tensors[name]
-        if found.dtype not in (_FLOATING if value.is_floating_point() else (value.dtype,)):
-            raise CheckpointError(f"{path} is damaged: {name} is {found.dtype}, the model's is {value.dtype}")
-        if value.is_floating_point() and not torch.isfinite(found).all():
+        tensor = tensors[name]
+        if tensor.dtype not in (_FLOATING if value.is_floating_point() else (value.dtype,)):
+            raise CheckpointError(f"{path} is damaged: {name} is {tensor.dtype}, the model's is {value.dtype}")
+        if value.is_floating_point() and not torch.isfinite(tensor).all():
             raise CheckpointError(
-                f"{path} holds no usable weights: {name} has entries that are NaN or infinite, so the run had failed; "
-                "fit again, with a lower learning rate"
+                f"the weights in {path} are unusable: {name} has entries that are NaN or infinite, because the run had "
+                "failed; fit again, with a lower learning rate"
             )
     return tensors
 
@@ -316,12 +315,18 @@ def read_weights(model: nn.Module, content: bytes, path: Path) -> dict[str, Tens
 def _tensors(content: bytes, path: Path) -> dict[str, Tensor]:
     try:
         return load_tensors(content)
-    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:  # also for unknown types
+    except (
+        SafetensorError,
+        ValueError,
+        KeyError,
+        TypeError,
+        RuntimeError,
+    ) as error:  # includes errors for unknown types
         raise CheckpointError(f"{path} is damaged or no safetensors file ({error}); copy or fit it again") from error
 
 
 def state_bytes(model: nn.Module, copies: int = 1) -> int:
-    """Return an upper limit on the file size of copies of a model's weights with names, in any floating type."""
+    """Return an upper limit on the size of a file with copies of a model's named weights, in any floating type."""
     state = model.state_dict()
     return copies * sum(8 * value.numel() + 1024 + 4 * len(name) for name, value in state.items()) + 2**16
 
@@ -330,24 +335,24 @@ def state_bytes(model: nn.Module, copies: int = 1) -> int:
 def at_most(size: int, what: str) -> Iterator[None]:
     """Prevent this thread from building modules with more parameters and buffers than `size` allows.
 
-    The size in bytes of a file of weights limits the size of its model. Shared and rebuilt tensors count several times,
-    but a number takes four bytes in a file, or two.
+    The size of a file of weights limits the size of its model. Shared and rebuilt tensors count several times, which
+    the limit allows, because a number takes four bytes in a file, or two.
 
     Raises:
         CheckpointError: when the limit is exceeded.
     """
     if size > LARGEST_WEIGHTS:
         raise CheckpointError(f"{what} has {size} bytes of weights, but at most {LARGEST_WEIGHTS} are supported")
-    left, thread = size + 2**24, threading.get_ident()
+    remaining, thread = size + 2**24, threading.get_ident()
 
     def count(module: nn.Module, name: str, value: Tensor | None) -> None:
-        nonlocal left
+        nonlocal remaining
         if threading.get_ident() == thread and value is not None:
-            left -= value.numel()
-            if left < 0:
+            remaining -= value.numel()
+            if remaining < 0:
                 raise CheckpointError(
-                    f"{what} describes a model that is larger than its weights of {size} bytes; it is "
-                    "damaged, or the weights are those of another run"
+                    f"{what} describes a model that is larger than its weights of {size} bytes; either it is damaged, "
+                    "or the weights are from another run"
                 )
 
     hooks = [
@@ -363,15 +368,15 @@ def at_most(size: int, what: str) -> Iterator[None]:
 
 def _check_names_and_shapes(model: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:
     expected = {name: tuple(value.shape) for name, value in model.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
-    if expected == found:
+    actual = {name: tuple(value.shape) for name, value in tensors.items()}
+    if expected == actual:
         return
-    problems = [f"it has no {name} {expected[name]}" for name in expected.keys() - found.keys()]
-    problems += [f"it has {name} {found[name]}, unlike the model" for name in found.keys() - expected.keys()]
+    problems = [f"it has no {name} {expected[name]}" for name in expected.keys() - actual.keys()]
+    problems += [f"it has {name} {actual[name]}, unlike the model" for name in actual.keys() - expected.keys()]
     problems += [
-        f"{name} is {found[name]}, the model's is {expected[name]}"
-        for name in expected.keys() & found.keys()
-        if expected[name] != found[name]
+        f"{name} is {actual[name]}, the model's is {expected[name]}"
+        for name in expected.keys() & actual.keys()
+        if expected[name] != actual[name]
     ]
     more = f" (and {len(problems) - 3} more)" if len(problems) > 3 else ""
     raise CheckpointError(
@@ -399,16 +404,16 @@ def _depth(value: Any) -> int:
 def _content(path: Path, most: int, links: bool = False) -> bytes | None:
     """Return the content of a file; None if it does not exist."""
     try:
-        with _refusing():
+        with _checkpoint_errors():
             return files.read(path, most, links)
     except FileNotFoundError:
         return None
 
 
 @contextmanager
-def _refusing() -> Iterator[None]:
-    """Raise `CheckpointError` for a file that is not a plain file, or too large."""
+def _checkpoint_errors() -> Iterator[None]:
+    """Raise `CheckpointError` for a file that is not plain or is too large."""
     try:
         yield
     except files.FileRefused as error:
-        raise CheckpointError(f"{error}; a run directory holds plain files, as fit writes them") from error
+        raise CheckpointError(f"{error}; a run directory must contain plain files, as fit writes them") from error

@@ -1,7 +1,7 @@
 """The training loop of every method: batches, validations, checkpoints and a log.
 
-`fit` is written with the steps of `SVI`; no other code changes the weights. A checkpoint contains everything that a
-step depends on. On a CPU, a resumed run therefore repeats the uninterrupted run bit for bit.
+`fit` uses the steps of `SVI`; no other code changes the weights. A checkpoint contains everything that a step depends
+on. On a CPU, a resumed run therefore repeats the uninterrupted run bit for bit.
 """
 
 import os
@@ -73,13 +73,14 @@ class Fit:
         model: fitted model with the best weights; None if only the log of a run was read.
         processor_seconds: processor time of all threads of the first process, with validation and checkpoints; of a
             resumed run, the total.
-        last_value: bound of repeating the last value on the validation windows, for comparison with `best_bound` (see
-            `last_value`); None if the windows have no horizon, or the model has no likelihood of the data as given.
+        last_value: bound of a forecast that repeats the last value, on the validation windows (see `last_value`), for
+            comparison with `best_bound`. None if the windows have no horizon, or the model's likelihood is not of the
+            original data.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
-        >>> found = dvae.fit(model, torch.randn(6, 4, 2), steps=3, log_every=1, progress=False)
-        >>> found.status, found.series("bound")[0]
+        >>> result = dvae.fit(model, torch.randn(6, 4, 2), steps=3, log_every=1, progress=False)
+        >>> result.status, result.series("bound")[0]
         ('finished', [1, 2, 3])
     """
 
@@ -96,25 +97,22 @@ class Fit:
 
     @property
     def best(self) -> str:
-        """Best value and its step in words; empty without validation data.
-
-        If repeating the last value is better, the text gives advice.
-        """
+        """Best value and its step as text, with advice if repeating the last value is better; "" without validation."""
         if self.best_bound is None:
             return ""
         if any("validation/loss" in row for row in self.history):
             return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
         self_fed = any("validation/self_fed/bound" in row for row in self.history)
         name = "best bound with scheduled sampling" if self_fed else "best bound"
-        found = f"{name} {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
+        best = f"{name} {self.best_bound:.3f} nats a {self.per} at step {self.best_step}"
         if self.last_value is None or self.best_bound >= self.last_value:
-            return found
+            return best
         advice = ["train for more steps"]
         if self.model is None or not any(getattr(module, "residual", False) for module in self.model.modules()):
             advice.append("try residual=1, which adds the output to the last value")
         if not self_fed:
             advice.append("try scheduled_sampling=1, which trains on the model's own output")
-        return f"{found}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
+        return f"{best}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
 
     def series(self, name: str) -> tuple[list[int], list[float]]:
         """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
@@ -132,25 +130,25 @@ class Fit:
         likelihood = any(name.startswith("log_likelihood/") for name in names)
         score, start = ("bound", "kl/") if likelihood else ("loss", "energy/")
         unit = f"nats per {self.per}" if likelihood else f"per {self.per}"
-        figure, (whole, terms) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
-        whole.plot(*self.series(score), color="0.7", label="training batch")
+        figure, (score_panel, term_panel) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+        score_panel.plot(*self.series(score), color="0.7", label="training batch")
         if self.best_step is not None:
-            whole.plot(*self.series(f"validation/{score}"), marker=".", label="validation")
-            whole.axvline(self.best_step, color="0.3", linestyle=":", label=f"best: step {self.best_step}")
-        whole.set(xlabel="step", ylabel=f"{score} ({unit})")
-        whole.legend()
+            score_panel.plot(*self.series(f"validation/{score}"), marker=".", label="validation")
+            score_panel.axvline(self.best_step, color="0.3", linestyle=":", label=f"best: step {self.best_step}")
+        score_panel.set(xlabel="step", ylabel=f"{score} ({unit})")
+        score_panel.legend()
         for name in names:
             if name.startswith(start):
-                terms.plot(*self.series(name), label=name.removeprefix(start))
-                literal_text(terms.legend().get_texts())
-        terms.set(xlabel="step", ylabel="KL (nats per frame)" if likelihood else "energies (per frame)")
+                term_panel.plot(*self.series(name), label=name.removeprefix(start))
+                literal_text(term_panel.legend().get_texts())
+        term_panel.set(xlabel="step", ylabel="KL (nats per frame)" if likelihood else "energies (per frame)")
         if not likelihood:
-            terms.set_yscale("log")  # scales of energies differ by orders of magnitude, which weights compensate
+            term_panel.set_yscale("log")  # scales of energies differ by orders of magnitude, which weights compensate
         return figure
 
 
 class Interrupted(KeyboardInterrupt):
-    """The run was stopped by Ctrl-C or SIGTERM, after a complete step and a checkpoint.
+    """Error of a run that Ctrl-C or SIGTERM stopped, after a complete step and a checkpoint.
 
     Args:
         fit: result of the run.
@@ -158,12 +156,12 @@ class Interrupted(KeyboardInterrupt):
     """
 
     def __init__(self, fit: Fit, signal: int) -> None:
-        how = (
+        advice = (
             f"resume with fit(…, out={str(fit.run)!r}, resume=True)"
             if fit.run
-            else "without out=… it cannot be resumed"
+            else "it cannot be resumed; pass out=… to store a run"
         )
-        super().__init__(f"interrupted after step {fit.step}; {how}")
+        super().__init__(f"interrupted after step {fit.step}; {advice}")
         self.fit = fit
         self.signal = signal
 
@@ -187,7 +185,7 @@ def fit(
 
     Afterwards the model is in evaluation mode. It has the weights of the best unweighted validation bound, or the last
     weights without validation data. The caller's random state is restored. Threads share Pyro's handlers and torch's
-    random state, so another fit or forecast waits until the current step is done.
+    random state, so another fit or forecast waits for the end of the current step.
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` accepts; or a method, such as `dvae.method("srnn")`.
@@ -196,7 +194,7 @@ def fit(
         data: x as a tensor (N, T, D), a batch of N sequences, an object with `sample(batch_size, generator)`, or data
             with parts, such as `dvae.tables.PanelData`, whose validation windows are used too; or a `Recipe`, which
             includes its data.
-        validation: x as a tensor, a batch, or an object whose `all()` returns a batch or whose `batches(size)` yields
+        validation: x as a tensor, a batch, an object whose `all()` returns a batch, or one whose `batches(size)` yields
             batches in order.
         objective: objective to minimise; `Evidence()` by default.
         stages: consecutive stages with their own objectives, instead of `objective`, for all steps of the run.
@@ -233,18 +231,18 @@ def fit(
         >>> result.status, result.best_step
         ('finished', 20)
     """
-    loop: dict[str, Any] = {"out": out, "resume": resume, "config": config, "trackers": trackers}
-    loop["callbacks"] = callbacks
+    loop_options: dict[str, Any] = {"out": out, "resume": resume, "config": config, "trackers": trackers}
+    loop_options["callbacks"] = callbacks
     if not isinstance(model, Trainable) and not isinstance(data, Recipe):
-        return _fit(model, data, validation, objective=objective, stages=stages, **loop, **options)
+        return _fit(model, data, validation, objective=objective, stages=stages, **loop_options, **options)
     if objective is not None or stages:
-        raise ValueError("a method or a recipe has its own objective; leave out objective and stages")
+        raise ValueError("a method or a recipe has its own objective; remove objective and stages")
     if not isinstance(model, Trainable):
         if validation is not None:
-            raise ValueError("a recipe has its own validation data; leave out validation")
-        return _fit(model, data.batches, data.validation, **_prepared(data, model, loop | options))
+            raise ValueError("a recipe has its own validation data; remove validation")
+        return _fit(model, data.batches, data.validation, **_prepare_options(data, model, loop_options | options))
     if resume:
-        raise ValueError(f"dvae.resume({os.fspath(out or 'RUN')!r}) continues the run of a method")
+        raise ValueError(f"fit cannot resume the run of a method; use dvae.resume({os.fspath(out or 'RUN')!r})")
     if validation is None and has_splits(data):
         validation = data
     train = as_source(take_split(data, "train"))
@@ -255,31 +253,33 @@ def fit(
     training = replace(model.training(schema), **{name: options.pop(name) for name in names})
     method = model.resolve_defaults(train)
     if out is not None and config is None and hasattr(data, "recorded"):
-        loop["config"] = run_config(method, schema, data.kind, data.recorded())
+        loop_options["config"] = run_config(method, schema, data.kind, data.recorded())
     recipe = method.train(train, take_split(validation, "validation"), training.steps)
     options = vars(training) | options
     with seeded(training.seed):
         module = method.build(schema)
-        told = _prepared(recipe, module, loop | options)
-    return _fit(module, recipe.batches, recipe.validation, **told)
+        fit_options = _prepare_options(recipe, module, loop_options | options)
+    return _fit(module, recipe.batches, recipe.validation, **fit_options)
 
 
-def _prepared(recipe: Recipe, model: nn.Module, options: Mapping[str, Any]) -> dict[str, Any]:
+def _prepare_options(recipe: Recipe, model: nn.Module, options: Mapping[str, Any]) -> dict[str, Any]:
     """Prepare a model for a recipe, unless a run is resumed, and return the options of its fit."""
     steps = sum(stage.steps for stage in recipe.stages)
     if options.get("steps", steps) != steps:
-        raise ValueError(f"this recipe has {steps} steps, not {options['steps']}; ask the method for another")
+        raise ValueError(
+            f"steps is {options['steps']}, but this recipe has {steps} steps; create the recipe with other steps"
+        )
     if options.get("scheduled_sampling", 0.0) != 0.0:
         raise ValueError(
-            f"scheduled sampling is an option of the method, which sets it in its recipe; instead of "
-            f"scheduled_sampling={options['scheduled_sampling']} here write dvae.method(…, scheduled_sampling=…)"
+            f"scheduled_sampling={options['scheduled_sampling']} conflicts with the recipe, which sets it; pass it to "
+            "the method: dvae.method(…, scheduled_sampling=…)"
         )
     if not options["resume"]:
-        run_directory(options["out"], False, {})  # refuses a directory before a preparation that may take long
+        run_directory(options["out"], False, {})  # refuses an invalid directory before a long preparation
         with seeded(None):
             recipe.prepare(model)
-    own = {"steps": steps, "scheduled_sampling": recipe.feeding, "stages": recipe.stages, "objective": None}
-    return {**options, **own}
+    recipe_options = {"steps": steps, "scheduled_sampling": recipe.feeding, "stages": recipe.stages, "objective": None}
+    return {**options, **recipe_options}
 
 
 def _fit(
@@ -305,8 +305,8 @@ def _fit(
     source = as_source(train)
     held_out = None if validation is None else as_batches(validation)
     if training.patience is not None and held_out is None:
-        raise ValueError("patience counts validations; give validation data, or remove patience")
-    # hashing all data takes time, so only for a run that is stored
+        raise ValueError("patience counts validations; pass validation data, or remove patience")
+    # Hashing all data takes time, and only stored runs need it.
     fingerprint = train.fingerprint if out is not None and isinstance(train, Fingerprinted) else None
     record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
     run = run_directory(out, resume, record)
@@ -339,12 +339,12 @@ def _fit(
             store(svi, run)  # even if the run was interrupted at its last step
         observed = None if validation is None else _observed(svi.model, take_split(validation, "validation"))
         _train(svi, source, held_out, observed, run, receivers, callbacks, signals)
-        processes.wait(svi.fabric)  # the caller may read what the first process has written
+        processes.wait(svi.fabric)  # the caller may read the files of the first process
         if state.best is not None:
             model.load_state_dict(state.best)
     path = run.path if run else None
-    told = state.step, state.best_step, state.best_bound, state.status
-    result = Fit(history.rows, *told, path, state.per, model, state.processor_seconds, state.last_value)
+    outcome = state.step, state.best_step, state.best_bound, state.status
+    result = Fit(history.rows, *outcome, path, state.per, model, state.processor_seconds, state.last_value)
     if state.status == "interrupted":
         raise Interrupted(result, signals.received or signal.SIGINT)
     return result
@@ -353,7 +353,7 @@ def _fit(
 def _observed(model: nn.Module, validation: Any) -> int | None:
     """Return the number of observed steps of validation windows with a horizon.
 
-    Return None without a horizon, or if the bound of the model is not of the data as given.
+    Return None without a horizon, or if the model's bound is not of the original data.
     """
     if not isinstance(model, DynamicalVAE) or not model.likelihood or model.view.measured:
         return None
@@ -363,14 +363,18 @@ def _observed(model: nn.Module, validation: Any) -> int | None:
 
 
 def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
-    """Return the run directory; raise if `fit` would overwrite a run, find none, or resume on other data."""
+    """Return the run directory, after checking that `fit` overwrites no run and resumes one on the same data.
+
+    Raises:
+        CheckpointError: when there is a run although `resume` is False, none to resume, or one on other data.
+    """
     run = None if out is None else Run(out)
     if resume and (run is None or not run.exists):
-        raise CheckpointError(f"no run to resume in {out}; give its directory as out=…, or leave out resume=True")
+        raise CheckpointError(f"no run to resume in {out}; pass its directory as out=…, or remove resume=True")
     if run is None or not run.exists:
         return run
     if not resume:
-        lower = " and a lower learning_rate, as it failed" if run.state["status"] == "failed" else ""
+        lower = " and a lower learning_rate, because it failed" if run.state["status"] == "failed" else ""
         raise CheckpointError(
             f"{out} already holds a run; continue it with resume=True{lower}, or choose another directory"
         )
@@ -378,7 +382,7 @@ def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapp
     if before is not None and now is not None and before != now:
         raise CheckpointError(
             f"{run.path} was fitted on other training data: {CONFIG} has the fingerprint {str(before)[:12]}…, these "
-            f"data {now[:12]}…; resume on the same data, or fit anew in another directory"
+            f"data have {now[:12]}…; resume with the same data, or start a new run in another directory"
         )
     return run
 
@@ -412,13 +416,13 @@ def _train(
         except KeyboardInterrupt:  # the step is complete, so the run can stop here
             signals.received = signal.SIGINT
 
-    def asked_to_stop() -> bool:
-        """Return whether a signal has reached any process; share a callback's `stop` among all processes."""
-        asked = torch.tensor([bool(signals.received), state.stop]).int()
-        stopped, state.stop = (svi.total(asked) > 0).tolist()
+    def is_stop_requested() -> bool:
+        """Return whether a signal has reached any process, and share a callback's `stop` among all processes."""
+        flags = torch.tensor([bool(signals.received), state.stop]).int()
+        stopped, state.stop = (svi.total(flags) > 0).tolist()
         return bool(stopped)
 
-    begun = time.process_time() - state.processor_seconds
+    start = time.process_time() - state.processor_seconds
     model: Any = svi.model
     unchecked = isinstance(model, DynamicalVAE) and like(model).dtype is not torch.float64
     while state.status == "running":
@@ -430,19 +434,19 @@ def _train(
         if state.step % training.log_every == 0 or state.step == training.steps:
             report(svi.row())
         call("on_step")
-        stopped = asked_to_stop()
+        stopped = is_stop_requested()
         due = state.step % training.validate_every == 0 or state.step == training.steps or state.stop
         if due and held_out is not None:
             report(svi.validate(held_out))
             if observed is not None and state.last_value is None and "validation/loss" not in state.row:
-                fed = bool(svi.final_feeding) and isinstance(model.feeding, ScheduledSampling)
+                self_fed = bool(svi.final_feeding) and isinstance(model.feeding, ScheduledSampling)
                 state.last_value = last_value_bound(
-                    model, source, held_out, observed, fed=fed, batch_size=training.batch_size
+                    model, source, held_out, observed, fed=self_fed, batch_size=training.batch_size
                 )
             call("on_validation")
-            stopped = asked_to_stop()
+            stopped = is_stop_requested()
         state.status = "interrupted" if stopped else _status(state, training)
-        state.processor_seconds = time.process_time() - begun
+        state.processor_seconds = time.process_time() - start
         if run is not None and (due or state.status != "running"):
             store(svi, run)
     call("on_end")

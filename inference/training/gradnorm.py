@@ -2,7 +2,7 @@
 
 For n tasks with losses L_i, weights w_i and shared parameters W:
 
-    G_i = |grad_W w_i L_i|                                norms of gradients, and Gbar their mean
+    G_i = |grad_W w_i L_i|                                norms of gradients; Gbar is their mean
     r_i = (L_i / L_i(0)) / mean_j (L_j / L_j(0))          relative inverse training rates
     L_grad = sum_i |G_i - Gbar r_i^a|                     with the targets Gbar r_i^a held constant
 
@@ -45,14 +45,14 @@ class GradNorm:
         tasks: names of log-likelihoods and energies, at least two.
         shared: prefix of the names of the parameters W, such as a last layer that all tasks use.
         others: objective that weighs all other terms, including the KL, and sets draws and selection.
-        asymmetry: a, how strongly tasks that train slowly are favoured. At 0, norms of gradients are equalised. Above
-            0, losses must be positive, which negative log densities need not be. The paper uses 0.12, and 1.5 if tasks
-            differ more.
-        learning_rate: learning rate of log w: change per step of a weight with the mean gradient.
+        asymmetry: a, the strength with which slowly training tasks are favoured. At 0, norms of gradients are
+            equalised. Above 0, losses must be positive, which negative log densities need not be. The paper uses 0.12,
+            and 1.5 if tasks differ more.
+        learning_rate: learning rate of log w, the change per step for a task whose gradient has the mean norm.
 
     Raises:
-        ValueError: with fewer than two tasks, or a repeated one; on the first call, if a task is no such term or does
-            not depend on the shared parameters; before training, if the model has no such parameters.
+        ValueError: with fewer than two tasks, or a repeated one; on the first call, if a task is not such a term or
+            does not depend on the shared parameters; before training, if the model has no such parameters.
 
     Example:
         >>> weighing = dvae.GradNorm(("pose", "time"), shared="generator.x.", others=dvae.Evidence(kl_weight=0.01))
@@ -79,7 +79,7 @@ class GradNorm:
 
     @property
     def select(self) -> Literal["bound", "loss"]:
-        """Score by which `others` selects the best weights."""
+        """Score that selects the best weights, as in `others`."""
         return self.others.select
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
@@ -88,11 +88,11 @@ class GradNorm:
 
     def weighted(self, terms: "Terms", step: int, weights: Tensor) -> Tensor:
         """Return the loss with the given weights (tasks,), a scalar."""
-        rest = [
+        other_terms = [
             {name: value for name, value in table.items() if name not in self.tasks}
             for table in (terms.log_likelihood, terms.energies)
         ]
-        loss = self.others(replace(terms, log_likelihood=rest[0], energies=rest[1]), step)
+        loss = self.others(replace(terms, log_likelihood=other_terms[0], energies=other_terms[1]), step)
         for weight, task in zip(weights.tolist(), self.losses(terms), strict=True):
             loss = loss + weight * task
         return loss
@@ -103,7 +103,7 @@ class GradNorm:
         if unknown := [task for task in self.tasks if task not in costs]:
             raise ValueError(
                 f"tasks names {', '.join(map(repr, unknown))}, but the log-likelihoods and energies are "
-                f"{', '.join(costs) or 'none'}; others sets the weights of all other terms"
+                f"{', '.join(costs) or 'none'}; set the weights of all other terms in others"
             )
         return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
 
@@ -112,13 +112,15 @@ class GradNorm:
         trained = {name: value for name, value in model.named_parameters() if value.requires_grad}
         shared = [value for name, value in trained.items() if name.startswith(self.shared)]
         if not shared:
-            raise ValueError(f"no parameter's name starts with {self.shared!r} (shared); they are {', '.join(trained)}")
+            raise ValueError(
+                f"no parameter's name starts with {self.shared!r} (shared); the parameters are {', '.join(trained)}"
+            )
         return Balance(self, shared)
 
     def to_config(self) -> dict[str, Any]:
         """Return the objective as a JSON object."""
-        own = vars(self) | {"tasks": list(self.tasks), "others": self.others.to_config()}
-        return {"objective": "GradNorm"} | own
+        config = vars(self) | {"tasks": list(self.tasks), "others": self.others.to_config()}
+        return {"objective": "GradNorm"} | config
 
 
 class Balance:
@@ -151,7 +153,7 @@ class Balance:
         """Update the weights, for the loss of the next step.
 
         Raises:
-            ValueError: when a loss has no training rate.
+            ValueError: when the training rate of a loss is not defined, because the loss is not positive.
         """
         norms = torch.linalg.vector_norm(mean(self._gradients), dim=1, dtype=torch.float64)
         losses, norms = torch.stack([mean(self._losses).double(), norms]).cpu()  # one copy, one synchronisation
@@ -159,8 +161,8 @@ class Balance:
         for task, start, now in zip(self.objective.tasks, first.tolist(), losses.tolist(), strict=True):
             if asymmetry and (start <= 0 or now < 0):
                 raise ValueError(
-                    f"the loss of {task} is {now:.4g}, {start:.4g} at first. Its training rate needs a ratio of "
-                    "losses above 0; give asymmetry=0, which needs none"
+                    f"the loss of {task} is {now:.4g}, and was {start:.4g} at first, but training rates need positive "
+                    "losses; set asymmetry=0, which does not use training rates"
                 )
         self.first = first
         smallest = torch.finfo(torch.float64).tiny  # if all losses or all gradients are 0
@@ -181,9 +183,9 @@ class Balance:
     @property
     def state(self) -> dict[str, Tensor]:
         """Weights, and the losses of the first step."""
-        named = {"weight": self.weights, "first": self.first}
+        values = {"weight": self.weights, "first": self.first}
         return {
-            f"{name}/{task}": value[i] for name, value in named.items() for i, task in enumerate(self.objective.tasks)
+            f"{name}/{task}": value[i] for name, value in values.items() for i, task in enumerate(self.objective.tasks)
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
@@ -195,19 +197,23 @@ class Balance:
         tasks = self.objective.tasks
         weights, first = (torch.stack([state[f"{name}/{task}"] for task in tasks]) for name in ("weight", "first"))
         if not (weights > 0).all() or abs(weights.sum() - len(tasks)) > 1e-6:
-            raise ValueError(f"the weights of {', '.join(tasks)} are not positive numbers with the sum {len(tasks)}")
+            raise ValueError(f"the weights of {', '.join(tasks)} must be positive numbers with the sum {len(tasks)}")
         self.weights, self.first = weights, first
 
     def _gradient(self, task: str, loss: Tensor) -> Tensor:
-        """Return the gradient of a task's loss with respect to W, flat; zeros if this batch's loss is a constant."""
-        none = [torch.zeros_like(value) for value in self.shared]
-        found = (
-            torch.autograd.grad(loss, self.shared, retain_graph=True, allow_unused=True) if loss.requires_grad else none
+        """Return the flat gradient of a task's loss with respect to W; zeros if the loss of this batch is constant."""
+        zeros = [torch.zeros_like(value) for value in self.shared]
+        gradients_or_none = (
+            torch.autograd.grad(loss, self.shared, retain_graph=True, allow_unused=True)
+            if loss.requires_grad
+            else zeros
         )
-        if all(gradient is None for gradient in found):
+        if all(gradient is None for gradient in gradients_or_none):
             raise ValueError(
-                f"the loss of {task} has no gradient by the parameters whose names start with "
-                f"{self.objective.shared!r} (shared); name parameters that all tasks use"
+                f"the loss of {task} does not depend on the parameters whose names start with "
+                f"{self.objective.shared!r} (shared); choose parameters that all tasks use"
             )
-        gradients = [zero if gradient is None else gradient for gradient, zero in zip(found, none, strict=True)]
+        gradients = [
+            zero if gradient is None else gradient for gradient, zero in zip(gradients_or_none, zeros, strict=True)
+        ]
         return torch.cat([gradient.flatten() for gradient in gradients])

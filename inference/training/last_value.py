@@ -5,9 +5,10 @@
 v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. For a model that reads the true
 past, the reference is this density given all steps before t.
 
-A model trained with scheduled sampling reads its own means. In its reference, observed steps have their mean and
-variance over training windows, and x_s is the last observed value at all future steps. A discrete value has the
-probability of the interval around it. A class has the probability that it does not change.
+A model trained with scheduled sampling reads its own means. Its reference uses the mean and variance over training
+windows for observed steps, and the last observed value as x_s for all future steps. A discrete value has the
+probability of the interval around it. The last class has the probability of no change, and all other classes share the
+rest equally.
 """
 
 from __future__ import annotations
@@ -38,32 +39,32 @@ def last_value_bound(
     """Return the log density of validation windows under the last-value forecast, in nats per frame.
 
     Args:
-        model: model whose view defines the first frames that no bound scores, and whose distributions define which
+        model: model. Its view defines the number of first frames without a score, and its distributions define which
             coordinates are discrete.
         train: training windows, for the variances of differences.
         validation: windows to score.
         observed: O, number of steps before the horizon.
-        fed: whether the model reads its own means instead of the true steps.
+        fed: whether the model reads its own means instead of the true past.
         batch_size: number of windows in a batch.
     """
     classes, discrete = _discrete(model)
     mean, spreads = _spreads(*_values(train.sample(WINDOWS, torch.Generator().manual_seed(0))), classes, discrete)
     total, frames = 0.0, 0
     for batch in validation.batches(batch_size):
-        x, seen = _values(batch)
+        x, mask = _values(batch)
         steps = torch.arange(x.shape[1])
-        known = torch.where(seen, steps[:, None], -1).cummax(1).values  # last observed step up to each step
+        last_observed = torch.where(mask, steps[:, None], -1).cummax(1).values  # last observed step up to each step
         before = torch.where(steps < observed, -1, observed - 1) if fed else steps - 1
-        source = torch.where(before[:, None] < 0, -1, known[:, before.clamp(min=0)])
+        source = torch.where(before[:, None] < 0, -1, last_observed[:, before.clamp(min=0)])
         lag = torch.where(source < 0, 0, steps[:, None] - source).clamp(max=len(spreads) - 1)
-        away = x - torch.where(source < 0, mean, x.gather(1, source.clamp(min=0)))
+        errors = x - torch.where(source < 0, mean, x.gather(1, source.clamp(min=0)))
         spread = spreads.gather(0, lag.flatten(0, 1)).view_as(x)
-        entries = _log_density(away, spread, discrete)
-        for places in classes:
-            stays, same = spread[..., places[0]], (away[..., places] == 0).all(-1)
-            entries[..., places] = 0.0
-            entries[..., places[0]] = torch.where(same, stays, (1 - stays) / (len(places) - 1)).log()
-        total += float(entries.masked_fill(~seen, 0.0)[:, model.view.past :].sum())
+        entries = _log_density(errors, spread, discrete)
+        for columns in classes:
+            unchanged, same = spread[..., columns[0]], (errors[..., columns] == 0).all(-1)
+            entries[..., columns] = 0.0
+            entries[..., columns[0]] = torch.where(same, unchanged, (1 - unchanged) / (len(columns) - 1)).log()
+        total += float(entries.masked_fill(~mask, 0.0)[:, model.view.past :].sum())
         lengths = Batch(batch).lengths
         frames += len(x) * (x.shape[1] - model.view.past) if lengths is None else int(lengths.sum())
     return total / frames
@@ -75,52 +76,52 @@ def _discrete(model: DynamicalVAE) -> tuple[list[list[int]], Tensor]:
         return [], torch.tensor(False)
     conditional = model.generator[WHOLE]
     parts = getattr(conditional.support, "parts", [(range(conditional.size), conditional.support)])
-    found = [(list(places), own) for places, own in parts if own is not None and own.is_discrete]
+    groups = [(list(columns), support) for columns, support in parts if support is not None and support.is_discrete]
     discrete = torch.zeros(conditional.size, dtype=torch.bool)
-    for places, own in found:
-        discrete[places] = not isinstance(own, _ONE_HOT)
-    return [places for places, own in found if isinstance(own, _ONE_HOT)], discrete
+    for columns, support in groups:
+        discrete[columns] = not isinstance(support, _ONE_HOT)
+    return [columns for columns, support in groups if isinstance(support, _ONE_HOT)], discrete
 
 
-def _spreads(x: Tensor, seen: Tensor, classes: Sequence[list[int]], discrete: Tensor) -> tuple[Tensor, Tensor]:
+def _spreads(x: Tensor, mask: Tensor, classes: Sequence[list[int]], discrete: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean (D,) and standard deviations (T, D).
 
-    Row 0 is for deviations from the mean, row h for differences over h steps. For a class, the first coordinate has the
-    probability of each class in row 0, and the probability of no change in later rows.
+    Row 0 is for deviations from the mean, row h for differences over h steps. For a class variable, the first
+    coordinate instead contains the probability of each class in row 0, and the probability of no change in later rows.
     """
-    count = seen.sum((0, 1)).clamp(min=1)
+    count = mask.sum((0, 1)).clamp(min=1)
     mean = x.sum((0, 1)) / count
-    scale = (torch.where(seen, x - mean, 0.0).square().sum((0, 1)) / count).sqrt().clamp(min=1e-6)
+    scale = (torch.where(mask, x - mean, 0.0).square().sum((0, 1)) / count).sqrt().clamp(min=1e-6)
     rows = [scale]
     for lag in range(1, x.shape[1]):
-        both = seen[:, lag:] & seen[:, :-lag]
-        away = torch.where(both, x[:, lag:] - x[:, :-lag], 0.0)
+        both = mask[:, lag:] & mask[:, :-lag]
+        differences = torch.where(both, x[:, lag:] - x[:, :-lag], 0.0)
         pairs = both.sum((0, 1))
-        row = torch.where(pairs > 0, (away.square().sum((0, 1)) / pairs.clamp(min=1)).sqrt(), rows[-1])
+        row = torch.where(pairs > 0, (differences.square().sum((0, 1)) / pairs.clamp(min=1)).sqrt(), rows[-1])
         row = torch.maximum(row, _FLOOR * scale)
-        for places in classes:
-            same = ((away[..., places] == 0).all(-1) & both[..., places[0]]).sum()
-            row[places[0]] = (same + 1) / (pairs[places[0]] + 2)
+        for columns in classes:
+            same = ((differences[..., columns] == 0).all(-1) & both[..., columns[0]]).sum()
+            row[columns[0]] = (same + 1) / (pairs[columns[0]] + 2)
         rows.append(row)
-    for places in classes:
-        rows[0][places[0]] = 1 / len(places)
+    for columns in classes:
+        rows[0][columns[0]] = 1 / len(columns)
     return mean, torch.stack([torch.where(discrete, row.clamp(min=0.1), row) for row in rows])
 
 
-def _log_density(away: Tensor, spread: Tensor, discrete: Tensor) -> Tensor:
-    """Return the log density of each entry at its distance from the location; for a discrete one, of its interval."""
-    density = -0.5 * (away / spread).square() - spread.log() - 0.5 * math.log(2 * math.pi)
+def _log_density(errors: Tensor, spread: Tensor, discrete: Tensor) -> Tensor:
+    """Return the log density of errors; for a discrete coordinate, the log probability of the interval around it."""
+    density = -0.5 * (errors / spread).square() - spread.log() - 0.5 * math.log(2 * math.pi)
     if not discrete.any():
         return density
-    ends = [torch.special.ndtr((away + end) / spread) for end in (-0.5, 0.5)]
+    ends = [torch.special.ndtr((errors + end) / spread) for end in (-0.5, 0.5)]
     return torch.where(discrete, (ends[1] - ends[0]).clamp(min=1e-12).log(), density)
 
 
-def _values(given: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+def _values(data: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """Return x (B, T, D) in double precision and the mask of its observed entries."""
-    batch = Batch(given)
+    batch = Batch(data)
     x, mask = torch.as_tensor(batch[WHOLE]).double().cpu(), batch.mask()
-    seen = torch.ones_like(x, dtype=torch.bool) if mask is None else torch.as_tensor(mask).cpu()
+    observed = torch.ones_like(x, dtype=torch.bool) if mask is None else torch.as_tensor(mask).cpu()
     if batch.lengths is not None:
-        seen = seen & valid_steps(torch.as_tensor(batch.lengths).cpu(), x.shape[1])[..., None]
-    return torch.where(seen, x, 0.0), seen
+        observed = observed & valid_steps(torch.as_tensor(batch.lengths).cpu(), x.shape[1])[..., None]
+    return torch.where(observed, x, 0.0), observed

@@ -4,9 +4,9 @@ An objective is a function of `Terms` and the global step. `Evidence` is the neg
 on each KL term (warm-up; Bowman et al. 2016, arXiv 1511.06349; beta-VAE, Higgins et al. 2017) and free bits (Kingma et
 al. 2016, arXiv 1606.04934). The weights never change the recorded bound: model selection reads `Terms.bound`.
 
-An objective with a state, such as adaptive weights (`gradnorm`), is `AdaptiveObjective`: a description without state.
-Each stage of a run turns it into an `StatefulObjective` objective. The state belongs to the run and its checkpoints, so
-two runs may share one description.
+An objective with adaptive weights (`gradnorm`) is described by an `AdaptiveObjective` without state. Each stage of a
+run creates a `StatefulObjective` from it. The state belongs to the run and its checkpoints, so two runs may share one
+description.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -51,7 +51,7 @@ class StatefulObjective(Objective, Protocol):
 
     @property
     def state(self) -> Mapping[str, Tensor]:
-        """All values that later calls depend on, by name. They are finite and keep their names, shapes and types."""
+        """All values that later calls depend on, by name; finite, with constant names, shapes and types."""
 
     @property
     def row(self) -> Mapping[str, float]:
@@ -61,7 +61,7 @@ class StatefulObjective(Objective, Protocol):
         """Compute gradients of a batch before the backward pass; the graph must be retained."""
 
     def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
-        """Update the state, after the backward pass and before the optimiser's step, once that step is certain.
+        """Update the state after the backward pass and its checks, and before the optimiser's step.
 
         Args:
             mean: function that averages a tensor over the processes; every process must call it.
@@ -73,7 +73,7 @@ class StatefulObjective(Objective, Protocol):
 
 @runtime_checkable
 class AdaptiveObjective(Protocol):
-    """Objective whose state starts anew in each stage; a direct call gives the losses that validation compares."""
+    """Objective whose state is reset at each stage; called directly, it returns losses that can be compared."""
 
     def begin(self, model: nn.Module) -> StatefulObjective:
         """Return the objective with its state for a stage; raise ValueError if the model does not fit."""
@@ -86,8 +86,8 @@ class Evidence:
     Division by the number of frames F makes learning rates independent of sequence length. With sums over the sequences
     of the batch,
 
-        loss = - weight * sum log p / F + sum_latents weight * max(KL / F, free bits) + sum_energies weight * energy /
-        F.
+        loss = - weight * sum log p / F + sum_latents weight * max(KL / F, free bits)
+               + sum_energies weight * energy / F.
 
     Args:
         kl_weight: weight of the KL terms, a number or a schedule; or one for each latent by name (default 1).
@@ -95,7 +95,8 @@ class Evidence:
             latents, or one for each latent by name (default 0).
         energy_weights: weight of each energy by name (default 1).
         likelihood_weight: weight of the log-likelihood. If energies train the locations and the likelihood only the
-            scales, a small weight leaves the loss to the energies; an adaptive optimiser fits the scales at any weight.
+            scales, use a small weight so that energies dominate the loss; an adaptive optimiser fits the scales at any
+            weight.
         draws: number of draws of a latent for each sequence, by name. Energies that compare samples, such as best of
             many, need several (see `DynamicalVAE.model`). The terms of the bound are means over the draws.
         select: score that selects the best weights: the unweighted "bound", or the "loss" if energies are trained.
@@ -116,7 +117,7 @@ class Evidence:
 
     def __post_init__(self) -> None:
         if self.select not in ("bound", "loss"):
-            raise ValueError(f"select is {self.select!r}; it must be 'bound' or 'loss'")
+            raise ValueError(f"select must be 'bound' or 'loss', got {self.select!r}")
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
         """Return the loss, a scalar."""
@@ -128,7 +129,7 @@ class Evidence:
         loss = -self.likelihood_weight * likelihood / frames
         for latent, kl in terms.kl.items():
             rate = kl.sum() / frames
-            if free_bits[latent] > 0:  # no floor at zero: an unbiased estimate of a KL may be negative
+            if free_bits[latent] > 0:  # without free bits no clamp: an unbiased estimate of a KL may be negative
                 rate = rate.clamp(min=free_bits[latent])
             loss = loss + schedule(kl_weight[latent])(step) * rate
         for name, energy in terms.energies.items():

@@ -20,24 +20,24 @@ class Training:
         steps: total number of optimiser steps.
         batch_size: number of sequences in a batch, in each process.
         learning_rate: step size of the optimiser, a number or a schedule.
-        decay: last share of the run over which a constant learning rate falls linearly to 0; a resumed run with more
-            steps falls later.
+        decay: last share of the run, over which a constant learning rate falls linearly to 0. In a resumed run with
+            more steps, the fall begins later.
         optimizer: "adam", "adamw" or "sgd".
-        momentum: momentum of "sgd", the share of the last step added to the next one.
+        momentum: momentum of "sgd", the share of the last step that is added to the next one.
         weight_decay: the optimiser's weight decay.
         gradient_clip: largest norm of the gradient of the loss (nats per frame); None for no limit.
-        scheduled_sampling: probability that a frame of x's history is replaced by the program's own mean (scheduled
+        scheduled_sampling: probability that a frame of x's history is replaced by the model's own mean (scheduled
             sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. For a model trained on noisy inputs
-            (`InputNoise`), the share of that noise. The best weights are then selected with this feeding, once the
-            schedule has reached its last value.
+            (`InputNoise`), the share of that noise. Validation then uses the last value of the schedule, and the best
+            weights are selected once the schedule has reached it.
         particles: number of draws from the guide for each sequence and step.
         validate_every: number of steps between validations and checkpoints.
         patience: number of validations without a better bound before the run stops; None to run all steps.
         log_every: number of steps between rows of the log.
         seed: seed of batches and latent draws; each of several processes derives its own seed from it.
-        accelerator: where to run: "auto", "cpu", "gpu", "cuda" or "mps".
-        devices: number of devices, with one process each; under torchrun, the number of processes that it started.
-        precision: precision of the computation; "32-true" leaves the model's own.
+        accelerator: kind of device: "auto", "cpu", "gpu", "cuda" or "mps".
+        devices: number of devices, with one process each; under torchrun, the number of processes on this host.
+        precision: precision of the computation; "32-true" keeps the model's own.
         progress: whether to show the terms on the terminal.
 
     Raises:
@@ -76,12 +76,9 @@ class Training:
                 if value not in allowed:
                     raise ValueError(f"{name} is {value}; it must be {allowed}")
         if self.momentum and self.optimizer != "sgd":
-            raise ValueError(f"momentum is an option of sgd, and {self.optimizer} has its own; set momentum to 0")
+            raise ValueError(f"momentum is an option of sgd, but the optimizer is {self.optimizer}; set momentum to 0")
         if self.decay and isinstance(self.learning_rate, Schedule):
-            raise ValueError(
-                "decay needs a constant learning rate, but learning_rate is a schedule, which decays already; set "
-                "decay to 0"
-            )
+            raise ValueError("decay needs a constant learning rate, but learning_rate is a schedule; set decay to 0")
 
     @property
     def rate(self) -> Schedule:
@@ -94,7 +91,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Stage:
-    """Part of a run with its own objective, for training in phases. Schedules still read the global step.
+    """Part of a run with its own objective, for training in phases. Schedules use the global step.
 
     Args:
         steps: number of steps in the stage.
@@ -119,12 +116,12 @@ class Stage:
 
     def __post_init__(self) -> None:
         if isinstance(self.objective, type):
-            raise TypeError(f"the objective is {kind_of(self.objective)}; expected an instance such as dvae.Evidence()")
+            raise TypeError(f"objective must be an instance such as dvae.Evidence(), got {kind_of(self.objective)}")
         if self.steps < 1:
-            raise ValueError(f"a stage has {self.steps} steps; it needs at least 1")
+            raise ValueError(f"a stage needs at least 1 step, got {self.steps}")
         for value in () if self.curriculum is None else levels(self.curriculum):
             if value not in Range(0, 1):
-                raise ValueError(f"the curriculum of a stage must be from 0 to 1, got {value}")
+                raise ValueError(f"the curriculum of a stage must be between 0 and 1, got {value}")
 
 
 def plan_stages(
@@ -136,18 +133,18 @@ def plan_stages(
         TypeError: when `Training` has no such option.
         ValueError: when both an objective and stages are given, or `steps` differs from the total of the stages.
     """
-    known = [option.name for option in fields(Training)]
+    names = [option.name for option in fields(Training)]
     for name in options:
-        if name not in known:
-            raise TypeError(f"fit has no option {name!r}{nearest(name, known)}; the options are {', '.join(known)}")
+        if name not in names:
+            raise TypeError(f"fit has no option {name!r}{nearest(name, names)}; the options are {', '.join(names)}")
     training = Training(**options)
     if not stages:
         stages = [Stage(training.steps, Evidence() if objective is None else objective)]
     elif objective is not None:
-        raise ValueError("give either objective or stages: each stage has its own objective")
+        raise ValueError("pass either objective or stages, because each stage has its own objective")
     total = sum(stage.steps for stage in stages)
     if "steps" in options and training.steps != total:
-        raise ValueError(f"steps is {training.steps}, but the stages take {total} steps; leave steps out")
+        raise ValueError(f"steps is {training.steps}, but the stages take {total} steps; remove steps")
     plan: list[Stage] = []
     end = last = total
     for stage, following in zip(reversed(stages), [None, *reversed(stages[1:])], strict=True):
@@ -160,7 +157,7 @@ def plan_stages(
 
 
 def stage_at(plan: Sequence[Stage], step: int) -> tuple[int, Stage]:
-    """Return the first step and the stage of a global step; after the last step, of the last stage."""
+    """Return the first step and the stage of a global step; the last stage after the last step."""
     first = 0
     for stage in plan[:-1]:
         if step < first + stage.steps:
@@ -174,7 +171,7 @@ def recorded(training: Training, plan: Sequence[Stage]) -> dict[str, Any]:
 
     def config(stage: Stage) -> dict[str, Any]:
         objective = stage.objective
-        said = getattr(objective, "to_config", objective.__repr__)()
-        return to_config(vars(stage) | {"objective": said})
+        description = getattr(objective, "to_config", objective.__repr__)()
+        return to_config(vars(stage) | {"objective": description})
 
     return {"training": to_config(vars(training)), "stages": [config(stage) for stage in plan]}

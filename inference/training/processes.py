@@ -1,8 +1,8 @@
-"""Training in several processes on one machine or many: exchange of gradients, and errors when a process is lost.
+"""Training in several processes, on one machine or several: exchange of gradients, and errors if a process is lost.
 
 Each process draws its own batches (synchronous data parallelism). Before a step of the optimiser, gradients are
-averaged, as if one process had all these batches. They are sent together with the loss in one message: models are
-small, so the number of messages costs more than their size. torch's own wrapper sends gradients in buckets, copies
+averaged, as if one process had all these batches. They are sent together with the loss in one message, because models
+are small and the number of messages costs more than their size. torch's own wrapper sends gradients in buckets, copies
 buffers at every pass, and refuses a parameter without a gradient.
 
 lightning-fabric starts the processes on one machine, torchrun those on several (`docs/scaling.md`).
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
 LONGEST_WAIT = timedelta(minutes=10)
 """Time limit for a process that does not answer, for example after a network failure.
 
-A process that has ended is noticed at once.
+A process that has ended is detected at once.
 """
 
 
 class LostProcess(RuntimeError):
-    """Another process of the run has ended, or does not answer."""
+    """Error if another process of the run has ended, or does not answer."""
 
 
 def launch(training: Training) -> "Fabric":
     """Start the processes of a run, or join those that torchrun has started.
 
     Raises:
-        ValueError: when torchrun has started another number of processes than `devices`, when the program is in no file
-            and cannot be started again, or when the accelerator is not available.
+        ValueError: when the number of processes that torchrun has started differs from `devices`, the program is not in
+            a file and cannot be started again, or the accelerator is not available.
     """
     _check(training)
     from lightning_fabric import Fabric  # the import takes over a second, half the time of `import dvae`
@@ -51,13 +51,13 @@ def launch(training: Training) -> "Fabric":
         def setup_module(self, module: nn.Module) -> nn.Module:  # type: ignore[override]
             return module
 
-    here, hosts = _places(training.devices)
+    local_processes, hosts = _count_processes(training.devices)
     fabric: Fabric = Fabric(
         accelerator=training.accelerator,
-        devices=here,
+        devices=local_processes,
         num_nodes=hosts,
         precision=training.precision,
-        strategy=Unwrapped(timeout=LONGEST_WAIT) if here * hosts > 1 else "auto",
+        strategy=Unwrapped(timeout=LONGEST_WAIT) if local_processes * hosts > 1 else "auto",
     )
     fabric.launch()
     if fabric.world_size > 1:
@@ -74,7 +74,7 @@ def is_torchrun() -> bool:
 def is_restartable() -> bool:
     """Return whether torchrun restarts the processes when one of them has ended (`--max-restarts`).
 
-    torchrun counts restarts, except those that another host has asked for.
+    torchrun does not count restarts that another host has requested.
     """
     return is_torchrun() and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
 
@@ -92,9 +92,9 @@ def sum_over_processes(fabric: "Fabric", value: Tensor) -> Tensor:
 def average_gradients(
     fabric: "Fabric", parameters: Sequence[nn.Parameter], loss: Tensor, frames: Tensor
 ) -> tuple[Tensor, Tensor | float]:
-    """Average gradients over processes, as for one batch of all their sequences with a loss per frame.
+    """Average gradients over processes, weighted by frames, as for one batch of the sequences of all processes.
 
-    A parameter keeps no gradient if it has none in any process.
+    A parameter without a gradient in every process still has none.
 
     Args:
         fabric: fabric of the processes.
@@ -107,23 +107,25 @@ def average_gradients(
     """
     if fabric.world_size == 1:
         return loss.detach(), 1.0
-    had = [parameter.grad is not None for parameter in parameters]
-    given = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-    numbers = torch.tensor([1.0, *had], device=loss.device)
-    own = torch.cat([loss.detach()[None], numbers, *(gradient.flatten() for gradient in given)])
-    joint = _all_reduce(own.mul_(frames))
+    has_gradient = [parameter.grad is not None for parameter in parameters]
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+    numbers = torch.tensor([1.0, *has_gradient], device=loss.device)
+    message = torch.cat([loss.detach()[None], numbers, *(gradient.flatten() for gradient in gradients)])
+    joint = _all_reduce(message.mul_(frames))
     all_frames = joint[1].clone()
-    whole, _, has, *means = joint.div_(all_frames).split([1, 1, len(had), *(p.numel() for p in parameters)])
-    anywhere = had if all(had) else (has > 0).tolist()
-    for parameter, mean, there in zip(parameters, means, anywhere, strict=True):
-        parameter.grad = mean.view_as(parameter).to(parameter.dtype) if there else None
-    return whole[0], frames / all_frames
+    total_loss, _, counts, *means = joint.div_(all_frames).split(
+        [1, 1, len(has_gradient), *(p.numel() for p in parameters)]
+    )
+    has_any_gradient = has_gradient if all(has_gradient) else (counts > 0).tolist()
+    for parameter, mean, has_any in zip(parameters, means, has_any_gradient, strict=True):
+        parameter.grad = mean.view_as(parameter).to(parameter.dtype) if has_any else None
+    return total_loss[0], frames / all_frames
 
 
 def broadcast_values(fabric: "Fabric", values: Iterable[Tensor]) -> None:
     """Copy the first process's values to every process, in place."""
     if fabric.world_size > 1:
-        with _answered():
+        with _lost_process_errors():
             for value in values:
                 sent = value.contiguous()
                 distributed.broadcast(sent, src=0)
@@ -139,51 +141,55 @@ def gather(fabric: "Fabric", value: Tensor) -> Tensor:
 
 def wait(fabric: "Fabric") -> None:
     """Wait until every process has reached this call."""
-    with _answered():
+    with _lost_process_errors():
         fabric.barrier()
 
 
 def _all_reduce(value: Tensor) -> Tensor:
     """Replace a value by its sum over the processes, and return it."""
-    with _answered():
-        distributed.all_reduce(value)  # fabric's own adds a barrier, which is one more message
+    with _lost_process_errors():
+        distributed.all_reduce(value)  # fabric's version adds a barrier, which is one more message
     return value
 
 
 def _check(training: Training) -> None:
-    """Refuse an unavailable accelerator, and several processes of a program that cannot be started again."""
+    """Refuse an unavailable accelerator, and several processes for a program that cannot be started again."""
     accelerator, devices = training.accelerator, training.devices
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    there["gpu"] = any(there.values())
-    if not there.get(accelerator, True):
-        found = f"torch {torch.__version__} finds none here"
-        raise ValueError(f"accelerator is {accelerator!r}, but {found}; 'auto' uses an available one")
+    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    available["gpu"] = any(available.values())
+    if not available.get(accelerator, True):
+        raise ValueError(
+            f"accelerator is {accelerator!r}, but torch {torch.__version__} finds none on this machine; 'auto' uses an "
+            "available one"
+        )
     if devices > 1 and not is_torchrun() and sys.argv[0] in ("", "-", "-c"):
         raise ValueError(
-            f"devices={devices} starts as many copies of the program, but it is in no file; write it to one"
+            f"devices={devices} starts {devices} copies of the program, which must be in a file; write it to a file"
         )
 
 
-def _places(devices: int) -> tuple[int, int]:
+def _count_processes(devices: int) -> tuple[int, int]:
     """Return the numbers of processes on this host and of hosts."""
     if not is_torchrun():
         return devices, 1
-    here, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
-    if devices not in (1, here):
-        raise ValueError(f"devices is {devices}, but torchrun has started {here} processes here; remove devices")
-    return here, all_processes // here
+    local_processes, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
+    if devices not in (1, local_processes):
+        raise ValueError(
+            f"devices is {devices}, but torchrun has started {local_processes} processes on this host; remove devices"
+        )
+    return local_processes, all_processes // local_processes
 
 
 @contextmanager
-def _answered() -> Iterator[None]:
-    """Raise `LostProcess` for errors of communication, as torch's messages only name the connection."""
+def _lost_process_errors() -> Iterator[None]:
+    """Raise `LostProcess` for errors of communication, because torch's messages only name the connection."""
     try:
         yield
     except RuntimeError as error:
         minutes = LONGEST_WAIT.total_seconds() / 60
         raise LostProcess(
-            f"another process of this run has ended, or has not answered for {minutes:g} minutes; its own output gives "
-            "the reason. Resume the run with as many processes to continue from its last checkpoint"
+            f"another process of this run has ended, or has not answered for {minutes:g} minutes; see its output for "
+            "the reason. Resume the run with the same number of processes to continue from its last checkpoint"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Recipes, which describe how to train a model on data, and methods, which build a model and its recipe."""
+"""Recipes, which describe the training of a model on data, and methods, which build a model and its recipe."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ FORMAT = 2
 """Format version of the config of a run."""
 
 
-def _as_it_is(model: nn.Module) -> None:
+def _do_nothing(model: nn.Module) -> None:
     """Leave the model unchanged."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Description of how a model is trained; `dvae.fit(model, recipe)` follows it.
+    """Description of a model's training, which `dvae.fit(model, recipe)` follows.
 
     Args:
         batches: source of training batches, with everything that the objective needs.
         validation: validation data for selecting the best weights, or None.
         stages: consecutive stages, each with its objective.
         feeding: probability of scheduled sampling over the run, or share of the noise (see `Training`).
-        prepare: called before fitting; stores statistics of the training data in the model.
+        prepare: function of the model that is called before fitting, for example to store statistics of the training
+            data in it.
     """
 
     batches: Source
     validation: Any
     stages: Sequence[Stage]
     feeding: Schedule | float = 0.0
-    prepare: Callable[[Any], None] = _as_it_is
+    prepare: Callable[[Any], None] = _do_nothing
 
     @property
     def objective(self) -> Objective:
@@ -50,7 +51,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Trainable:
-    """Base class of methods: builds a model for data and describes its training. Its fields are its options.
+    """Base class of methods, which build a model for data and describe its training. The fields are the options.
 
     A subclass implements `build` and `train`, and `resolve_defaults` if an option may be left open.
 
@@ -69,14 +70,14 @@ class Trainable:
         check(self)
 
     def resolve_defaults(self, data: Any) -> Self:
-        """Return a copy whose open options are chosen for these data, or the method itself if none is open."""
+        """Return a copy whose open options are set for these data, or the method itself if no option is open."""
         return self
 
     def build(self, data: Any) -> nn.Module:
         """Build the model for data: windows, a `Schema`, or sizes by name such as {"x": 60}.
 
         Raises:
-            SchemaError: when the model needs to know more about the data.
+            SchemaError: when the model needs more information about the data.
         """
         raise NotImplementedError
 
@@ -89,10 +90,10 @@ class Trainable:
         return self.trainings.get(Schema.of(data).preset, self.trainings[""])
 
     def check(self) -> None:
-        """Refuse options that do not fit together, before any data are read.
+        """Refuse options that conflict, before any data are read.
 
         Raises:
-            ValueError: naming the options that conflict.
+            ValueError: with the names of the options that conflict.
         """
         with suppress(SchemaError):
             self.build(Schema({"x": 1}))

@@ -52,8 +52,8 @@ class _Rise:
         if self.steps < 1 or self.delay < 0:
             name = type(self).__name__
             raise ValueError(
-                f"{name} got steps={self.steps}, delay={self.delay}; it needs steps of at least 1 and a "
-                "delay of at least 0. Use Constant for a value that does not change."
+                f"{name} needs steps of at least 1 and a delay of at least 0, got steps={self.steps} and "
+                f"delay={self.delay}; use Constant for a value that does not change"
             )
 
     def __call__(self, step: int) -> float:
@@ -106,8 +106,7 @@ class Logistic(_Rise):
 class Saturating(_Rise):
     """Exponential saturation from `start` to `end`: 1 - e^{-steepness s} at a share s of the steps, rescaled.
 
-    The first n steps of a weight 1 - q^step, which has no end, are `Saturating(0.0, 1 - q**n, n, steepness=-n *
-    log(q))`.
+    The first n steps of the endless schedule 1 - q^step are `Saturating(0.0, 1 - q**n, n, steepness=-n * log(q))`.
 
     Args:
         start: value before and at `delay`.
@@ -139,9 +138,9 @@ class Piecewise:
     def __post_init__(self) -> None:
         points = tuple((int(step), float(value)) for step, value in self.points)
         if not all(math.isfinite(value) for _, value in points):
-            raise ValueError(f"Piecewise got the points {points}; all its values must be finite")
+            raise ValueError(f"all values of Piecewise must be finite, got the points {points}")
         if not points or any(later[0] < earlier[0] for earlier, later in pairwise(points)):
-            raise ValueError(f"Piecewise got the points {points}; it needs at least one, in the order of their steps")
+            raise ValueError(f"Piecewise needs at least one point, and points in the order of steps, got {points}")
         object.__setattr__(self, "points", points)
 
     def __call__(self, step: int) -> float:
@@ -176,7 +175,7 @@ def schedule(value: float | Schedule) -> Schedule:
 
 
 def levels(value: float | Schedule) -> tuple[float, ...]:
-    """Return values whose range, ends included, contains all values of a number or schedule."""
+    """Return values whose closed range contains all values of a number or schedule."""
     match schedule(value):
         case Constant(level):
             return (level,)
@@ -198,7 +197,7 @@ def clamp(value: Any, steps: int, name: str = "") -> Any:
             return value
         clamped = _compress(value, steps)
         warnings.warn(
-            f"the schedule{name and ' of '}{name} needs {end} steps, and training has {steps}: "
+            f"the schedule{name and ' of '}{name} needs {end} steps, but training has {steps}: "
             f"it is shortened to {steps}"
         )
         return clamped
@@ -263,7 +262,7 @@ def from_config(config: Any) -> Any:
     """Return the value that `to_config` converted.
 
     Raises:
-        ValueError: when "schedule" names no schedule, or its arguments do not fit.
+        ValueError: when "schedule" is not the name of a schedule, or its arguments do not fit.
     """
     if isinstance(config, list | tuple):
         return tuple(from_config(item) for item in config)
@@ -276,8 +275,8 @@ def from_config(config: Any) -> Any:
     if name not in _SCHEDULES:
         raise ValueError(f"unknown schedule {name!r}; the schedules are {', '.join(_SCHEDULES)}")
     kind = _SCHEDULES[name]
-    known = [field.name for field in fields(kind)]
+    names = [field.name for field in fields(kind)]
     try:
         return kind(**arguments)
     except TypeError as error:
-        raise ValueError(f"{name} takes {', '.join(known)}; the config gives {', '.join(arguments)}") from error
+        raise ValueError(f"{name} takes {', '.join(names)}; the config gives {', '.join(arguments)}") from error

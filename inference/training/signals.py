@@ -8,12 +8,12 @@ from typing import Any
 
 
 class Signals:
-    """Context manager that stores the first Ctrl-C or SIGTERM in `received`; a second one acts at once.
+    """Context manager that stores the first Ctrl-C or SIGTERM in `received`; a second one has its usual effect.
 
-    A loop reads `received` after each step and stops.
+    A loop reads `received` after each step, and stops if it is not None.
 
     Args:
-        then: called when the first signal arrives.
+        then: function called when the first signal arrives.
     """
 
     def __init__(self, then: Callable[[], object] = lambda: None) -> None:
@@ -25,7 +25,7 @@ class Signals:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 if signal.getsignal(number) != signal.SIG_IGN:
-                    self._previous[number] = signal.signal(number, self._remember)
+                    self._previous[number] = signal.signal(number, self._receive)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -33,7 +33,7 @@ class Signals:
             number, handler = self._previous.popitem()
             signal.signal(number, handler or signal.SIG_DFL)
 
-    def _remember(self, number: int, _: FrameType | None) -> None:
+    def _receive(self, number: int, _: FrameType | None) -> None:
         self.received = number
         self.__exit__()
         self._then()

@@ -2,8 +2,8 @@
 
 `SVI` draws from the guide, computes the terms of the bound and the loss of the objective, and takes a step of a torch
 optimiser. lightning-fabric runs the same code on a CPU, on a GPU, in bfloat16, or in several processes. Everything that
-varies over time is a schedule of the global step. The run has its own random state: draws of the caller between steps
-do not affect it, nor the reverse.
+varies over time is a schedule of the global step. The run has its own random state, which is independent of the
+caller's: draws of one do not affect the other.
 """
 
 import math
@@ -40,7 +40,7 @@ OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch
 
 
 class NonFiniteError(FloatingPointError):
-    """A loss or its gradient is NaN or infinite; the step was not taken."""
+    """Error if a loss or its gradient is NaN or infinite; the step was not taken."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ class State:
 
 
 class SVI:
-    """Stochastic variational inference step by step, for a training loop of your own; `fit` is written with it.
+    """Stochastic variational inference step by step, for custom training loops; `fit` uses it.
 
     On a CPU, steps on the batches that `fit` draws, `train.sample(batch_size, svi.generator)`, repeat its numbers bit
     for bit. `resuming` stores and restores a run.
@@ -108,42 +108,45 @@ class SVI:
             raise ValueError(f"{type(model).__name__} has no parameters that require gradients, so it cannot be fitted")
         for name, tensor in model.state_dict(keep_vars=True).items():
             if tensor.is_meta or tensor.is_inference():
-                where = "on the meta device" if tensor.is_meta else "in `torch.inference_mode()`"
-                raise ValueError(f"{name} was made {where} and cannot be fitted; build the model outside of it")
+                origin = "on the meta device" if tensor.is_meta else "in `torch.inference_mode()`"
+                raise ValueError(f"{name} was created {origin} and cannot be fitted; build the model outside of it")
         for stage in self.plan:
             if missing := [start for start in stage.frozen if not any(name.startswith(start) for name in trained)]:
-                raise ValueError(f"no parameter's name starts with {', '.join(missing)}; they are {', '.join(trained)}")
+                raise ValueError(
+                    f"frozen has {', '.join(missing)}, but no parameter's name starts with it; the parameters are "
+                    f"{', '.join(trained)}"
+                )
             if all(name.startswith(stage.frozen) for name in trained):
-                raise ValueError(f"every parameter is frozen in a stage of {stage.steps} steps; free at least one")
+                raise ValueError(f"every parameter is frozen in a stage of {stage.steps} steps; train at least one")
             if stage.curriculum is not None and not getattr(model, "has_curriculum", False):
                 raise ValueError(
                     f"a stage of {stage.steps} steps has a curriculum, but {type(model).__name__} "
                     "does not support one; a model with shared context does (DynamicalVAE(shared=...))"
                 )
             if isinstance(stage.objective, AdaptiveObjective):
-                stage.objective.begin(model)  # refuse it now rather than when its stage begins
+                stage.objective.begin(model)  # raises now rather than when its stage begins
         self.parameters = list(trained.values())
         self.final_feeding = self.rates(self.training.steps - 1)["scheduled_sampling"]
         self._state: State | None = None
-        self._begun: dict[int, Objective] = {}
+        self._stage_objective: dict[int, Objective] = {}
 
     @property
     def state(self) -> State:
         """State of the run, after `init`."""
         if self._state is None:
-            raise RuntimeError("the run has not begun; call init() first, which creates its optimiser")
+            raise RuntimeError("the run has not begun; call init() first")
         return self._state
 
     @property
     def objective(self) -> Objective:
-        """Objective of the next step; its state, if any, starts anew in each stage."""
+        """Objective of the next step; its state, if any, is reset at each stage."""
         first, stage = stage_at(self.plan, self.state.step)
-        if first not in self._begun:
+        if first not in self._stage_objective:
             described = stage.objective
-            self._begun = {
+            self._stage_objective = {
                 first: described.begin(self.model) if isinstance(described, AdaptiveObjective) else described
             }
-        return self._begun[first]
+        return self._stage_objective[first]
 
     @torch.inference_mode(False)
     def init(self) -> State:
@@ -153,18 +156,18 @@ class SVI:
             self.fabric: Fabric = processes.launch(training)
             torch.optim.SGD([torch.zeros(1)])
         with seeded(None, self.fabric.device):
-            own: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
+            sgd_options: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
-                self.parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True, **own
+                self.parameters, lr=training.rate(0), weight_decay=training.weight_decay, fused=True, **sgd_options
             )
             bound = _Bound(self.model, SequenceELBO(training.particles))
             self.module, self.optimizer = self.fabric.setup(bound, optimizer)
             processes.broadcast_values(self.fabric, self.model.state_dict().values())
             self.generator = torch.Generator().manual_seed(self._seed)
-            # Not the generator's own seed: equal seeds would tie the latent draws to the choice of the batch.
+            # A different seed from the generator's, because latent draws and batches would be dependent otherwise.
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             self.random = self._random_state()
-        self._state, self._begun = State(self.model), {}
+        self._state, self._stage_objective = State(self.model), {}
         return self._state
 
     @serialized
@@ -184,26 +187,28 @@ class SVI:
             group["lr"] = rates["learning_rate"]
         if not self.model.training:
             self.module.train()
-        where = f"step {state.step + 1}"
+        location = f"step {state.step + 1}"
         with self.drawing():
-            terms = self._terms(batch, stage.objective, where, rates["scheduled_sampling"], rates.get("curriculum"))
+            terms = self._terms(batch, stage.objective, location, rates["scheduled_sampling"], rates.get("curriculum"))
             loss = objective(terms, state.step)
             self.optimizer.zero_grad()
             self.fabric.backward(loss)
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # the optimiser skips a parameter without a gradient, and keeps its state
-        whole, self._share = processes.average_gradients(self.fabric, self.parameters, loss, terms.frames.sum())
+        total_loss, self._share = processes.average_gradients(self.fabric, self.parameters, loss, terms.frames.sum())
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
-        # the only place where a step synchronises with the device; everything up to the optimiser's step is queued
-        *self._numbers, of_all = torch.stack([loss.detach(), norm, whole + norm]).tolist()
+        # The only synchronisation with the device in a step; all other work is queued.
+        *self._numbers, of_all = torch.stack([loss.detach(), norm, total_loss + norm]).tolist()
         if not math.isfinite(of_all):
             impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
             advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
             if impossible and not state.step:
-                advice = "a distribution that can have these values; where it ends may depend on its parameters"
-            raise NonFiniteError(f"{where}: {_culprit(self.model, terms, loss)}; no step was taken. Try {advice}")
+                advice = "a distribution whose support includes these values; the support may depend on its parameters"
+            raise NonFiniteError(
+                f"{location}: {_describe_non_finite(self.model, terms, loss)}; no step was taken. Try {advice}"
+            )
         if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
             for gradient in gradients:
                 gradient.mul_(training.gradient_clip / norm)
@@ -219,28 +224,28 @@ class SVI:
     def row(self) -> dict[str, float]:
         """Return the numbers of the last step, in nats per frame (see `trackers`)."""
         if self.state.terms is None:
-            raise RuntimeError("no step has been taken since init(), so its numbers do not exist; call step() first")
+            raise RuntimeError("no step has been taken since init(); call step() first")
         loss, norm = self._numbers
         rates = self.rates(self.state.step - 1)
         return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_frame(_sums(self.state.terms))}
 
     def evaluate(self, data: Any) -> dict[str, float]:
-        """Return the terms of the unweighted bound on data, in nats per frame; the model is left in evaluation mode.
+        """Return the terms of the unweighted bound on data, in nats per frame; the model stays in evaluation mode.
 
-        The draws from the guide are the same at each call, so bounds differ only by the weights. Processes divide the
-        data among them, and each returns the terms of all data. The row of a model without a likelihood has a "loss"
-        instead of a bound. An objective that selects by "loss" adds it to the row. A run with scheduled sampling adds
+        The draws from the guide are the same at each call, so bounds differ only by the weights. Processes share the
+        data, and each returns the terms of all data. The row of a model without a likelihood has a "loss" instead of a
+        bound. An objective that selects by "loss" adds it to the row. A run with scheduled sampling adds
         "self_fed/bound", the bound with the feeding at the end of the run.
 
         Args:
-            data: x as a tensor (N, T, D), a batch, or an object whose `all()` returns a batch or whose `batches(size)`
-                yields batches in order.
+            data: x as a tensor (N, T, D), a batch, an object whose `all()` returns a batch, or one whose
+                `batches(size)` yields batches in order.
         """
         held_out = as_batches(data)
         row = self._score(held_out, 0.0)
         if self.final_feeding:
-            what = "loss" if "loss" in row else "bound"
-            row[f"self_fed/{what}"] = self._score(held_out, self.final_feeding)[what]
+            score = "loss" if "loss" in row else "bound"
+            row[f"self_fed/{score}"] = self._score(held_out, self.final_feeding)[score]
         return row
 
     def validate(self, data: Any) -> dict[str, float]:
@@ -249,32 +254,32 @@ class SVI:
         Scheduled sampling trains a model to run on its own output, which lowers the bound on the true past. Its best
         weights are therefore selected by "self_fed/bound", once the schedule has reached its last value.
 
-        Without a likelihood, or if the objective selects by "loss", the best weights have the lowest loss. A stage with
-        another objective starts this comparison anew.
+        Without a likelihood, or if the objective selects by "loss", the best weights have the lowest loss. At a stage
+        with another objective, this comparison starts again.
         """
         state, row = self.state, self.evaluate(data)
-        fed = "self_fed/" if self.final_feeding else ""
-        score = -row[f"{fed}loss"] if "loss" in row else row[f"{fed}bound"]
-        if not fed or self.rates(state.step - 1)["scheduled_sampling"] == self.final_feeding:
+        prefix = "self_fed/" if self.final_feeding else ""
+        score = -row[f"{prefix}loss"] if "loss" in row else row[f"{prefix}bound"]
+        if not prefix or self.rates(state.step - 1)["scheduled_sampling"] == self.final_feeding:
             state.waited += 1
-            if "loss" in row and state.best_step is not None and not self._alike(state.best_step, state.step):
+            if "loss" in row and state.best_step is not None and not self._same_objective(state.best_step, state.step):
                 state.best_bound = None  # the best loss so far is of another objective
             if score > (-math.inf if state.best_bound is None else state.best_bound):  # never true of NaN
                 state.best_step, state.best_bound, state.waited = state.step, score, 0
                 state.best = weights(self.model)
         return {f"validation/{name}": value for name, value in row.items()}
 
-    def _alike(self, first: int, second: int) -> bool:
-        """Return whether losses at two steps are of the same objective."""
+    def _same_objective(self, first: int, second: int) -> bool:
+        """Return whether two steps have the same objective."""
         before, now = (stage_at(self.plan, step)[1].objective for step in (first, second))
         return before is now or before == now
 
     def rates(self, step: int) -> dict[str, float]:
-        """Return learning rate, probability of scheduled sampling and curriculum, if there is one, at a global step."""
+        """Return learning rate, probability of scheduled sampling and, if any, curriculum at a global step."""
         _, stage = stage_at(self.plan, step)
-        given = {"learning_rate": self.training.rate, "scheduled_sampling": self.training.scheduled_sampling}
-        own = {name: getattr(stage, name) for name in given}
-        rates = {name: given[name] if own[name] is None else own[name] for name in given}
+        defaults = {"learning_rate": self.training.rate, "scheduled_sampling": self.training.scheduled_sampling}
+        stage_rates = {name: getattr(stage, name) for name in defaults}
+        rates = {name: defaults[name] if stage_rates[name] is None else stage_rates[name] for name in defaults}
         rates |= {} if stage.curriculum is None else {"curriculum": stage.curriculum}
         return {name: schedule(rate)(step) for name, rate in rates.items()}
 
@@ -289,14 +294,14 @@ class SVI:
         return processes.sum_over_processes(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Return the mean over the processes of a rate per frame of the last step, weighted by their frames."""
+        """Return the mean over processes of a value per frame of the last step, weighted by numbers of frames."""
         return self.total(value * self._share)
 
     def settle(self) -> None:
         """Copy buffers that training changes, such as running means, from the first process to all."""
         parameters = dict(self.model.named_parameters())
-        moved = [value for name, value in self.model.state_dict().items() if name not in parameters]
-        processes.broadcast_values(self.fabric, moved)
+        buffers = [value for name, value in self.model.state_dict().items() if name not in parameters]
+        processes.broadcast_values(self.fabric, buffers)
 
     @property
     def _seed(self) -> int:
@@ -304,7 +309,7 @@ class SVI:
 
     @contextmanager
     def _drawing(self, random: dict[str, Tensor]) -> Iterator[None]:
-        """Use a random state inside the context, store what it becomes, and restore the caller's afterwards."""
+        """Use and update a random state inside the context, and restore the caller's afterwards."""
         with seeded(None, self.fabric.device):
             torch.set_rng_state(random["torch"])
             if "cuda" in random:
@@ -325,58 +330,58 @@ class SVI:
         sums, fabric = dict[str, Tensor](), self.fabric
         size = min(self.training.batch_size, math.ceil(len(data) / fabric.world_size))
         shares = fabric.global_rank * size < len(data)
-        # a process without a batch of its own scores the first one, only for the names of the terms
+        # a process without a batch scores the first one, only for the names of the terms
         first, end = (fabric.global_rank, None) if shares else (0, 1)
-        own = islice(data.batches(size), first, end, fabric.world_size)
+        batches = islice(data.batches(size), first, end, fabric.world_size)
         self.module.eval()
         with seeded(self._seed, self.fabric.device):
             random = self._random_state()
         while True:
             with self._drawing(random), torch.no_grad():  # other threads may run between two batches
-                if (batch := next(own, None)) is None:
+                if (batch := next(batches, None)) is None:
                     break
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
-                found = _sums(terms)
+                sums_of_batch = _sums(terms)
                 if not terms.likelihood or (isinstance(objective, RequiresDraws) and objective.select == "loss"):
-                    found["loss"] = objective(terms, last).double() * found["frames"]
-                for name, value in found.items():
+                    sums_of_batch["loss"] = objective(terms, last).double() * sums_of_batch["frames"]
+                for name, value in sums_of_batch.items():
                     sums[name] = sums[name] + value if name in sums else value
         totals = self.total(torch.stack(list(sums.values())) * shares)
         return _per_frame(dict(zip(sums, totals, strict=True)))
 
     def _terms(
-        self, batch: AnyBatch, objective: Objective, where: str, feeding: float, curriculum: float | None = None
+        self, batch: AnyBatch, objective: Objective, location: str, feeding: float, curriculum: float | None = None
     ) -> Terms:
         """Return the terms of a batch that the objective needs, on the device of the model."""
         refuse_table(batch)
-        placed = Batch(batch if isinstance(batch, Mapping) else {"x": batch}).map(tensor_of)
+        converted = Batch(batch if isinstance(batch, Mapping) else {"x": batch}).map(tensor_of)
         if not isinstance(self.model, DynamicalVAE):  # a DynamicalVAE converts to its own precision
             dtype = self.parameters[0].dtype
-            placed = placed.map(lambda v: v.to(dtype) if v.is_floating_point() else v)
+            converted = converted.map(lambda v: v.to(dtype) if v.is_floating_point() else v)
         program: dict[str, Any] = {"scheduled_sampling": feeding} if feeding else {}
         program |= {} if curriculum is None else {"curriculum": curriculum}
         if isinstance(objective, RequiresDraws) and objective.draws:
             program["draws"] = objective.draws
         try:
             measure = self.objective.measure if isinstance(self.objective, StatefulObjective) else None
-            on_device = self.fabric.to_device(placed)
+            on_device = self.fabric.to_device(converted)
             return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensor arguments
         except ValueError as error:
-            if not _by_distribution(error):
+            if not _is_from_distribution(error):
                 raise
-            raise NonFiniteError(f"{where}: {error_message(error).partition(chr(10))[0]}") from error
+            raise NonFiniteError(f"{location}: {error_message(error).partition(chr(10))[0]}") from error
 
 
-def _by_distribution(error: ValueError) -> bool:
-    """Return whether a distribution raised the error: torch's distributions refuse NaN parameters and values."""
+def _is_from_distribution(error: ValueError) -> bool:
+    """Return whether a distribution raised the error, as torch's do for NaN parameters and values."""
     *_, (frame, _) = walk_tb(error.__traceback__)
     return str(frame.f_globals.get("__name__")).startswith(("torch.distributions", "pyro.distributions"))
 
 
 class _Bound(nn.Module):
-    """Module that returns the terms of the bound, as fabric needs a module to set up training.
+    """Module that returns the terms of the bound, because fabric sets up training for a module.
 
-    Pyro's `ELBOModule` returns a single number; objectives need the terms.
+    Pyro's `ELBOModule` returns a single number, but objectives need the terms.
     """
 
     def __init__(self, model: nn.Module, estimator: SequenceELBO) -> None:
@@ -388,7 +393,7 @@ class _Bound(nn.Module):
         self, batch: Callable[[], Batch], program: Mapping[str, Any], measure: Callable[[Terms], None] | None
     ) -> dict[str, Any]:
         terms = self.estimator.terms(self.model, batch(), **program)
-        # here, because only fabric may compute gradients from the output of the module
+        # measured here, because outside only fabric may compute gradients of the module's output
         if measure is not None and torch.is_grad_enabled():
             with torch.autocast(terms.frames.device.type, enabled=False):
                 measure(terms)
@@ -397,14 +402,14 @@ class _Bound(nn.Module):
 
 def _sums(terms: Terms) -> dict[str, Tensor]:
     """Return the sum of each term over the sequences of a batch, and the number of frames."""
-    named = {
+    values = {
         **({"bound": terms.bound} if terms.likelihood else {}),
         **{f"log_likelihood/{name}": value for name, value in terms.log_likelihood.items()},
         **{f"kl/{name}": value for name, value in terms.kl.items()},
         **{f"energy/{name}": value for name, value in terms.energies.items()},
         "frames": terms.frames,
     }
-    return {name: value.detach().double().sum() for name, value in named.items()}
+    return {name: value.detach().double().sum() for name, value in values.items()}
 
 
 def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
@@ -412,22 +417,22 @@ def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
     return {name: rate for name, rate in zip(sums, rates, strict=True) if name != "frames"}
 
 
-def _culprit(model: nn.Module, terms: Terms, loss: Tensor) -> str:
+def _describe_non_finite(model: nn.Module, terms: Terms, loss: Tensor) -> str:
     """Return a description of the first term, or else of the loss or a gradient, that is not finite."""
     groups = {"log likelihood": terms.log_likelihood, "KL": terms.kl, "energy": terms.energies}
     for group, values in groups.items():
         for name, value in values.items():
-            bad = ~torch.isfinite(value)
-            if bad.any():
-                first = f"the {group} of {name} is {value[bad][0].item()}"
-                where = f"in {int(bad.sum())} of {len(value)} sequences"
+            invalid = ~torch.isfinite(value)
+            if invalid.any():
+                first = f"the {group} of {name} is {value[invalid][0].item()}"
+                location = f"in {int(invalid.sum())} of {len(value)} sequences"
                 if name in terms.steps:
                     frames = (~torch.isfinite(terms.steps[name])).any(0).nonzero().flatten().tolist()
-                    where += f", frames {', '.join(map(str, frames[:3]))}{'…' if len(frames) > 3 else ''}"
-                return f"{first} {where}"
+                    location += f", frames {', '.join(map(str, frames[:3]))}{'…' if len(frames) > 3 else ''}"
+                return f"{first} {location}"
     if not torch.isfinite(loss):
-        return f"the loss is {loss.item()} though every term is finite, so a weight of the objective is not"
+        return f"the loss is {loss.item()} although every term is finite, so a weight of the objective is not finite"
     for name, parameter in model.named_parameters():
         if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-            return f"the gradient of {name} is not finite though the loss is"
+            return f"the gradient of {name} is not finite although the loss is"
     return "the norm of the gradient overflows, or the loss of another process is not finite"

@@ -1,8 +1,8 @@
 """Trackers: receivers of a run's log, such as a history, a file of JSON lines, TensorBoard or the terminal.
 
-A row maps names to numbers, in nats per frame. `bound`, `log_likelihood/x` and `kl/z` are of a training batch. With the
-prefix `validation/` they are of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling`
-are of the step, and so is `weight/x` if an objective's weights adapt.
+A row maps names to numbers, in nats per frame. `bound`, `log_likelihood/x` and `kl/z` are of a training batch, and with
+the prefix `validation/` of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling` are
+of the step; so is `weight/x` for an objective with adaptive weights.
 """
 
 import io
@@ -31,13 +31,13 @@ class Tracker(Protocol):
     """Receiver of the rows of a run."""
 
     def start(self, step: int) -> None:
-        """Start at a step; stored rows of later steps belong to an abandoned run and are dropped."""
+        """Start at a step, and drop stored rows of later steps, which belong to an abandoned run."""
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
         """Store a row."""
 
     def close(self) -> None:
-        """Release files and screen; called once, also when the run fails."""
+        """Release files and terminal; called once, even if the run fails."""
 
 
 class InMemory:
@@ -74,9 +74,9 @@ class JSONLines:
 
     def start(self, step: int) -> None:
         """Drop rows after `step`, and an incomplete last line, then open the file for appending."""
-        kept = [json.dumps(row) + "\n" for row in self.read() if row["step"] <= step]
-        with files.atomic_write(self.path) as new:  # a new file, which no link can share
-            new.write("".join(kept).encode())
+        lines = [json.dumps(row) + "\n" for row in self.read() if row["step"] <= step]
+        with files.atomic_write(self.path) as new:  # a new file, so that no link to it exists
+            new.write("".join(lines).encode())
         self._file = files.open_plain(self.path, os.O_WRONLY | os.O_APPEND)
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
@@ -92,8 +92,8 @@ class JSONLines:
         """Return the rows of the file, without an incomplete last line; an empty list without a file.
 
         Raises:
-            CheckpointError: when a line is no row of numbers, there are too many rows or bytes, or the path is no plain
-                file.
+            CheckpointError: when a line is not a row of numbers, there are too many rows or bytes, or the path is not a
+                plain file.
         """
         try:
             content = files.read(self.path, LARGEST_LOG)
@@ -202,7 +202,7 @@ class Terminal:
         self._bar: Progress | None = None
 
     def start(self, step: int) -> None:
-        """Show the bar, or nothing yet without a terminal."""
+        """Show the bar if the output is a terminal."""
         self._next_line = step + self.steps / 10
         if self.console.is_terminal and not self.console.is_jupyter:
             rate = TextColumn("{task.fields[rate]}")
@@ -225,7 +225,7 @@ class Terminal:
             self._print()
 
     def close(self) -> None:
-        """Leave the bar on the screen, or write the last line."""
+        """Stop the bar, which stays on the screen, or print the last line."""
         if self._bar is not None:
             self._bar.stop()
         elif self._latest:

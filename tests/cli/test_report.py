@@ -183,7 +183,7 @@ def test_records_beside_a_run_are_shown(scored, tmp_path):
     assert "AIS, L = 2, K = 2" in bracket
     assert "amortisation" in bracket
     assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in beside
-    assert "beside the posterior of 1 sequences" in beside
+    assert "compared with the posterior of 1 sequences" in beside
     assert "held 40 %" in bands
     pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
     dvae.ablate(pair, steps=2, surrogates=1).save(tmp_path / "a.json")

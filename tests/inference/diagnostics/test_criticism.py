@@ -70,7 +70,7 @@ def test_ranks_of_the_exact_guide_are_uniform_and_of_the_mean_field_guide_are_no
     )
     assert right.p_value > 1e-3
     assert not any(right.readings)
-    assert right.verdict.startswith("nothing speaks against")
+    assert right.verdict.startswith("no evidence against")
     assert wrong.p_value < 1e-6
     assert wrong.readings[np.argmin(wrong.p_values[:-2])] == "is too narrow"
     assert "is not the posterior" in wrong.verdict

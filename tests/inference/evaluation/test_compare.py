@@ -235,7 +235,7 @@ def test_joined_rows_are_those_of_one_comparison(fitted):
     dkf, other = (run({name: model}, x) for name, model in models.items())
     assert Comparison.from_json(dkf.to_json()).join(other).to_json() == run(models, x).to_json()
     for told, data, options in (("seed", x, {"seed": 1}), ("data", x + 1, {}), ("contrasts", x, {"contrasts": 8})):
-        with pytest.raises(ValueError, match=f"not in {told}"):
+        with pytest.raises(ValueError, match=f"differ in {told}"):
             dkf.join(run({"b": models["dkf"]}, data, **options))
     with pytest.raises(ValueError, match="comparisons have"):
         dkf.join(dkf)

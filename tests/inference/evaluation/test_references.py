@@ -105,8 +105,8 @@ def test_references_are_had_by_name_or_say_what_they_need():
     assert list(run(held, references=asked, training_windows=known, season=3).rows) == asked
     for options, message in (
         ({"references": ["season"]}, r"no reference row 'season' \(did you mean 'seasonal'\?\); there are last"),
-        ({"references": ["seasonal"]}, "'seasonal' needs a season of 1 to 7 frames, which are observed$"),
-        ({"references": ["seasonal"], "season": 9}, "of 1 to 7 frames, which are observed, not 9"),
+        ({"references": ["seasonal"]}, "'seasonal' needs a season between 1 and the 7 observed frames$"),
+        ({"references": ["seasonal"], "season": 9}, "between 1 and the 7 observed frames, got 9"),
         ({"references": ["mean"]}, "'mean' needs training windows"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -195,9 +195,9 @@ def test_what_cannot_be_started_is_told(monkeypatch):
 
 
 def test_torchrun_says_how_many_processes_there_are(monkeypatch):
-    assert processes._places(2) == (2, 1)
+    assert processes._count_processes(2) == (2, 1)
     for name, value in {"TORCHELASTIC_RUN_ID": "none", "LOCAL_WORLD_SIZE": "2", "WORLD_SIZE": "6"}.items():
         monkeypatch.setenv(name, value)
-    assert processes._places(1) == processes._places(2) == (2, 3)
-    with pytest.raises(ValueError, match="processes here"):
-        processes._places(4)
+    assert processes._count_processes(1) == processes._count_processes(2) == (2, 3)
+    with pytest.raises(ValueError, match="processes on this host"):
+        processes._count_processes(4)
