@@ -138,7 +138,7 @@ class Units(nn.Module):
         if values.ndim == 3 and exceeds_float32(values.dtype) and self.scale.dtype is torch.float32:
             imprecise = imprecise_sequences(values, summary.mean)
             if imprecise.any():
-                rows, coordinate = imprecise.any(1), imprecise.any(0).argmax()
+                rows, coordinate = np.asarray(imprecise).any(1), imprecise.any(0).argmax()
                 warnings.warn(
                     f"in {rows.sum()} of {len(rows)} sequences, such as {rows.argmax()}, coordinate {coordinate} "
                     "varies by less than float32 resolves at its distance from the mean of all sequences, "

@@ -103,9 +103,9 @@ class Sampling:
         narrow = f"; {count} divergences: it may have missed narrow regions of the posterior" if count else ""
         if self.converged.all():
             return f"the reference is by NUTS, which converged ({numbers}){narrow}"
-        count = f"{(~self.converged).sum()} of {len(self.converged)} sequences"
+        failed = f"{(~self.converged).sum()} of {len(self.converged)} sequences"
         return (
-            f"the reference did not converge for {count} ({numbers}){narrow}. Use more draws and warm-up "
+            f"the reference did not converge for {failed} ({numbers}){narrow}. Use more draws and warm-up "
             "before you interpret the comparison"
         )
 

@@ -268,7 +268,8 @@ def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
     assert "no joint 'RPaw'" in failure(capsys, "evaluate", str(tracker), "--joints", "RPaw", *out)
     error = failure(capsys, "evaluate", str(fitted), "--joints", "RFoot", *out, code=2)
     assert "are for methods that take trajectories" in error
-    assert "1 observed frames and no given joints" in failure(capsys, "evaluate", str(tracker), "--exchange", ".01", *out)
+    error = failure(capsys, "evaluate", str(tracker), "--exchange", ".01", *out)
+    assert "1 observed frames and no given joints" in error
     assert main(["evaluate", str(tracker), "--joints", "RFoot", "--samples", "2", "--exchange", "2"]) == 0
     assert dvae.Evaluation.load(tracker / "evaluation-RFoot-exchanged-2.json").data["exchanged"]["threshold"] == 2
 

@@ -146,8 +146,8 @@ class Body(nn.Module):
             resting = _changed(self.template[vertices], self.shapes[vertices], shape).mT[..., None, None, :, :]
             # weights first, because all bodies share them: in the other order, second derivatives take twice as long
             transforms = moves.movedim(-3, -1).contiguous() @ self.weights[vertices].mT  # (..., T, 3, 4, M)
-            positions = (transforms[..., :3, :] * resting).sum(-2) + transforms[..., 3, :]
-            return positions.mT + translation[..., None, :]
+            coordinates = (transforms[..., :3, :] * resting).sum(-2) + transforms[..., 3, :]
+            return coordinates.mT + translation[..., None, :]
         frames = translation.shape[:-1]
         vertex_indices = vertices.flatten(-2)[..., None].expand(*frames[:-1], -1, 3)
         resting = self.at_rest(shape)[0].gather(-2, vertex_indices).unflatten(-2, vertices.shape[-2:])
