@@ -1,13 +1,13 @@
-"""Runs benchmarks, compares them with the last release and keeps them: `python -m benchmarks.bench`, or `make bench`.
+"""Run benchmarks, compare them with the last release and store them: `python -m benchmarks.bench`, or `make bench`.
 
-A benchmark is a module of this folder with `rows(device)`, from names to numbers, and `TARGETS`, from some of these
-names to a side and a bound, or None. Numbers are ratios within one run, or sizes. "at most" is a row that is better the
-less it is, as all are that `TARGETS` does not name, and "at least" one that is better the more; "under" and "over" have
-a bound alone, as exponents and seconds do, of which a tenth means nothing on another machine.
+A benchmark is a module of this folder with two members. `rows(device)` returns numbers by name. `TARGETS` maps some of
+the names to a side and a bound, or None. Numbers are ratios within one run, or sizes. Lower is better for "at most",
+the default, and higher for "at least". "under" and "over" only have a bound: exponents and seconds differ by more than
+a tenth between machines.
 
-The exit status is 1 where a row is worse by more than a tenth than at the last release, which is the first record of
-the last version, or misses a target that it met there. Machines of one name differ by as much. So such a row is
-measured once more, of which the better counts, and then beside the code of that record, which git has.
+The exit status is 1 if a row is worse by more than a tenth than at the last release, or misses a target that it met
+there. The release is the first record of the last version. Machines of one name differ by as much, so such a row is
+measured again, and the better value counts. Then it is compared with the code of that record on this machine.
 """
 
 from __future__ import annotations
@@ -87,13 +87,13 @@ def slower(found: Mapping[str, float], targets: Targets, before: Mapping[str, fl
 
 
 def missed(found: Mapping[str, float], targets: Targets) -> list[str]:
-    """What is to be said of rows that miss their targets."""
+    """Return one message for each row that misses its target."""
     rows = [row for row in found if not met(found[row], targets[row])]
-    return [f"{row}: {found[row]:.2f} is to be {targets[row][0]} {targets[row][1]:g}" for row in rows]
+    return [f"{row}: {found[row]:.2f} must be {targets[row][0]} {targets[row][1]:g}" for row in rows]
 
 
 def commit() -> str:
-    """Of what is measured; "" where git does not know."""
+    """Return the short hash of the measured commit; "" if git cannot find it."""
     return _git("rev-parse", "--short", "HEAD")
 
 
@@ -139,7 +139,7 @@ def machine(device: torch.device) -> dict[str, Any]:
 
 
 def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
-    """The history with a record. Of a version there are two, its first and its last, which keep what is not in it."""
+    """Return the history with a record added; a version keeps its first and its last record, with rows merged."""
     alike = [each for each in records if (each["version"], how(each)) == (record["version"], how(record))]
     own = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
     joined = {
@@ -152,7 +152,7 @@ def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str
 
 
 def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
-    """What a record is compared with, and of which commit that is: of each row the first number of the last version."""
+    """Return the reference of each row, the first number of the last version in other commits, and its commit."""
     others = [each for each in records if how(each) == how(record) and each["commit"] != record["commit"]]
     found: dict[str, tuple[float, str]] = {}
     for each in others:
@@ -162,14 +162,14 @@ def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str,
 
 
 def how(record: dict[str, Any]) -> tuple[str, int]:
-    """On which device and how many threads a record was measured; the first ones were, untold, on the processor."""
+    """Return the device and the number of threads of a record; records without them are from the processor."""
     return record["machine"].get("device", "cpu"), record["machine"]["threads"]
 
 
 def page(records: list[dict[str, Any]], path: Path | None = DOCS / "results" / "speed.md") -> None:
-    """Writes the history, newest first, of what was measured as the last was, and the ratio of the last two.
+    """Write the table of the records measured like the last one, newest first, with the ratio to the release.
 
-    Of the processor and of a GPU there is one each.
+    The page has one table for the processor and one for a GPU.
     """
     newest = [record for record in records[::-1] if how(record) == how(records[-1])]
     last, before = newest[0], released(records, records[-1])
@@ -205,19 +205,21 @@ def main(
     """Measure.
 
     Args:
-        names: of benchmarks.
-        threads: of torch.
-        device: where models and their data are. On a GPU some rows are left out, which is told.
-        out: where the numbers are written, after each benchmark.
-        keep: whether they join the history, as those of this version, and its page.
+        names: benchmarks to run.
+        threads: number of torch threads.
+        device: device of models and data. A GPU skips some rows; the output names them.
+        out: file of the numbers, written after each benchmark.
+        keep: whether to add the numbers to the history and its page.
     """
     refuse_unknown("benchmark", names, NAMES)
     if device == "cuda":
         require_gpu("device")
     if threads < 1:
-        sys.exit(f"threads is {threads}, expected 1 or more")
+        sys.exit(f"threads must be at least 1, got {threads}")
     if not out.parent.is_dir():
-        sys.exit(f"{out} has no folder to be written to; make {out.parent} first, or name another file by --out")
+        sys.exit(
+            f"{out} is in a folder that does not exist; create {out.parent} first, or name another file with --out"
+        )
     torch.set_num_threads(threads)
     place = torch.device(device)
     record = {
@@ -273,4 +275,4 @@ if __name__ == "__main__":
     try:
         sys.exit(tyro.cli(main, description=__doc__))
     except KeyboardInterrupt:
-        sys.exit("stopped; benchmarks that had ended are written, give the names of the others to go on")
+        sys.exit("stopped; finished benchmarks are written; to continue, give the names of the others")

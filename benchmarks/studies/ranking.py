@@ -1,10 +1,9 @@
-"""Fits every method for motion on every set, scores it on the test windows, and ranks them.
+"""Fit every method for motion on every set, score it on the test windows, and rank the methods.
 
-Methods have the options and the training of their presets, which the tuning protocol chose (docs/results/tuning.md);
-runs lie in `RUNS/SET/METHOD-seedN`. What tables are made of, scores by clip, is kept in `SCORES/SET` beside the metric
-models
-that gave them: the script goes on where it was stopped, there or on another machine, a further method is scored by the
-same metric models, and without `--data` nothing is fitted.
+Options and training are the presets', chosen with the tuning protocol (docs/results/tuning.md). Runs are stored in
+`RUNS/SET/METHOD-seedN`. Scores by clip, from which the tables are made, are stored in `SCORES/SET` with the metric
+models that computed them. An interrupted script therefore continues, also on another machine, and scores further
+methods with the same metric models. Without `--data` nothing is fitted.
 """
 
 from __future__ import annotations
@@ -54,19 +53,19 @@ ALIKE, ALIKE_PATHS = (
 
 @dataclass(frozen=True)
 class View:
-    """What of the test windows is predicted, and how.
+    """Conditions and options of a prediction of the test windows.
 
     Args:
-        given: joints whose paths are known, those of `JOINTS` first; None where methods take no paths.
-        single: one motion, at the mean of the prior, in place of draws.
-        exchanged: metres within which the given joints are in another window's pose, from which motions begin; 0 for
+        given: number of joints with given paths, in the order of `JOINTS`; None for methods without paths.
+        single: whether to predict one motion from the prior's mean instead of draws.
+        exchanged: largest distance in metres of the given joints in another window's pose, used as the start; 0 for
             the window's own.
-        own: of the windows that have such another one, with their own poses.
+        own: whether windows with such a pose keep their own one.
         truth: see `motion.ExchangedWindows`.
-        observed: frames, in place of the protocol's.
-        metric_models: names with + between, in place of the set's.
-        parts: how diverse the parts of the body are, alone, in "free" futures, in those that have the lower body's
-            draw "held", that of the first, or in those of many whose lower body is "nearest" the first one's.
+        observed: number of observed frames; None for the protocol's.
+        metric_models: names joined by +; empty for the set's.
+        parts: diversity of body parts, in "free" futures, in futures with the first draw of the lower body
+            "held", or in the futures with the lower body "nearest" to the first one's.
     """
 
     given: int | None = None
@@ -79,7 +78,7 @@ class View:
     parts: Literal["", "free", "held", "nearest"] = ""
 
     def windows(self, data: MotionData, split: str) -> Any:
-        """Windows of a part of the data, and what is told of them."""
+        """Return the windows of a split, with the given paths."""
         observed = self.observed or data.protocol.observed
         windows = motion.windows(data.motion, replace(data.protocol, observed=observed), split)
         if self.given is None:
@@ -102,13 +101,13 @@ class View:
 
 @dataclass(frozen=True)
 class Set:
-    """The file of clips below the folder of data, and what is fitted and scored.
+    """A file of clips below the data folder, with the methods and views to fit and score.
 
     Args:
-        file: of the clips.
-        methods: by the rows that they are.
-        views: in which each is scored.
-        metric_models: of `METRIC_MODELS`.
+        file: path of the clips below the data folder.
+        methods: options of the methods by row.
+        views: views of each method.
+        metric_models: names in `METRIC_MODELS`.
         like: the set whose protocol, fitted metric models and reference rows it shares; its own where empty.
     """
 
@@ -156,7 +155,7 @@ LEVEL = 0.9
 
 
 def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
-    """What is kept of an evaluation: scores by clip of a run, or of all reference rows.
+    """Return the stored part of an evaluation: scores by clip of a run, or of all reference rows.
 
     Returns:
         `basis`, windows, draws and metric models, which all rows of a table share; windows by clip; scores, of four
@@ -204,7 +203,7 @@ def grouped(data: MotionData) -> MotionData:
 
 
 def judging(judged: Mapping[str, Path]) -> Any:
-    """The scores of motion that tables show, with those of metric models where there are some."""
+    """Return the motion scores of the tables, including scores by the given metric models."""
     models = {name: load(path).model for name, path in judged.items()}
     prior = models.pop("prior", None)
 
@@ -235,8 +234,8 @@ def fit(
 
 
 def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Options of a method, and those of its training."""
-    # methods have options of that name, which make the schedule of training's
+    """Split options into options of the method and options of its training."""
+    # methods have an option of this name too, which sets the training schedule
     training = Training.__dataclass_fields__.keys() - {"scheduled_sampling"}
     return (
         {name: value for name, value in options.items() if name not in training},
@@ -255,18 +254,18 @@ def work(
     samples: int,
     accelerator: Accelerator = "cpu",
 ) -> None:
-    """Fits and scores what is not there yet, seed by seed, so that every method has one before any has two.
+    """Fit and score missing results, seed by seed, so that each method has one seed before any has two.
 
     Args:
         data: the folder of files.
-        runs: of all sets.
-        stored: scores of all sets.
-        name: of the set.
-        methods: by the rows that they are.
-        views: in which each is scored; the reference rows in all of them.
-        seeds: of every method.
-        samples: futures of a window.
-        accelerator: on which to train and to forecast.
+        runs: folder of the runs of all sets.
+        stored: folder of the scores of all sets.
+        name: name of the set.
+        methods: options of the methods by row.
+        views: views of each method; reference rows are scored in all views.
+        seeds: seeds of each method.
+        samples: number of futures of each window.
+        accelerator: device for training and forecasts.
     """
     if accelerator == "cuda":
         require_gpu("accelerator")
@@ -295,7 +294,7 @@ def work(
         member = view.member(REFERENCES)
         if not (view.single or view.exchanged or view.parts in ("held", "nearest") or member in references.names):
             references.add(member, score(None, REFERENCES, view))
-    every = {**SETS[name].methods, **methods}  # what a second stage stands on has the set's options, chosen or not
+    every = {**SETS[name].methods, **methods}  # a second stage uses the set's options of its first stage
     for seed, row in itertools.product(seeds, methods):
         members = {view: view.member(f"{folder(row)}-seed{seed}") for view in views[row]}
         if missing := {view: member for view, member in members.items() if member not in own.names}:
@@ -324,9 +323,9 @@ class Held(Wrapped):
 
 
 class Nearest(Wrapped):
-    """A model whose futures are those of `MANY` times as many whose lower body is nearest to the first one's.
+    """A model that draws `MANY` times as many futures and keeps those with the lower body nearest to the first one's.
 
-    As GSPS has DLow hold the lower body: the nearest 50 of 1,000.
+    GSPS selects DLow's futures with a fixed lower body in the same way: the nearest 50 of 1,000.
     """
 
     MANY = 20
@@ -368,7 +367,7 @@ def archive(stored: Path, name: str) -> Archive:
 
 
 def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Row]:
-    """What has been scored on a set: the reference rows, and methods with their seeds.
+    """Return the rows scored on a set: references, then methods with their seeds.
 
     Raises:
         ValueError: scores of other windows, samples, or metric models.
@@ -391,7 +390,7 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
 
 
 def rows_of(stored: Path, name: str, view: View) -> dict[str, Row]:
-    """What has been scored of a set's own rows, with the reference rows; nothing where no method has been."""
+    """Return the scored rows of a set with the reference rows; empty if no method is scored."""
     found = entries(stored, name, view, SETS[name].methods)
     return found if any(entry.trained for entry in found.values()) else {}
 
@@ -406,7 +405,7 @@ def alike(basis: Sequence[Any]) -> list[Any]:
 
 
 def titled(name: str, entry: Row) -> str:
-    """A row as it is called, with what sets it apart."""
+    """Return the label of a row, with the options that distinguish it."""
     first = entry.runs[0]
     modes = first["config"].get("method", {}).get("modes")
     apart = ["drawn"] * (first["basis"][EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
@@ -432,9 +431,9 @@ def ranked(found: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
 
 
 def ranking(found: Mapping[str, Row], columns: Sequence[str]) -> str:
-    """Rows in order of the energy score, each with what it has more than the neighbours and than the next better.
+    """Return rows sorted by energy score, with differences to the neighbours and to the row above.
 
-    And below, the model confidence set.
+    The model confidence set follows the table.
     """
     scores = ranked(found)
     header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
@@ -485,19 +484,19 @@ def main(
     page: Path | None = None,
     picture: Path = DOCS / "img" / "ranking.png",
 ) -> None:
-    """Fit and score what is missing, and write the tables.
+    """Fit and score missing results, and write the tables.
 
     Args:
-        runs: where run directories lie.
+        runs: folder of the run directories.
         data: the folder with bandai/ and cmu/; without it nothing is fitted.
-        sets: which.
-        methods: of these alone; all of a set where none is named.
-        seeds: of every method.
-        samples: futures of a window.
-        scores: the folder of scores and metric models; in another than the project's own, all is fitted anew.
-        accelerator: on which to train and to forecast; runs on a GPU tell no minutes.
-        page: whose tables; without one they are printed.
-        picture: of all sets that tell no paths, drawn with a page.
+        sets: names of sets.
+        methods: names of methods to fit; all methods of a set if empty.
+        seeds: seeds of each method.
+        samples: number of futures of each window.
+        scores: folder of scores and metric models; an empty folder starts from the beginning.
+        accelerator: on which to train and to forecast; runs on a GPU record no minutes.
+        page: page of the tables; None prints them.
+        picture: figure of all sets without given paths; drawn only with a page.
     """
     refuse_unknown("set", sets, SETS)
     refuse_unknown("method", methods, {**FUTURES, **PATHS})

@@ -27,7 +27,7 @@ def root_mean_square(values: np.ndarray) -> float:
 
 
 def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
-    """What both diagnostics say of a guide."""
+    """Return the cells of both diagnostics of a guide."""
     found = dvae.reference_posterior(model, x, progress=False, **nuts)
     tested = dvae.stein_discrepancy(model, x, progress=False)
     steps = found.pairs["z, between steps"]
@@ -45,7 +45,7 @@ def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
     ]
 
 
-COLUMNS = ["bias (rms)", "deviation ratio", "correlations", "the guide’s", "told by KSD at 5 %", "p, together"]
+COLUMNS = ["bias (rms)", "deviation ratio", "correlations", "the guide’s", "detected by KSD at 5 %", "p, together"]
 
 
 def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
@@ -66,7 +66,7 @@ def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
 
 
 def power(steps: int, sequences: int) -> list[str]:
-    """Of the discrepancy: the share of sequences that are told."""
+    """Return the share of sequences with a detected error of the guide, by kind of error."""
     model = dvae.linear_gaussian_surrogate(
         bounds.MODEL, GUIDES["exact"], {"z": 1, "x": 1}, steps, scale=0.9
     ).requires_grad_(False)
