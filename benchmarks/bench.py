@@ -75,21 +75,21 @@ def better(one: Rows, other: Mapping[str, float], targets: Targets) -> Rows:
     return {row: (min if targets[row][0] in LESS else max)(values) for row, values in both.items()}
 
 
-def slower(found: Mapping[str, float], targets: Targets, before: Mapping[str, float]) -> list[str]:
+def slower(rows: Mapping[str, float], targets: Targets, before: Mapping[str, float]) -> list[str]:
     """Rows that are worse than before by more than a tenth, or miss a target that they met."""
 
     def is_slower(row: str) -> bool:
-        (side, _), now, then = targets[row], found[row], before[row]
+        (side, _), now, then = targets[row], rows[row], before[row]
         costs = side in COMPARED and (now > WORSE * then if side in LESS else then > WORSE * now)
         return costs or (met(then, targets[row]) and not met(now, targets[row]))
 
-    return [row for row in found if row in before and is_slower(row)]
+    return [row for row in rows if row in before and is_slower(row)]
 
 
-def missed(found: Mapping[str, float], targets: Targets) -> list[str]:
+def missed(values: Mapping[str, float], targets: Targets) -> list[str]:
     """Return one message for each row that misses its target."""
-    rows = [row for row in found if not met(found[row], targets[row])]
-    return [f"{row}: {found[row]:.2f} must be {targets[row][0]} {targets[row][1]:g}" for row in rows]
+    rows = [row for row in values if not met(values[row], targets[row])]
+    return [f"{row}: {values[row]:.2f} must be {targets[row][0]} {targets[row][1]:g}" for row in rows]
 
 
 def commit() -> str:
@@ -99,10 +99,10 @@ def commit() -> str:
 
 def _git(*arguments: str) -> str:
     try:
-        done = subprocess.run(["git", "-C", HERE, *arguments], capture_output=True, text=True, check=True)
+        process = subprocess.run(["git", "-C", HERE, *arguments], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return ""
-    return done.stdout.strip() or "done"
+    return process.stdout.strip() or "done"
 
 
 def there(commit: str, name: str, device: str, threads: int) -> Rows:
@@ -141,24 +141,24 @@ def machine(device: torch.device) -> dict[str, Any]:
 def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the history with a record added; a version keeps its first and its last record, with rows merged."""
     alike = [each for each in records if (each["version"], how(each)) == (record["version"], how(record))]
-    own = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
-    joined = {
-        key: {name: value for part in (*own, record) for name, value in part[key].items()}
+    matching = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
+    merged = {
+        key: {name: value for part in (*matching, record) for name, value in part[key].items()}
         for key in ("rows", "targets")
     }
-    if not own:
+    if not matching:
         return [*records, record]
-    return [record | joined if each is own[0] else each for each in records]
+    return [record | merged if each is matching[0] else each for each in records]
 
 
 def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
     """Return the reference of each row, the first number of the last version in other commits, and its commit."""
     others = [each for each in records if how(each) == how(record) and each["commit"] != record["commit"]]
-    found: dict[str, tuple[float, str]] = {}
+    reference: dict[str, tuple[float, str]] = {}
     for each in others:
         if each["version"] == others[-1]["version"]:
-            found = {row: (value, each["commit"]) for row, value in each["rows"].items()} | found
-    return found
+            reference = {row: (value, each["commit"]) for row, value in each["rows"].items()} | reference
+    return reference
 
 
 def how(record: dict[str, Any]) -> tuple[str, int]:
@@ -230,14 +230,16 @@ def main(
     }
     records = json.loads(HISTORY.read_text()) if HISTORY.exists() else []
     release = {} if BESIDE in os.environ else released(records, record)
-    found: Rows = {}
+    numbers: Rows = {}
     targets: dict[str, Target] = {}
     failed: list[str] = []
     for name in names:
         print(f"{name} ...", flush=True)
-        left_out = {row: why for row, why in PROCESSORS.items() if device != "cpu" and row.partition(":")[0] == name}
-        for row, why in left_out.items():
-            print(f"  {row} is left out: it {why}", flush=True)
+        left_out = {
+            row: reason for row, reason in PROCESSORS.items() if device != "cpu" and row.partition(":")[0] == name
+        }
+        for row, reason in left_out.items():
+            print(f"  {row} is left out: it {reason}", flush=True)
         if name in left_out:
             continue
         rows, bounds = measured(name, place)
@@ -246,8 +248,8 @@ def main(
             rows = better(rows, measured(name, place)[0], bounds)
         if doubtful := slower(rows, bounds, before):
             for old in {release[row][1] for row in doubtful}:
-                beside = there(old, name, device, threads)
-                before |= {row: value for row, value in beside.items() if row in before and release[row][1] == old}
+                old_rows = there(old, name, device, threads)
+                before |= {row: value for row, value in old_rows.items() if row in before and release[row][1] == old}
             failed += [
                 f"{row}: {rows[row]:.2f} was {before[row]:.2f} at the last release"
                 for row in slower(rows, bounds, before)
@@ -257,15 +259,15 @@ def main(
             was = f"{before[row]:8.2f}" if row in before else " " * 8
             side, bound = bounds[row]
             print(f"  {row:50} {value:8.2f} {was}   {'' if bound is None else f'{side} {bound:g}'}", flush=True)
-        found |= {row: round(value, 4) for row, value in rows.items()}
+        numbers |= {row: round(value, 4) for row, value in rows.items()}
         targets |= bounds
-        written = record | {"rows": found, "targets": targets}
+        written = record | {"rows": numbers, "targets": targets}
         out.write_text(json.dumps(written, indent=1) + "\n")
         if keep:
             records = kept(records, written)
             HISTORY.write_text(json.dumps(records, indent=1) + "\n")
             page(records)
-    for title, lines in (("targets missed:", missed(found, targets)), ("slower than at the last release:", failed)):
+    for title, lines in (("targets missed:", missed(numbers, targets)), ("slower than at the last release:", failed)):
         if lines:
             print(title, *lines, sep="\n  ")
     return int(bool(failed))

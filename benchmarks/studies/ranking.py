@@ -84,10 +84,10 @@ class View:
         if self.given is None:
             return windows
         others = [name for name in windows.joints if name not in JOINTS]
-        told = windows.given([*JOINTS, *others][: self.given])
+        conditioned = windows.given([*JOINTS, *others][: self.given])
         if not self.exchanged or split != "test":
-            return told
-        return motion.ExchangedWindows(told, self.exchanged, own=self.own, truth=self.truth)
+            return conditioned
+        return motion.ExchangedWindows(conditioned, self.exchanged, own=self.own, truth=self.truth)
 
     def evaluate(self, samples: int) -> dict[str, Any]:
         """Arguments of `dvae.evaluate`."""
@@ -95,8 +95,8 @@ class View:
 
     def member(self, run: str) -> str:
         """The name of the scores of a run in an archive."""
-        told = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
-        return f"{run}/{'-'.join(['scores', *told])}.json"
+        parts = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
+        return f"{run}/{'-'.join(['scores', *parts])}.json"
 
 
 @dataclass(frozen=True)
@@ -170,13 +170,13 @@ def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
         }
         for name, row in evaluation.rows.items()
     }
-    found = {"basis": same(evaluation), "clips": evaluation.clips, "rows": rows, "minutes": 0.0, "config": {}}
+    result = {"basis": same(evaluation), "clips": evaluation.clips, "rows": rows, "minutes": 0.0, "config": {}}
     if run is not None:
-        fitted = Run(run)
-        options = {name: value for name, value in fitted.config["method"].items() if not name.endswith("_run")}
-        found["config"] = {"method": options, "training": fitted.config["training"]}
-        found["minutes"] = fitted.state.get("processor_seconds", 0.0) / 60
-    return found
+        fitted_run = Run(run)
+        options = {name: value for name, value in fitted_run.config["method"].items() if not name.endswith("_run")}
+        result["config"] = {"method": options, "training": fitted_run.config["training"]}
+        result["minutes"] = fitted_run.state.get("processor_seconds", 0.0) / 60
+    return result
 
 
 def fitted_metric_models(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
@@ -202,9 +202,9 @@ def grouped(data: MotionData) -> MotionData:
     return replace(data, motion=motion.MotionSet(clips, data.motion.skeleton, data.motion.name, copy=False))
 
 
-def judging(judged: Mapping[str, Path]) -> Any:
+def judging(metric_models: Mapping[str, Path]) -> Any:
     """Return the motion scores of the tables, including scores by the given metric models."""
-    models = {name: load(path).model for name, path in judged.items()}
+    models = {name: load(path).model for name, path in metric_models.items()}
     prior = models.pop("prior", None)
 
     def scores(windows: Any) -> list[Measure]:
@@ -223,13 +223,13 @@ def fit(
     accelerator: Accelerator = "cpu",
 ) -> Path:
     """The run directory of a method, fitted once; second stages stand on the first of the same seed."""
-    told, training = parted({**methods[row], "accelerator": accelerator})
-    method = told.pop("method", row)
-    if method in ("gsps", "hit-dvae") and prior is not None and told.get("pose_prior") != 0:
-        told["pose_prior_run"] = str(prior.absolute())
+    method_options, training = parted({**methods[row], "accelerator": accelerator})
+    method = method_options.pop("method", row)
+    if method in ("gsps", "hit-dvae") and prior is not None and method_options.get("pose_prior") != 0:
+        method_options["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
-        told["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
-    (path,) = swept(row, dvae.method(method, **told), data, runs, (seed,), training)
+        method_options["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
+    (path,) = swept(row, dvae.method(method, **method_options), data, runs, (seed,), training)
     return path
 
 
@@ -269,19 +269,19 @@ def work(
     """
     if accelerator == "cuda":
         require_gpu("accelerator")
-    own, like = archive(stored, name), SETS[name].like or name
-    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like])
-    judged = fitted_metric_models(opened, stored / like, SETS[name].metric_models)
+    store, like = archive(stored, name), SETS[name].like or name
+    dataset = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like])
+    metric_models = fitted_metric_models(dataset, stored / like, SETS[name].metric_models)
 
     def score(path: Path | None, row: str, view: View) -> dict[str, Any]:
-        data, by = opened, judged
+        data, by = dataset, metric_models
         if view.metric_models:
-            data, by = grouped(opened), fitted_metric_models(opened, stored / like, view.metric_models.split("+"))
+            data, by = grouped(dataset), fitted_metric_models(dataset, stored / like, view.metric_models.split("+"))
         elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
-            by = {metric_model: run for metric_model, run in judged.items() if metric_model != "prior"}
+            by = {metric_model: run for metric_model, run in metric_models.items() if metric_model != "prior"}
         models = {} if path is None else {row: load(path).model.to(accelerator)}
-        known: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
-        options = {"references": False} if models else known
+        extra: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
+        options = {"references": False} if models else extra
         windows, told = view.windows(data, "test"), view.evaluate(samples)
         if view.parts:
             ways: dict[str, Any] = {"held": Held, "nearest": partial(Nearest, lower=places(windows)["lower"])}
@@ -297,10 +297,10 @@ def work(
     every = {**SETS[name].methods, **methods}  # a second stage uses the set's options of its first stage
     for seed, row in itertools.product(seeds, methods):
         members = {view: view.member(f"{folder(row)}-seed{seed}") for view in views[row]}
-        if missing := {view: member for view, member in members.items() if member not in own.names}:
-            path = fit(opened, row, every, seed, runs / name, judged.get("prior"), accelerator)
+        if missing := {view: member for view, member in members.items() if member not in store.names}:
+            path = fit(dataset, row, every, seed, runs / name, metric_models.get("prior"), accelerator)
             for view, member in missing.items():
-                own.add(member, score(path, row, view))
+                store.add(member, score(path, row, view))
 
 
 class Wrapped(nn.Module):
@@ -336,10 +336,10 @@ class Nearest(Wrapped):
 
     def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
         """Futures, by the squared distance over all frames."""
-        made = self.model.forecast(past, horizon, self.MANY * samples, **options)["x"]
-        lower = made[..., self.lower]
+        candidates = self.model.forecast(past, horizon, self.MANY * samples, **options)["x"]
+        lower = candidates[..., self.lower]
         nearest = (lower - lower[0]).square().sum((2, 3)).topk(samples, 0, largest=False).indices
-        return {"x": made.take_along_dim(nearest[..., None, None], 0)}
+        return {"x": candidates.take_along_dim(nearest[..., None, None], 0)}
 
 
 def places(windows: Any) -> dict[str, list[int]]:
@@ -354,8 +354,8 @@ def diversities(windows: Any) -> list[Measure]:
     def of(place: Any) -> Any:
         return lambda forecasts, *_: average_pairwise_distance(forecasts[..., place])
 
-    scored = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
-    return [Measure(name, of(place), "m", "higher") for name, place in scored.items()]
+    selections = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
+    return [Measure(name, of(place), "m", "higher") for name, place in selections.items()]
 
 
 REFERENCES = "references"
@@ -372,27 +372,29 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
     Raises:
         ValueError: scores of other windows, samples, or metric models.
     """
-    found, basis = dict[str, Row](), None
-    own, like = archive(stored, name), archive(stored, SETS[name].like or name)
+    rows, basis = dict[str, Row](), None
+    store, like = archive(stored, name), archive(stored, SETS[name].like or name)
     if view.member(REFERENCES) in like.names:
         references = like.read([view.member(REFERENCES)])
         basis = references[0]["basis"]
-        found = {row: Row(references, row, trained=False) for row in references[0]["rows"]}
-    names = own.names
+        rows = {row: Row(references, row, trained=False) for row in references[0]["rows"]}
+    names = store.names
     for row in methods:
-        if chosen := fnmatch.filter(names, view.member(f"{folder(row)}-seed*")):
-            scored = own.read(chosen)
-            basis = basis or scored[0]["basis"]
-            if any(alike(each["basis"]) != alike(basis) for each in scored):
-                raise ValueError(f"scores of {row} in {own.file} are of other windows, samples, seed or metric models")
-            found[row] = Row(scored, row)
-    return found
+        if members := fnmatch.filter(names, view.member(f"{folder(row)}-seed*")):
+            runs = store.read(members)
+            basis = basis or runs[0]["basis"]
+            if any(alike(each["basis"]) != alike(basis) for each in runs):
+                raise ValueError(
+                    f"scores of {row} in {store.file} differ from the others in windows, samples, seed or metric models"
+                )
+            rows[row] = Row(runs, row)
+    return rows
 
 
 def rows_of(stored: Path, name: str, view: View) -> dict[str, Row]:
     """Return the scored rows of a set with the reference rows; empty if no method is scored."""
-    found = entries(stored, name, view, SETS[name].methods)
-    return found if any(entry.trained for entry in found.values()) else {}
+    rows = entries(stored, name, view, SETS[name].methods)
+    return rows if any(entry.trained for entry in rows.values()) else {}
 
 
 EMISSION = 3
@@ -408,8 +410,8 @@ def titled(name: str, entry: Row) -> str:
     """Return the label of a row, with the options that distinguish it."""
     first = entry.runs[0]
     modes = first["config"].get("method", {}).get("modes")
-    apart = ["drawn"] * (first["basis"][EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
-    return f"{name} ({', '.join(apart)})" if apart else name
+    details = ["drawn"] * (first["basis"][EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
+    return f"{name} ({', '.join(details)})" if details else name
 
 
 TRAINED = ("seeds", "CPU minutes")
@@ -423,31 +425,31 @@ def trained(entry: Row) -> tuple[str, str]:
     return str(len(entry.runs)), f"{statistics.fmean(here):.1f}" if here else "GPU"
 
 
-def ranked(found: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
+def ranked(rows: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
     """The energy score of all but the truth, the best first."""
-    scores = {name: entry.crossed(RANKED) for name, entry in found.items() if name != "real motion"}
-    known = {name: score for name, score in scores.items() if score is not None}  # all motion has it
-    return dict(sorted(known.items(), key=lambda item: item[1].mean))
+    scores = {name: entry.crossed(RANKED) for name, entry in rows.items() if name != "real motion"}
+    complete = {name: score for name, score in scores.items() if score is not None}  # all motion has it
+    return dict(sorted(complete.items(), key=lambda item: item[1].mean))
 
 
-def ranking(found: Mapping[str, Row], columns: Sequence[str]) -> str:
+def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> str:
     """Return rows sorted by energy score, with differences to the neighbours and to the row above.
 
     The model confidence set follows the table.
     """
-    scores = ranked(found)
+    scores = ranked(rows)
     header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
     lines = []
     for name, above in zip(scores, [None, *scores], strict=False):
-        own = found[name]
+        row = rows[name]
         minus = [None if name == NEIGHBOURS else NEIGHBOURS, above]
         behind = [None if other is None else scores[name].estimate(scores[other]) for other in minus]
-        lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *map(own.estimate, columns)])])
-    known = {name: score for name, score in scores.items() if score.count >= ENOUGH}
-    if not any(found[name].trained for name in known):
+        lines.append([titled(name, row), *trained(row), *map(cell, [*behind, *map(row.estimate, columns)])])
+    tested = {name: score for name, score in scores.items() if score.count >= ENOUGH}
+    if not any(rows[name].trained for name in tested):
         return table(header, lines)
     best = f"May be the best, at {100 * LEVEL:.0f} % over clips and seeds, of rows with {ENOUGH} seeds or more"
-    return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(known, level=LEVEL).members)}.\n"
+    return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(tested, level=LEVEL).members)}.\n"
 
 
 def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
@@ -501,18 +503,18 @@ def main(
     refuse_unknown("set", sets, SETS)
     refuse_unknown("method", methods, {**FUTURES, **PATHS})
     for name in sets:
-        chosen = SETS[name]
+        selected = SETS[name]
         if data is not None:
-            named = {row: options for row, options in chosen.methods.items() if not methods or row in methods}
-            work(data, runs, scores, name, named, dict.fromkeys(named, chosen.views), seeds, samples, accelerator)
+            named = {row: options for row, options in selected.methods.items() if not methods or row in methods}
+            work(data, runs, scores, name, named, dict.fromkeys(named, selected.views), seeds, samples, accelerator)
         tables = []
-        for view in chosen.views:
+        for view in selected.views:
             if rows := rows_of(scores, name, view):
                 heading = "" if view.given is None else f"With {view.given} path{'s' * (view.given != 1)} given:\n\n"
-                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if chosen.metric_models else ())]))
+                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if selected.metric_models else ())]))
         if tables:
             write(page, *tables, name=name)
-    sought = {name: rows_of(scores, name, View()) for name, chosen in SETS.items() if View() in chosen.views}
+    sought = {name: rows_of(scores, name, View()) for name, selected in SETS.items() if View() in selected.views}
     futures = {name: rows for name, rows in sought.items() if rows}
     if page is not None and futures:
         drawn(futures).savefig(picture, dpi=110)
