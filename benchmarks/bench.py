@@ -1,13 +1,13 @@
-"""Runs benchmarks, compares them with the last release and keeps them: `python -m benchmarks.bench`, or `make bench`.
+"""Run benchmarks, compare them with the last release and store them: `python -m benchmarks.bench`, or `make bench`.
 
-A benchmark is a module of this folder with `rows(device)`, from names to numbers, and `TARGETS`, from some of these
-names to a side and a bound, or None. Numbers are ratios within one run, or sizes. "at most" is a row that is better the
-less it is, as all are that `TARGETS` does not name, and "at least" one that is better the more; "under" and "over" have
-a bound alone, as exponents and seconds do, of which a tenth means nothing on another machine.
+A benchmark is a module of this folder with two members. `rows(device)` returns numbers by name. `TARGETS` maps some of
+the names to a side and a bound, or None. Numbers are ratios within one run, or sizes. Lower is better for "at most",
+the default, and higher for "at least". "under" and "over" only have a bound: exponents and seconds differ by more than
+a tenth between machines.
 
-The exit status is 1 where a row is worse by more than a tenth than at the last release, which is the first record of
-the last version, or misses a target that it met there. Machines of one name differ by as much. So such a row is
-measured once more, of which the better counts, and then beside the code of that record, which git has.
+The exit status is 1 if a row is worse by more than a tenth than at the last release, or misses a target that it met
+there. The release is the first record of the last version. Machines of one name differ by as much, so such a row is
+measured again, and the better value counts. Then it is compared with the code of that record on this machine.
 """
 
 from __future__ import annotations
@@ -75,34 +75,34 @@ def better(one: Rows, other: Mapping[str, float], targets: Targets) -> Rows:
     return {row: (min if targets[row][0] in LESS else max)(values) for row, values in both.items()}
 
 
-def slower(found: Mapping[str, float], targets: Targets, before: Mapping[str, float]) -> list[str]:
+def slower(rows: Mapping[str, float], targets: Targets, before: Mapping[str, float]) -> list[str]:
     """Rows that are worse than before by more than a tenth, or miss a target that they met."""
 
     def is_slower(row: str) -> bool:
-        (side, _), now, then = targets[row], found[row], before[row]
+        (side, _), now, then = targets[row], rows[row], before[row]
         costs = side in COMPARED and (now > WORSE * then if side in LESS else then > WORSE * now)
         return costs or (met(then, targets[row]) and not met(now, targets[row]))
 
-    return [row for row in found if row in before and is_slower(row)]
+    return [row for row in rows if row in before and is_slower(row)]
 
 
-def missed(found: Mapping[str, float], targets: Targets) -> list[str]:
-    """What is to be said of rows that miss their targets."""
-    rows = [row for row in found if not met(found[row], targets[row])]
-    return [f"{row}: {found[row]:.2f} is to be {targets[row][0]} {targets[row][1]:g}" for row in rows]
+def missed(values: Mapping[str, float], targets: Targets) -> list[str]:
+    """Return one message for each row that misses its target."""
+    rows = [row for row in values if not met(values[row], targets[row])]
+    return [f"{row}: {values[row]:.2f} must be {targets[row][0]} {targets[row][1]:g}" for row in rows]
 
 
 def commit() -> str:
-    """Of what is measured; "" where git does not know."""
+    """Return the short hash of the measured commit; "" if git cannot find it."""
     return _git("rev-parse", "--short", "HEAD")
 
 
 def _git(*arguments: str) -> str:
     try:
-        done = subprocess.run(["git", "-C", HERE, *arguments], capture_output=True, text=True, check=True)
+        process = subprocess.run(["git", "-C", HERE, *arguments], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return ""
-    return done.stdout.strip() or "done"
+    return process.stdout.strip() or "done"
 
 
 def there(commit: str, name: str, device: str, threads: int) -> Rows:
@@ -139,37 +139,37 @@ def machine(device: torch.device) -> dict[str, Any]:
 
 
 def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
-    """The history with a record. Of a version there are two, its first and its last, which keep what is not in it."""
+    """Return the history with a record added; a version keeps its first and its last record, with rows merged."""
     alike = [each for each in records if (each["version"], how(each)) == (record["version"], how(record))]
-    own = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
-    joined = {
-        key: {name: value for part in (*own, record) for name, value in part[key].items()}
+    matching = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
+    merged = {
+        key: {name: value for part in (*matching, record) for name, value in part[key].items()}
         for key in ("rows", "targets")
     }
-    if not own:
+    if not matching:
         return [*records, record]
-    return [record | joined if each is own[0] else each for each in records]
+    return [record | merged if each is matching[0] else each for each in records]
 
 
 def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
-    """What a record is compared with, and of which commit that is: of each row the first number of the last version."""
+    """Return the reference of each row, the first number of the last version in other commits, and its commit."""
     others = [each for each in records if how(each) == how(record) and each["commit"] != record["commit"]]
-    found: dict[str, tuple[float, str]] = {}
+    reference: dict[str, tuple[float, str]] = {}
     for each in others:
         if each["version"] == others[-1]["version"]:
-            found = {row: (value, each["commit"]) for row, value in each["rows"].items()} | found
-    return found
+            reference = {row: (value, each["commit"]) for row, value in each["rows"].items()} | reference
+    return reference
 
 
 def how(record: dict[str, Any]) -> tuple[str, int]:
-    """On which device and how many threads a record was measured; the first ones were, untold, on the processor."""
+    """Return the device and the number of threads of a record; records without them are from the processor."""
     return record["machine"].get("device", "cpu"), record["machine"]["threads"]
 
 
 def page(records: list[dict[str, Any]], path: Path | None = DOCS / "results" / "speed.md") -> None:
-    """Writes the history, newest first, of what was measured as the last was, and the ratio of the last two.
+    """Write the table of the records measured like the last one, newest first, with the ratio to the release.
 
-    Of the processor and of a GPU there is one each.
+    The page has one table for the processor and one for a GPU.
     """
     newest = [record for record in records[::-1] if how(record) == how(records[-1])]
     last, before = newest[0], released(records, records[-1])
@@ -205,19 +205,21 @@ def main(
     """Measure.
 
     Args:
-        names: of benchmarks.
-        threads: of torch.
-        device: where models and their data are. On a GPU some rows are left out, which is told.
-        out: where the numbers are written, after each benchmark.
-        keep: whether they join the history, as those of this version, and its page.
+        names: benchmarks to run.
+        threads: number of torch threads.
+        device: device of models and data. A GPU skips some rows; the output names them.
+        out: file of the numbers, written after each benchmark.
+        keep: whether to add the numbers to the history and its page.
     """
     refuse_unknown("benchmark", names, NAMES)
     if device == "cuda":
         require_gpu("device")
     if threads < 1:
-        sys.exit(f"threads is {threads}, expected 1 or more")
+        sys.exit(f"threads must be at least 1, got {threads}")
     if not out.parent.is_dir():
-        sys.exit(f"{out} has no folder to be written to; make {out.parent} first, or name another file by --out")
+        sys.exit(
+            f"{out} is in a folder that does not exist; create {out.parent} first, or name another file with --out"
+        )
     torch.set_num_threads(threads)
     place = torch.device(device)
     record = {
@@ -228,14 +230,16 @@ def main(
     }
     records = json.loads(HISTORY.read_text()) if HISTORY.exists() else []
     release = {} if BESIDE in os.environ else released(records, record)
-    found: Rows = {}
+    numbers: Rows = {}
     targets: dict[str, Target] = {}
     failed: list[str] = []
     for name in names:
         print(f"{name} ...", flush=True)
-        left_out = {row: why for row, why in PROCESSORS.items() if device != "cpu" and row.partition(":")[0] == name}
-        for row, why in left_out.items():
-            print(f"  {row} is left out: it {why}", flush=True)
+        left_out = {
+            row: reason for row, reason in PROCESSORS.items() if device != "cpu" and row.partition(":")[0] == name
+        }
+        for row, reason in left_out.items():
+            print(f"  {row} is left out: it {reason}", flush=True)
         if name in left_out:
             continue
         rows, bounds = measured(name, place)
@@ -244,8 +248,8 @@ def main(
             rows = better(rows, measured(name, place)[0], bounds)
         if doubtful := slower(rows, bounds, before):
             for old in {release[row][1] for row in doubtful}:
-                beside = there(old, name, device, threads)
-                before |= {row: value for row, value in beside.items() if row in before and release[row][1] == old}
+                old_rows = there(old, name, device, threads)
+                before |= {row: value for row, value in old_rows.items() if row in before and release[row][1] == old}
             failed += [
                 f"{row}: {rows[row]:.2f} was {before[row]:.2f} at the last release"
                 for row in slower(rows, bounds, before)
@@ -255,15 +259,15 @@ def main(
             was = f"{before[row]:8.2f}" if row in before else " " * 8
             side, bound = bounds[row]
             print(f"  {row:50} {value:8.2f} {was}   {'' if bound is None else f'{side} {bound:g}'}", flush=True)
-        found |= {row: round(value, 4) for row, value in rows.items()}
+        numbers |= {row: round(value, 4) for row, value in rows.items()}
         targets |= bounds
-        written = record | {"rows": found, "targets": targets}
+        written = record | {"rows": numbers, "targets": targets}
         out.write_text(json.dumps(written, indent=1) + "\n")
         if keep:
             records = kept(records, written)
             HISTORY.write_text(json.dumps(records, indent=1) + "\n")
             page(records)
-    for title, lines in (("targets missed:", missed(found, targets)), ("slower than at the last release:", failed)):
+    for title, lines in (("targets missed:", missed(numbers, targets)), ("slower than at the last release:", failed)):
         if lines:
             print(title, *lines, sep="\n  ")
     return int(bool(failed))
@@ -273,4 +277,4 @@ if __name__ == "__main__":
     try:
         sys.exit(tyro.cli(main, description=__doc__))
     except KeyboardInterrupt:
-        sys.exit("stopped; benchmarks that had ended are written, give the names of the others to go on")
+        sys.exit("stopped; finished benchmarks are written; to continue, give the names of the others")

@@ -1,12 +1,12 @@
 """Speed of completion by a latent of the paper's size: `python -m benchmarks.bench completion`.
 
-    whole      100 segments from one start each, of which 16 markers are seen in 5 frames: one by one over in one batch
+    whole      100 segments from one start each, with 16 markers in 5 frames: one by one over in one batch
     starts     the same from four starts each, the default
-    descent    the same of steps of Adam alone
-    curvature  of what comes once, above all the posterior's curvature
+    descent    the same, for steps of Adam only
+    curvature  the same, for the part that is computed once, mainly the posterior's curvature
 
-Of one segment most time goes into starting operations, of many into the operations themselves. The decoder is not
-fitted, which changes no time; a segment stands for all of those that are completed one by one.
+A single segment spends most time on starting operations, a batch on the operations themselves. The decoder is not
+fitted, which does not change the time. One segment represents all in the one-by-one timing.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Motion files and pages: `python -m benchmarks.bench files`; a minute or two on two cores.
 
-gain          300 BVH clips of 2,400 frames resampled and written again, a clip at a time: how much faster on all
-              cores than on one, for each core
-GB held       by all processes together meanwhile (Linux tells), which is no matter of how many clips
-MB of a page  of a run with 50 futures of 6 windows
+gain          speed-up of all cores over one, per core, for resampling and writing 300 BVH clips of 2,400 frames
+GB held       memory of all processes together meanwhile (Linux only); does not depend on the number of clips
+MB of a page  for a run with 50 futures of 6 windows
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ def page(folder: Path) -> dict[str, float]:
     run, out = str(folder / "run"), folder / "page.html"
     options = ["--steps", "10", "--latent", "4", "--warm-up", "5", "--validate-every", "5"]
     if dvae(["fit", "srnn", *options, "--out", run]) or dvae(["report", run, "--samples", "50", "--out", str(out)]):
-        raise SystemExit("there is no page")
+        raise SystemExit("`dvae fit` or `dvae report` failed, so that no page was written; see its output above")
     return {"MB of a page": out.stat().st_size / 1e6}
 
 

@@ -1,13 +1,13 @@
 """Quality on real motion: `python benchmarks/forecasts.py`; about 15 minutes a file on one core.
 
-Fits hit-dvae on bandai2 (by style) and on cmu8, as `dvae fit` does, and asks of its forecasts on the test windows
+Fits hit-dvae on bandai2 (by style) and on cmu8, as `dvae fit` does, and checks its forecasts on the test windows:
 
-    ADE, FDE      best of 50, below those of zero velocity
-    KL            of every latent above 0.1 nats a frame: nothing has collapsed
-    300 frames    finite; the length of every bone within 15 %, on average over frames, of the skeleton's; the mean
-                  speed of the last second at least half that of real motion
+    ADE, FDE      best of 50, below the errors of zero velocity
+    KL            every latent above 0.1 nats a frame, so that no latent has collapsed
+    300 frames    finite; the length of every bone within 15 % of the skeleton's, on average over frames; the mean
+                  speed of the last second at least half the speed of real motion
 
-A file that is not there is left out. The exit code is 1 where something is missed.
+Missing files are skipped. The exit code is 1 if a check fails.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FILES = (DATA / "bandai" / "bandai2.npz", DATA / "cmu" / "cmu8.npz")
 
 
 def rows(file: Path, steps: int, batch_size: int) -> Iterator[tuple[str, float, str, float]]:
-    """Name, value, and what is asked of it."""
+    """Yield the name of each row, its value, the side of its bound and the bound."""
     data = MotionData.open(file)
     with tempfile.TemporaryDirectory() as folder:
         start, out = time.perf_counter(), Path(folder) / "run"

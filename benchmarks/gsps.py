@@ -1,13 +1,13 @@
 """Speed of GSPS at the Human3.6M preset: `python -m benchmarks.bench gsps`.
 
-    step      a training step (windows and their pseudo ground truths, forward, backward, Adam; 16 windows of 25 + 100
-              frames, 10 x 10 futures each), over its matrix products alone
-    energies  the share of a step that the energies of futures take that are there, forward and backward
+    step      a training step (forward, backward, Adam; 16 windows of 25 + 100 frames with pseudo ground truths, 10 x 10
+              futures each), over its matrix products
+    energies  share of a step for the energies of given futures, forward and backward
     prior     the pose prior's energy, with the reflections of its layers one after the other over all at once
-    memory    the most that the process held, in GB, not that of a GPU; the public implementation 6.7
-    futures   50 futures of 16 windows, over their matrix products alone
+    memory    peak memory of the process in GB, without the GPU's; the public implementation uses 6.7
+    futures   50 futures of 16 windows, over their matrix products
 
-Motion is simulated, on the same tree of joints. Times are the least of several, in turns with what they compare to.
+Motion is simulated, on the same tree of joints. Times are the shortest of several; the two sides of a ratio alternate.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TARGETS = {"energies": ("at most", 0.25), "prior": ("at least", 3.0), "memory": 
 
 
 def sequential(flow: QRFlowModule, x: torch.Tensor) -> torch.Tensor:
-    """What the flow makes of x, by one reflection after the other."""
+    """Apply the flow to x with one reflection after the other."""
     for layer, (upper, bias) in enumerate(zip(flow.factors()[1], flow.bias, strict=True)):
         if layer:
             x = torch.where(x < 0, flow.log_slope[layer - 1].exp() * x, x)

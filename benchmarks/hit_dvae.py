@@ -1,19 +1,18 @@
 """Speed of HiT-DVAE at the paper's widths and 15 + 60 frames: `python -m benchmarks.bench hit_dvae`.
 
-    cache      50 futures of 60 frames for one window with caches, against attending to the whole prefix anew at every
-               frame; how many times faster
-    growth     the cost of a frame among 300 against that of a frame among 60: at most in proportion to the frames
-    frame      of generation at the preset for small sets, 50 futures of one window, over its matrix products alone
-    seconds    to make 50 futures of 60 frames for each of 100 windows
-    samples    memory that 1,024 futures of 8 windows take beside themselves, over that of 512, which fill two chunks
-    evaluation of 50 futures of each of a few windows at that preset, with all scores of motion and the bound, without
-               reference rows, over its matrix products alone; seconds: by those of 78, what a processor takes for
-               1,834 windows, as many as bandai2's test has
-    step       a training step (16 windows, K motions each; forward, backward, Adam) in which the model reads its own
-               output, against one in which it reads the truth: exactly, step by step; the same with gradients back in
-               time; and in two parallel passes
+    cache       speed-up by caches for 50 futures of 60 frames of one window, over attending to the whole prefix anew
+    growth      cost of a frame among 300 over the cost among 60; at most proportional to the frames
+    frame       generation of a frame at the preset for small sets, 50 futures of one window, over its matrix products
+    seconds     time of 50 futures of 60 frames for each of 100 windows
+    samples     memory of 1,024 futures of 8 windows over the memory of 512, which fill two chunks
+    evaluation  50 futures of a few windows at that preset, with all motion scores and the bound, without reference
+                rows, over the matrix products. "evaluation, seconds" extrapolates to the 1,834 windows of bandai2's
+                test set
+    step        a training step (16 windows, K motions each; forward, backward, Adam) in which the model reads its own
+                output, over one with true frames. "exact": step by step; "gradient": with gradients back in time;
+                "two passes": two parallel passes
 
-Motion is simulated. Times are the least of several, in turns with what they compare to.
+Motion is simulated. Times are the shortest of several; the two sides of a ratio alternate.
 """
 
 from __future__ import annotations

@@ -1,14 +1,12 @@
-"""Training on 10^7 frames on a disk beside fewer of them in memory: `python -m benchmarks.bench mapped`; takes some
-minutes, and 2.5 GB where temporary files go.
+"""Training on 10^7 frames on disk over fewer in memory: `python -m benchmarks.bench mapped`; minutes, 2.5 GB of disk.
 
-memory          most anonymous memory (Linux tells) of `dvae fit` on 10^7 frames of 48 numbers, over that on 10^5
-memory, motion  likewise of 17 joints, of an archive of 100 clips over one of as many shorter ones, which is in memory
-a step          processor time of drawing a batch and a training step, frames mapped over frames in memory: SRNN, B 32,
-                T 125
-a draw          of the batch alone
+memory          peak anonymous memory (Linux only) of `dvae fit` on 10^7 frames of 48 numbers, over 10^5
+memory, motion  the same for 17 joints: an archive of 100 clips over one of as many shorter clips in memory
+a step          processor time of drawing a batch and a training step, mapped over in memory: SRNN, B 32, T 125
+a draw          the same for drawing the batch only
 
-All commands end with a validation, on a tenth of the frames. Files were just written, so that the system has most of
-them in its cache; where it has not, a draw waits for the disk, of which processor time says nothing.
+All commands end with a validation, on a tenth of the frames. Files were just written, so that most of them are in the
+system's cache. Without the cache, a draw waits for the disk, and processor time does not include that wait.
 """
 
 from __future__ import annotations

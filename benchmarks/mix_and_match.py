@@ -1,10 +1,10 @@
 """Speed of Mix-and-Match at the preset for small sets and 15 + 60 frames: `python -m benchmarks.bench mix_and_match`.
 
     feeding    a training step (32 windows of quaternions; forward, backward, Adam) in which the decoder reads its own
-               poses, against one in which it reads the true ones, whose loop is torch's
+               poses, over one with true poses, which uses torch's loop
     step       seconds of the first
 
-Motion is simulated. Times are the least of several, in turns with what they compare to.
+Motion is simulated. Times are the shortest of several; the two sides of a ratio alternate.
 """
 
 from __future__ import annotations

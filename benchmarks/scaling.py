@@ -1,14 +1,14 @@
-"""How a fit grows with processes and with sizes, as ratios within one run: `python -m benchmarks.bench scaling`.
+"""Scaling of a fit with processes and sizes, as ratios within one run: `python -m benchmarks.bench scaling`.
 
-    METHOD, two processes     windows a second of two processes over those of one, with the same batch in each
-    METHOD, two alone         the same where neither knows of the other: what the machine allows
-    METHOD, exchange          share of a step's processor time in which gradients are made those of both
+    METHOD, two processes     windows a second of two processes over one, with the same batch in each
+    METHOD, two alone         the same without communication: the limit of the machine
+    METHOD, exchange          share of a step's processor time spent on exchanging gradients
     METHOD over T, K, B, D    exponents of power laws: a training step over frames, particles, windows in a batch and
                               numbers in a frame
-    METHOD over clips         of a batch drawn from so many clips, and a step on it
-    METHOD, held-out clips    of the bound of so many
+    METHOD over clips         the same over the clips of the training set, with the draw of the batch
+    METHOD, held-out clips    the same for the bound of the test clips
 
-Processes that wait for one another are timed by the clock, and need two cores of their own: the sides take turns, a few
+Processes that wait for one another are timed by the wall clock, and need two free cores. The sides alternate, a few
 steps at a time, and the shortest turn of each counts. Exponents are of processor time.
 """
 
@@ -119,7 +119,7 @@ def two(name: str) -> dict[str, float]:
 
 
 def exponent(sizes: Sequence[int], action: Callable[[int], Callable[[], object]], repeat: int = 5) -> float:
-    """Of the size in the least time of what is made for it."""
+    """Return the exponent of the size in the shortest time of the actions."""
     times = seconds(*map(action, sizes), repeat=repeat)
     return math.log(times[-1] / times[0]) / math.log(sizes[-1] / sizes[0])
 
@@ -140,7 +140,7 @@ def sizes(name: str) -> dict[str, float]:
 
 
 def clips(name: str) -> dict[str, float]:
-    """Exponents of the number of clips: of what a step takes from them, and of a validation."""
+    """Return the exponents of a training step and of a validation over the number of clips."""
     svi = begun(name)
 
     def windows(count: int, split: str) -> motion.Windows:

@@ -1,7 +1,7 @@
 """Print the size of the project and its targets: `python -m benchmarks.size`; takes a minute.
 
 lines      lines of code, without docstrings, comments and blank lines
-calls      calls between files of the project, in a training step, in a forecast of 50 futures of 60 frames, and from a
+calls      calls between files of the project: in a training step; in a forecast of 50 futures of 60 frames; from a
            DataFrame to a CSV of forecasts by an unfitted model
 """
 

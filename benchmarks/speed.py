@@ -1,16 +1,16 @@
 """Speed of the engine and of the family, as ratios within one run: `python -m benchmarks.bench speed`.
 
-    program   the Pyro training step of an SRNN against the same computation written by hand in torch
-    chain     an SRNN training step with a plain loop over z_{t-1} against the fused one
-    cache     generation with caches against recomputing the prefix at every step, Attention
+    program   the Pyro training step of an SRNN over the same computation written by hand in torch
+    chain     an SRNN training step with a plain loop over z_{t-1} over the fused one
+    cache     generation with the prefix recomputed at every step over generation with caches, Attention
     linear    seconds of a training step over T, Recurrent: the exponent of a power law
-    segments  segments seen as time-stamped frames against forward kinematics of as many poses, on one core
-    filter    a Kalman chain of 10,000 steps in blocks against one step after the other; filter-step: with its gradients
-    the family, by name: a whole training step (forward, backward, Adam) at the layer sizes of the public
-              implementation over the LSTM layers that are in it, forward and backward, alone
+    segments  segments seen as time-stamped frames over forward kinematics of as many poses, on one core
+    filter    a Kalman chain of 10,000 steps in blocks over step by step; filter-step: with its gradients
+    VARIANT   a training step (forward, backward, Adam) at the layer sizes of the public implementation over the
+              forward and backward passes of its LSTM layers
 
-Times are the least of several repetitions, the two sides of a ratio alternating, so that what else the machine does
-counts least; with one thread they are the processor's. On a GPU they end when all is done that was asked of it.
+Times are the shortest of several repetitions. The two sides of a ratio alternate, to reduce the influence of other
+processes. With one thread, times are processor times. On a GPU, each timing ends with a synchronisation.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ TARGETS = {
     "program": ("at most", 1.15),
     "chain": ("at least", 1.0),
     "cache": ("at least", 8.0),
-    "linear": ("under", 1.1),  # 1 is linear; what is timed is exact to a few percent
+    "linear": ("under", 1.1),  # 1 is linear; timings are exact to a few percent
     "segments": ("at most", 3.0),
     "filter": ("at most", 0.1),
     "filter-step": ("at most", 0.1),
@@ -77,7 +77,7 @@ def seconds(*actions: Callable[[], object], repeat: int = 15) -> list[float]:
 
 
 def stopwatch() -> Callable[[], float]:
-    """Tells seconds: the processor's with one thread; where there is a GPU at work, the clock's, once it has done."""
+    """Return a clock in seconds: processor time for one thread, otherwise wall time; a GPU is synchronised first."""
     if not torch.cuda.is_initialized():
         return time.process_time if torch.get_num_threads() == 1 else time.perf_counter
 
@@ -107,9 +107,9 @@ def layers(model: nn.Module, x: Tensor) -> Callable[[], None]:
 
 
 class Products(TorchDispatchMode):
-    """Within it matrix products are noted, those of backward passes too; `run` makes as many of the same shapes.
+    """Record the matrix products within this mode, including backward passes; `run` repeats the same shapes.
 
-    Attention's kernel is two products and what lies between them.
+    Attention's kernel counts as a whole: two products and the operations between them.
     """
 
     ATTENTION = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
@@ -169,7 +169,7 @@ def products(action: Callable[[], object]) -> Callable[[], None]:
 
 
 def over_products(*actions: Callable[[], object], repeat: int = 3) -> list[float]:
-    """Times of actions over those of their matrix products alone."""
+    """Return the time of each action divided by the time of its matrix products."""
     times = seconds(*(each for action in actions for each in (action, products(action))), repeat=repeat)
     return [whole / alone for whole, alone in zip(times[::2], times[1::2], strict=True)]
 
@@ -293,7 +293,7 @@ def segments() -> float:
 
 
 def filters(device: torch.device, steps: int = 10_000, batch: int = 1, size: int = 4) -> tuple[float, float]:
-    """Time of a Kalman chain in blocks over that of one step after the other: forward, and with its gradients."""
+    """Return the time of a Kalman chain in blocks over that step by step: forward, and with gradients."""
     options: Any = {"device": device, "requires_grad": True}
     emission, one = 0.3 * torch.randn(steps, batch, 2 * size, size, device=device), torch.eye(size, device=device)
     chain = LinearGaussianChain(

@@ -1,6 +1,6 @@
-"""How soon the command line answers, beside `import torch`: `python -m benchmarks.bench startup`.
+"""Startup time of the command line over `import torch`: `python -m benchmarks.bench startup`.
 
-Times are the least of several starts, the sides alternating.
+Times are the shortest of several starts; the sides alternate.
 """
 
 import subprocess

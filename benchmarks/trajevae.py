@@ -1,11 +1,10 @@
 """Speed of TrajeVAE at its size for Human3.6M: `python -m benchmarks.bench trajevae`.
 
-    step      a training step (32 windows of 1 + 100 frames; forward, backward, Adam), over its
-              matrix products alone
-    sampling  50 motions of one pose and its paths, over their matrix products alone
-    bend      5 motions of 100 frames bent to the path of a wrist, in seconds, once
+    step      a training step (32 windows of 1 + 100 frames; forward, backward, Adam), over its matrix products
+    sampling  50 motions of one pose and its paths, over their matrix products
+    bend      seconds of bending 5 motions of 100 frames to the path of a wrist, once
 
-Motion is simulated, on the same tree of joints. Times are the least of several, in turns with the products.
+Motion is simulated, on the same tree of joints. Times are the shortest of several, alternating with the products.
 """
 
 from __future__ import annotations

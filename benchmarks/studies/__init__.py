@@ -1,4 +1,4 @@
-"""What makes the tables and pictures of the pages: `python -m benchmarks.studies.NAME`, from the project's folder.
+"""Scripts for the tables and pictures of the pages: `python -m benchmarks.studies.NAME`, from the project's folder.
 
-Each is a module whose `main` has the command line's arguments, and options by which a test runs it on little.
+The arguments of each module's `main` are its command line. They include options for tests on little data.
 """

@@ -42,7 +42,7 @@ def sensors(path: Path, sequences: int = 600) -> dvae.tables.PanelData:
 
 
 def exact(edge: AblatedEdge, found: dvae.Ablation) -> float:
-    """What an edge is worth with the weights by which the data are made, in nats a step."""
+    """Return the exact cost of leaving out an edge, at the weights that generate the data, in nats a step."""
     if edge.kind == "p":
         moves = MOVES**2 / (1 - KEEPS**2) * KEEPS ** np.abs(np.subtract.outer(range(STEPS), range(STEPS)))
         covariance = np.kron(moves, np.outer(SENSORS, SENSORS)) + NOISE**2 * np.eye(STEPS * len(SENSORS))

@@ -24,13 +24,13 @@ def spread(cost: torch.Tensor) -> str:
 
 
 def derived(names: Sequence[str]) -> str:
-    """The guides of some models that miss nothing, by what they cost."""
+    """Return a table of the guides of some models without missing dependencies, with their cost."""
     rows = [(name, code(guide), *rest) for name in names for guide, *rest in dvae.alternatives(FAMILY[name][0]).rows]
     return table(["", "guide", "drawn", "edges", "looped", "KL by draws"], rows, "|---|---|---|---:|---|---|")
 
 
 def edge_rows(names: Sequence[str], steps: int, seeds: int) -> str:
-    """What each edge of the derived guide is worth by itself."""
+    """Return a table of the cost of leaving out each edge of the derived guide."""
     costs = {name: dvae.edge_costs(FAMILY[name][0], steps=steps, seeds=seeds) for name in names}
     rows = [(name, code(edge), spread(cost)) for name, each in costs.items() for edge, cost in each.items()]
     return words("", "edge", "cost of leaving it out", rows=rows)

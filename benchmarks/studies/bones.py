@@ -1,7 +1,6 @@
-"""Writes the tables of docs/results/bones.md from runs, which it evaluates on every few of their test windows.
+"""Write the tables of docs/results/bones.md from runs, evaluated on a part of their test windows.
 
-The page says how the runs were fitted, each method without `bones` and then with it. What is found of a run is kept in
-its directory.
+The page describes the fits of each method without `bones` and with it. Results of a run are stored in its directory.
 """
 
 import sys
@@ -35,7 +34,7 @@ def evaluated(path: Path, every: int, samples: int) -> Path:
 
 
 def joined(files: Sequence[Path]) -> dvae.Evaluation:
-    """Evaluations of single runs on the same windows as one, named by their files, beside the first's references."""
+    """Join evaluations of single runs on the same windows, named by file, with the references of the first."""
     found = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
     first = next(iter(found.values()))
     if any(same(each) != same(first) for each in found.values()):

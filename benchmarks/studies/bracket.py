@@ -1,7 +1,7 @@
-"""Writes the tables of docs/bounds.md of where guides lose what their ELBO lacks of the evidence.
+"""Write the tables of docs/bounds.md that divide the gap between evidence and ELBO into its causes.
 
-Of guides of a model whose evidence is known, and of runs. Brackets of runs lie in `KEPT` by the name of their run; what
-is there is not computed anew.
+They cover guides of a model with known evidence, and runs. Brackets of runs are stored in `KEPT` by the name of the
+run and are not computed again.
 """
 
 from pathlib import Path

@@ -1,12 +1,12 @@
-"""Measures prediction and completion by fitted runs of motion-latent, and writes their tables and pictures.
+"""Measure prediction and completion by fitted runs of motion-latent, and write the tables and pictures.
 
-Everything measured has a file under `--out`: the script goes on where it was stopped, skips what is there, and two of
-it may work on other parts or runs at once. Tables are of what is there, over all runs, which are seeds of one fit:
+Each measurement has a file under `--out`. An interrupted script continues there and skips existing files, and two
+processes may work on other parts or runs at once. Tables show the available files, over all runs, the seeds of one fit:
 
-    prediction    of the rest from the first quarter of a second, beside residual-sup and the last frame held
+    prediction    of the rest from the first quarter of a second, with residual-sup and the last frame as baselines
     completion    from M points a frame in all of 100 frames, and from few of them, with and without 16 markers
-    uncertainty   what intervals hold of surfaces and durations, k-hat, and whether descents converge
-    tuning        deviations and descents, by a run that was fitted on file group A alone (`--tuned`), judged on B
+    uncertainty   coverage of intervals for surfaces and durations, k-hat, and convergence of descents
+    tuning        deviations and descents, by a run fitted on file group A only (`--tuned`), evaluated on B
 
 Residual-sup (Martinez et al. 2017, arXiv 1705.02445) is the network of mix-and-match without noise that adds velocities
 to poses, on quaternions and places, fitted to the takes of the same training segments on the same body.
@@ -74,14 +74,14 @@ CONVERGED = 0.1
 
 @dataclass(frozen=True)
 class Budget:
-    """What it may cost.
+    """Size of the study.
 
     Args:
-        every: test segments that are predicted, each so many-th.
-        some: test segments that are completed from each kind of what was seen.
-        known: training segments, which are starts of descents, and of which the prior is.
-        steps: of training residual-sup.
-        dense: points of the true surface in each frame from which completed ones are measured.
+        every: step between test segments that are predicted.
+        some: number of test segments to complete for each kind of observation.
+        known: number of training segments for the starts of descents and for the prior.
+        steps: training steps of residual-sup.
+        dense: points of the true surface in each frame, for the distance to completed surfaces.
     """
 
     every: int = 1
@@ -93,12 +93,12 @@ class Budget:
 
 @dataclass(frozen=True)
 class Sight:
-    """What is seen of segments, beside when.
+    """Observed points and markers of a segment.
 
     Args:
-        points: in a frame, M.
-        frames: of 100, evenly.
-        markers: whether the 16 are seen too.
+        points: number of points in a frame, M.
+        frames: number of observed frames of 100, evenly spaced.
+        markers: whether the 16 markers are observed too.
     """
 
     points: int
@@ -121,10 +121,10 @@ class Sight:
 
 @dataclass(frozen=True)
 class Beginning:
-    """What is seen of segments: all of the first quarter of a second.
+    """Observation of the whole surface in the first quarter of a second.
 
     Args:
-        told: whether bodies are known.
+        told: whether body shapes are given.
     """
 
     told: bool = True
@@ -172,14 +172,14 @@ def grouped(people: motion.MotionSet) -> motion.MotionSet:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A run, and segments that it has not seen, which are read when they are asked for.
+    """A run and its test segments, read on first use.
 
     Args:
-        path: of the run.
-        data: file of the segments.
-        budget: what it may cost.
-        some: those that are completed, in place of those that are predicted.
-        grouped: it was fitted on file group A, and is judged on B.
+        path: directory of the run.
+        data: file of segments.
+        budget: size of the study.
+        some: whether to use the segments to complete instead of those to predict.
+        grouped: whether the run was fitted on file group A and is evaluated on B.
     """
 
     path: Path
@@ -204,7 +204,7 @@ class Held:
 
     @cached_property
     def segments(self) -> Segments:
-        """Those of the test, evenly over all."""
+        """Test segments, evenly spaced."""
         clips = self.split("test")[:: self.budget.every]
         return self.seen(subsample_clips(clips, self.budget.some) if self.some else clips)
 
@@ -216,7 +216,7 @@ class Held:
     def complete(
         self, seen: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
     ) -> Completed:
-        """From what was seen, and known segments for training."""
+        """Complete segments from observations, with known segments for training."""
         known = self.seen(subsample_clips(self.split("train"), self.budget.known)).all()
         how: dict[str, Any] = {"deviations": deviations, "descent": descent, "aggregate": aggregate}
         return complete(self.model, seen, **how, known=known)
@@ -259,7 +259,7 @@ def errors(held: Held, made: tuple[Tensor, Tensor], times: Sequence[float]) -> d
 
 
 def prediction(held: Held) -> dict[str, Any]:
-    """Errors by time of a run, and of what it makes of whole segments."""
+    """Return errors by time of predictions and of reconstructions of whole segments."""
     model, batch = held.model, held.batch
     times, _ = moments(held.segments.motion.skeleton.fps)
     found = {}
@@ -285,7 +285,7 @@ def recurrent(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
 
 
 def protocol(fps: float) -> motion.Protocol:
-    """Windows of what is seen and of what is not, up to the horizon, that face ahead in the last frame seen."""
+    """Return the protocol of windows up to the horizon, rotated to face ahead in the last observed frame."""
     times, seen = moments(fps)
     options: dict[str, Any] = {"root": "relative", "heading": True, "representation": "quaternion", "validation": 0.0}
     return motion.Protocol(SUP, seen, len(times) - seen, fps, train_stride=1, test_stride=100_000, **options)
@@ -362,7 +362,7 @@ def completed(held: Held, sight: Sight) -> dict[str, Any]:
 
 
 def ended(done: Completed) -> dict[str, Any]:
-    """Nats that a step of Newton's would still gain, and by which the second start ended behind the first."""
+    """Return three measures of convergence: nats to gain by a Newton step, nats between two starts, and `bent`."""
     posterior = done.posterior
     behind = posterior.behind[1] if len(posterior.behind) > 1 else torch.full_like(posterior.energy, torch.nan)
     return dict(zip(ENDS, (each.tolist() for each in (posterior.left, behind, posterior.bent)), strict=True))
@@ -371,10 +371,10 @@ def ended(done: Completed) -> dict[str, Any]:
 def certain(
     held: Held, sight: Any, deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
 ) -> dict[str, Any]:
-    """What intervals hold, by segment: shares of vertices' coordinates, and of durations, by level; and what is off.
+    """Return, by segment, the coverage of intervals for vertices and durations, and the errors.
 
-    Intervals are those of normals with the mean and variance of draws: of the surface alone, and with the deviation of
-    what was seen beside, of what would be seen; of durations, where nobody saw the end, with that of times.
+    Intervals are normal, with the mean and variance of draws. They are for the surface, the surface with its noise,
+    and, if the end is not observed, the duration with the deviation of times.
     """
     model, batch = held.model, held.batch
     done = held.complete(sight.of(model, batch), deviations, descent, aggregate)
@@ -425,7 +425,7 @@ def holds(what: str, level: float) -> str:
 
 
 def curves(out: Path) -> dict[str, Row]:
-    """What has errors by time."""
+    """Return the rows with errors by time."""
     ours, others = (read_all(out, name) for name in ("prediction", "references"))
     named = {OURS: ours, UNTOLD: ours, NEAR: ours, SUP: others, STILL: others}
     return {name: replace(row, name=name) for name, row in named.items() if row is not None}
@@ -444,13 +444,13 @@ def by_time(drawn: Mapping[str, Row]) -> str:
 
 
 def of_sights(out: Path, sights: Iterable[Any], name: str = "{}") -> dict[Any, Row]:
-    """What was measured, by what was seen."""
+    """Return the measured rows by observation."""
     found = {sight: read_all(out, folder(name.format(sight))) for sight in sights}
     return {sight: row for sight, row in found.items() if row is not None}
 
 
 def completions(found: Mapping[Sight, Row]) -> str:
-    """What was seen down, errors across."""
+    """Return a table of errors, one row for each observation."""
 
     def more(sight: Sight) -> str:
         whole = found.get(replace(sight, frames=ALL))
@@ -472,7 +472,7 @@ def completions(found: Mapping[Sight, Row]) -> str:
 
 
 def sureness(found: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> str:
-    """What was seen, or tried, down; what intervals hold and how descents end across."""
+    """Return a table of interval coverage and convergence, one row for each observation or setting."""
 
     def share(row: Row, name: str, off: Callable[[np.ndarray], np.ndarray]) -> str:
         return f"{100 * off(row.values(name)).mean():.0f}"
@@ -493,7 +493,7 @@ def sureness(found: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> str:
 
 
 def tables(out: Path) -> list[str]:
-    """All of what is there, with headings."""
+    """Return all available tables, with headings."""
     found = []
     if drawn := curves(out):
         found += ["### Prediction\n", by_time(drawn)]
@@ -550,7 +550,7 @@ def draw(out: Path, file: Path) -> None:
 
 
 def tried() -> dict[str, tuple[Any, Deviations, dvae.Descent, bool]]:
-    """Of tuning: name to what is seen, deviations, descent, and whether the prior is of known segments."""
+    """Return the tuning settings by name: observation, deviations, descent, and whether the prior uses segments."""
     found: dict[str, tuple[Any, Deviations, dvae.Descent, bool]] = {}
     for sight in SURE:
         kind = KINDS[str(sight)]

@@ -35,10 +35,10 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
     """Fit, score, draw and report.
 
     Args:
-        out: where people, runs, scores, picture and page go, in place of those of an earlier complete demonstration.
-        share: of the steps of training.
-        samples: futures of a window that are scored.
-        clips: of simulated people.
+        out: folder of data, runs, scores, picture and page; replaces an earlier complete demonstration.
+        share: fraction of the training steps.
+        samples: number of scored futures of each window.
+        clips: number of simulated clips.
     """
     out.mkdir(parents=True, exist_ok=True)
     report = out / "report.html"

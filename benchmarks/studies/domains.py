@@ -1,8 +1,8 @@
-"""Fits and scores what docs/results/domains.md compares on real data of other kinds than motion, and writes its tables.
+"""Fit and score the models of docs/results/domains.md on real data other than motion, and write its tables.
 
-Every run has a directory under `--runs`, and a file of scores in it for each part that was scored: the script goes on
-where it was stopped, skips what is there, and two of it may work on other domains, cases or seeds at once. Options are
-chosen with `--part validation`, seed 0; `--part test` scores the runs of three seeds. Tables are of what is there.
+Each run has a directory under `--runs`, with a file of scores for each scored part. An interrupted script continues and
+skips existing files, and two processes may work on other domains, cases or seeds at once. Options are chosen with
+`--part validation`, seed 0; `--part test` scores the runs of three seeds. Tables show the available files.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class Alike:
 
 
 def trimmed(batch: Mapping[str, Any], some: Tensor) -> dict[str, Any]:
-    """Rows of a batch, without what is padding in all of them."""
+    """Return rows of a batch, without the steps that are padding in all of them."""
     part = dict(batch.map(lambda value: value[some]))
     longest = int(part["lengths"].max()) if "lengths" in part else None
     return {name: value[:, :longest] if value.dim() == 3 else value for name, value in part.items()}
@@ -183,12 +183,12 @@ def measured(model: Any, case: str, data: Data, part: str, seed: int) -> dict[st
 
 
 def shown(windows: Any) -> list[Measure]:
-    """Those of the page, in the unit of the data."""
+    """Return the scores of the page, in the unit of the data."""
     return [CRPS, ENERGY, *map(coverage_at, LEVELS)]
 
 
 def forecasts(case: str, seed: int, model: Any, data: Data) -> dict[str, Any]:
-    """Scores of test windows; the references stand beside the first run of the model without latents."""
+    """Return the scores of test windows, with references for the first run of the model without latents."""
     section = SECTIONS[data.name]
     windows = data.cut(section.forecast).windows
     told: dict[str, Any] = {"samples": FORECASTS, "seed": seed, "draw_emission": True, "progress": False}
@@ -213,12 +213,12 @@ def run(data: Data, part: str, case: str, seed: int, out: Path) -> dict[str, Any
 
 
 def said(row: Row, part: str, score: str, other: Row | None = None) -> str:
-    """A score, or the paired difference to that of another case."""
+    """Return a cell with a score or its paired difference to another case."""
     return cell(row.of(part).estimate(score, None if other is None else other.of(part)))
 
 
 def mean(row: Row, part: str, score: str) -> float:
-    """Of a score, by which rows stand in order."""
+    """Return the mean of a score, used to sort rows."""
     found = row.of(part).estimate(score)
     assert found is not None
     return found.mean
@@ -268,7 +268,7 @@ def sound(cases: Mapping[str, Row]) -> str:
 
 
 def tables(runs: Path, part: str) -> list[str]:
-    """Of what was scored on a part."""
+    """Return the tables of the scores on a part."""
     parts = []
     for name, section in SECTIONS.items():
         cases = read(runs / name, section.cases, f"{part}.json")
@@ -301,12 +301,12 @@ def main(
     """Fit, score, and write the tables.
 
     Args:
-        domains: to fit, by name; none for tables alone.
-        runs: where runs are kept.
-        page: where the tables stand; None prints them.
-        part: that is scored, and of which the tables are.
-        cases: to fit, by name; all of a domain where none is named.
-        seeds: of the runs to fit.
+        domains: names of domains to fit; empty to write the tables only.
+        runs: folder of the runs.
+        page: page of the tables; None prints them.
+        part: split to score and to show in the tables.
+        cases: names of cases to fit; all cases of a domain if empty.
+        seeds: seeds of the runs to fit.
     """
     torch.set_num_threads(1)
     for name in domains:

@@ -226,7 +226,7 @@ def read(path: Path, cases: Iterable[str], file: str = MEASURED) -> dict[str, Ro
 
 
 def read_all(path: Path, name: str) -> Row | None:
-    """Return the measurements with one name of all runs; None if there are none."""
+    """Return the measurements of all runs under one name, or None without any."""
     found = [json.loads(file.read_text()) for file in sorted(path.glob(f"*/{name}.json"))]
     return Row(found) if found else None
 

@@ -1,6 +1,6 @@
-"""Writes the tables of docs/results/family.md from comparisons.
+"""Write the tables of docs/results/family.md from comparisons.
 
-The page says how a comparison is made; several of other models on the same windows are joined.
+The page describes a comparison. Comparisons of other models on the same windows are joined.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ ARROWS = {"ADE": " ↓", "FDE": " ↓", "MMADE": " ↓", "MMFDE": " ↓", "energ
 
 
 def tables(comparison: dvae.Comparison) -> list[str]:
-    """Teacher-forced scores in the order of the ranking, then free-running ones in that of the energy score."""
+    """Return the teacher-forced scores in the order of the ranking, then free-running ones by energy score."""
     best, *_ = ranking = comparison.ranking
 
     def latents(name: str) -> str:

@@ -54,9 +54,9 @@ def main(
 
     Args:
         run: a run directory.
-        page: where; with None it is printed.
-        count: windows from which forecasts run on.
-        seconds: for so long.
+        page: page of the table; None prints it.
+        count: number of windows to forecast.
+        seconds: length of the forecasts.
     """
     write(page, long_run(run, count, seconds), name="long forecasts")
 

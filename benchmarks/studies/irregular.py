@@ -1,8 +1,7 @@
-"""Fits a linear SDE to utterances whole and with half of their frames dropped, for docs/results/irregular.md.
+"""Fit a linear SDE to utterances, whole and with half of their frames dropped, for docs/results/irregular.md.
 
-Every run has a directory under `--runs`, and a file of scores in it for each part that was scored: the script goes on
-where it was stopped, and skips what is there. Options are chosen with `--part validation`, seed 0; `--part test` scores
-the runs of three seeds.
+Each run has a directory under `--runs`, with a file of scores for each scored part. An interrupted script continues and
+skips existing files. Options are chosen with `--part validation`, seed 0; `--part test` scores the runs of three seeds.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ def batch_of(sequences: Utterances, share: float, seed: int) -> dict[str, torch.
 
 
 def frames(batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    """Those of a batch, (N, D)."""
+    """Return the valid frames of a batch, (N, D)."""
     return batch["x"][torch.arange(batch["x"].shape[1]) < batch["lengths"][:, None]]
 
 
@@ -118,20 +117,20 @@ def apart(part: str) -> dict[str, float]:
 
 
 def tables(runs: Path, part: str) -> str:
-    """What was scored on a part, and what dropping frames from training costs."""
+    """Return a table of the bounds on a part, and of the cost of dropping training frames."""
     found, free, lines = read(runs, KEPT, f"{part}.json"), apart(part), []
     for judged_on in KEPT:
         rows = {fitted_on: row.of(judged_on) for fitted_on, row in found.items()}
         for fitted_on, row in rows.items():
-            line, costs = [f"{fitted_on}, judged on {judged_on}", cell(row.estimate("bound"))], ["–"] * 3
+            line, costs = [f"{fitted_on}, tested on {judged_on}", cell(row.estimate("bound"))], ["–"] * 3
             if fitted_on != "whole" and "whole" in rows:
                 less, whole = row.estimate("bound", rows["whole"]), rows["whole"].estimate("bound").mean
                 shares = less.mean / abs(whole), less.mean / (whole - free[judged_on])
                 costs = [cell(less), *(f"{100 * share:.1f} %" for share in shares)]
             lines.append([*line, *costs])
-        lines.append([f"frames apart, judged on {judged_on}", f"{free[judged_on]:.3f}", "–", "–", "–"])
+        lines.append([f"independent frames, tested on {judged_on}", f"{free[judged_on]:.3f}", "–", "–", "–"])
     header = [f"fitted on …, {part}", "nats a frame", "minus fitted on whole"]
-    return table([*header, "of its bound", "of its gain over frames apart"], lines)
+    return table([*header, "of its bound", "of its gain over independent frames"], lines)
 
 
 def main(
@@ -144,11 +143,11 @@ def main(
     """Fit, score, and write the table.
 
     Args:
-        runs: where runs are kept.
-        page: where the table stands; None prints it.
-        part: that is scored, and of which the table is.
-        seeds: of the runs to fit; none for the tables alone.
-        latents: sizes of their latent.
+        runs: folder of the runs.
+        page: page of the table; None prints it.
+        part: split to score and to show in the table.
+        seeds: seeds of the runs to fit; empty to write the tables only.
+        latents: sizes of the latent.
     """
     torch.set_num_threads(1)
     for latent in latents:

@@ -1,7 +1,7 @@
-"""Fits and scores what docs/results/mix_and_match.md compares, how noise enters a forecast, and writes its tables.
+"""Fit and score the models of docs/results/mix_and_match.md, which differ in their noise, and write its tables.
 
-Every run has a directory under `--runs`, and measured.json in it: the script goes on where it was stopped, skips what
-is there, and two of it may work on other seeds at once (`--seeds 0`, `--seeds 1 2`). Tables are of what is there.
+Each run has a directory under `--runs`, with measured.json. An interrupted script continues and skips existing files,
+and two processes may work on other seeds at once (`--seeds 0`, `--seeds 1 2`). Tables show the available files.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ BODY = (
 
 @dataclass(frozen=True)
 class Section:
-    """What the page compares with one another.
+    """Cases that the page compares with one another.
 
     Args:
-        protocol: of the windows.
-        cases: name to options.
-        share: of the steps of training.
+        protocol: name of the window protocol.
+        cases: options by name of the case.
+        share: fraction of the training steps.
     """
 
     protocol: str
@@ -112,12 +112,12 @@ def data_of(protocol: str, file: Path) -> motion.MotionData:
 
 
 def some_scores(held: Any) -> list[Measure]:
-    """Those of motion that the tables have."""
+    """Return the motion scores that the tables show."""
     return [measure for measure in motion.scores(held) if measure.name in SCORES]
 
 
 def measured(section: Section, data: motion.MotionData, case: str, seed: int, out: Path) -> dict[str, Any]:
-    """Fits a case, and scores it by clip, the runs of "mix" beside zero velocity."""
+    """Fit a case and score it by clip; runs of "mix" also score zero velocity."""
     steps, method = section.steps, dvae.method("mix-and-match", **{**OPTIONS, **section.cases[case]})
     train, test = data.windows("train"), data.windows("test")
     fewer = test.with_protocol(replace(test.protocol, test_stride=THINNED * test.protocol.test_stride))
@@ -155,8 +155,8 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
         angles = euler_errors({OURS: model}, fewer, counts=counts, **how)
         found["angles"] = scores_of(angles.clips, {name: plain(angles.rows[name].clip_means) for name in futures})
     if method.noise == "mix" and noise:
-        # the diversity of codes with indices drawn once, in units of that with all drawn, and that of futures with z at
-        # 0, whose indices alone differ, likewise
+        # ratios of diversity: codes with indices drawn once over codes with all drawn; futures with z at
+        # 0, which differ in their indices only, over futures with all drawn
         with seeded_evaluation(model, seed):
             drawn, once = (code_diversity(model, batch).mean() for batch in (past, model.read(past)))
         unsaid = dvae.evaluate({OURS: model, UNSAID: RedrawnModel(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts)
@@ -216,7 +216,7 @@ def angles(found: Mapping[str, Row]) -> str:
 
 
 def tables(name: str, found: Mapping[str, Row]) -> list[str]:
-    """Of a section: what was done, and its tables."""
+    """Return a section's summary and tables."""
     first = next(iter(found.values())).runs[0]
     clips, spent = first["futures"]["weights"], budget(found.values(), SECTIONS[name].steps)
     done = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {spent}\n"
@@ -274,14 +274,14 @@ def main(
     """Fit, score, and write the tables.
 
     Args:
-        data: motion file with file groups (bandai2.npz); where it lacks, nothing is fitted for its protocols.
-        raw: folder of BVH files of CMU's recordings; likewise.
-        runs: where runs are kept.
-        page: where the tables stand.
-        picture: of codes over training, and of quality against diversity.
-        sections: of the page, to fit.
-        cases: to fit, by name; all of a section where none is named.
-        seeds: of the runs to fit.
+        data: motion file with file groups (bandai2.npz); without it, its protocols are not fitted.
+        raw: folder of CMU's BVH files; without it, its protocol is not fitted.
+        runs: folder of the runs.
+        page: page of the tables.
+        picture: figure of codes over training, and of quality against diversity.
+        sections: sections of the page to fit.
+        cases: names of cases to fit; all cases of a section if empty.
+        seeds: seeds of the runs to fit.
     """
     torch.set_num_threads(1)
     for name, section in ((name, SECTIONS[name]) for name in sections):

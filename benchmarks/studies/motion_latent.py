@@ -1,7 +1,7 @@
-"""Fits and scores what docs/results/motion_latent_4d.md compares, latent spaces of gait cycles, and writes its tables.
+"""Fit and score the latent spaces of gait cycles of docs/results/motion_latent_4d.md, and write its tables.
 
-Every run has a directory under `--runs`, and measured.json in it: the script goes on where it was stopped, skips what
-is there, and two of it may work on other cases or seeds at once. Tables and pictures are of what is there.
+Each run has a directory under `--runs`, with measured.json. An interrupted script continues and skips existing files,
+and two processes may work on other cases or seeds at once. Tables and pictures show the available files.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def run(section: str, file: Path, other: Path | None, steps: int, case: str, see
 
 
 def rows_of(path: Path, section: str) -> dict[str, Row]:
-    """Cases that are there, and behind them what is linear beside the first of one size."""
+    """Return the available cases, then the linear models of the first case of each size."""
     found, linear = read(path, SECTIONS[section]), dict[str, Row]()
     for row in found.values():
         (name,) = row.runs[0][SAME]["rows"].keys() - {OURS}
@@ -143,7 +143,7 @@ def against(cases: Mapping[str, Row]) -> str:
 
 
 def tables(section: str, cases: Mapping[str, Row]) -> list[str]:
-    """Of a section: what was done, and two tables for each test set; walks and runs are of the first one alone."""
+    """Return a section's summary and two tables for each test set; interpolations are scored on the first only."""
     first, parts = next(iter(cases.values())).runs[0], []
     for test in first["tests"]:
         takes, own = first[test]["clips"], {name: row.of(test) for name, row in cases.items()}
@@ -155,7 +155,7 @@ def tables(section: str, cases: Mapping[str, Row]) -> list[str]:
 
 
 def draw(held: Mapping[str, Row], tuned: Mapping[str, Row], file: Path) -> None:
-    """Boxes by Tukey of both test sets and of what is varied; and how long steps from walks to runs last."""
+    """Draw box plots of the errors on both test sets and in the sweeps, and durations between walks and runs."""
     tests, swept = next(iter(held.values())).runs[0]["tests"] if held else [], CASES["swept"]
     figure = new_figure(3.2 * (len(tests) + len(swept) + 1), 3.4)
     panels = iter(figure.subplots(1, len(tests) + len(swept) + 1))
@@ -197,15 +197,15 @@ def main(
     """Fit, score, and write the tables.
 
     Args:
-        data: motion file with file groups (bandai2.npz); where it lacks, nothing is fitted.
-        other: of the source that nothing is learned from (cmu8.npz).
-        runs: where runs are kept.
-        page: where the tables stand.
-        picture: of vertex errors, and of how long segments between walks and runs last.
-        sections: to fit.
-        cases: to fit, by name; all of a section where none is named.
-        seeds: of the runs to fit.
-        steps: of training.
+        data: motion file with file groups (bandai2.npz); without it, nothing is fitted.
+        other: motion file of a source outside the training data (cmu8.npz).
+        runs: folder of the runs.
+        page: page of the tables.
+        picture: figure of vertex errors, and of durations between walks and runs.
+        sections: sections to fit.
+        cases: names of cases to fit; all cases of a section if empty.
+        seeds: seeds of the runs to fit.
+        steps: number of training steps.
     """
     torch.set_num_threads(1)
     for section in sections if data else ():

@@ -1,7 +1,7 @@
-"""Runs notebooks and stores them with what they show; `make notebooks` does so for all.
+"""Run notebooks and store them with their outputs; `make notebooks` runs all.
 
-What is stored depends on the run alone: no times, no versions, no progress. An animation is stored as
-its last frame, as it is large and hosts that show notebooks do not play it.
+Stored outputs depend only on the run: they contain no times, versions or progress bars. An animation is stored as its
+last frame, because it is large and notebook hosts do not play it.
 """
 
 import base64
@@ -96,10 +96,10 @@ def execute(path: Path, share: float = 1.0, on: KernelManager | None = None) -> 
 
 
 def check(path: Path, on: KernelManager) -> None:
-    """Run a notebook on a small share of its work and compare what each cell shows with what is stored.
+    """Run a notebook on a small share of its work and compare the outputs of each cell with the stored ones.
 
     Raises:
-        AssertionError: a cell shows something else.
+        AssertionError: the outputs of a cell differ.
     """
     stored, run = nbformat.read(path, as_version=4), execute(path, share=0.02, on=on)
     code = ([cell for cell in each.cells if cell.cell_type == "code"] for each in (stored, run))
@@ -116,7 +116,7 @@ def _small(picture: str) -> str:
 
 
 def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
-    """Outputs without progress; what was printed is one, however it came."""
+    """Return outputs without progress bars, with consecutive text of a stream joined."""
     whole: list[nbformat.NotebookNode] = []
     for output in outputs:
         data = output.get("data", {})
@@ -130,10 +130,10 @@ def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
 
 
 def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
-    """What a cell shows, as any run of it must: kinds of output, and their texts without what arithmetic decides.
+    """Return the reproducible part of a cell's outputs: their kinds, and texts without rounding-dependent numbers.
 
-    Figures are there or not. Texts have their words and whole numbers, but for shares; of a table, which may order its
-    rows by their numbers, the words alone, among which no fingerprint is.
+    Figures count as present or absent. Texts keep words and whole numbers, except percentages. Tables may be
+    sorted by their numbers and keep only words, without fingerprints.
     """
     found = []
     for output in cell.get("outputs", []):
@@ -141,7 +141,7 @@ def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
         if "text" in output:
             data["text/plain"] = output["text"]
         if len(data) > 1:
-            data["text/plain"] = ""  # pages show what is richer
+            data["text/plain"] = ""  # pages show the richer format
         texts = {kind: _stable(text) if kind in TEXTS else "" for kind, text in data.items()}
         found.append((output.get("name") or output["output_type"], texts))
     return found

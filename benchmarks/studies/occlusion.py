@@ -1,7 +1,7 @@
-"""Writes the table of docs/results/occlusion.md: how well gaps in motion are filled, by methods and by simpler means.
+"""Write the table of docs/results/occlusion.md, a comparison of methods and baselines that fill gaps in motion.
 
 Joints of the recordings are hidden in bursts (`dvae.motion.occlude`), in training and in test. Methods are fitted to
-what is left, and fill the gaps of whole test windows with means given latents of their guide.
+the observed entries. They fill the gaps of whole test windows with means given latents of their guide.
 """
 
 import time
@@ -36,7 +36,7 @@ LENGTHS = ((1, 10), (11, 30), (31, None))
 
 
 def bursts(mask: Tensor) -> Tensor:
-    """How long the gap is in which an entry lies, (N, T, D); 0 where it was observed."""
+    """Return the length of the gap around each entry, (N, T, D); 0 for observed entries."""
     step = torch.arange(1, mask.shape[1] + 1)[:, None]
     before = torch.where(mask, step, 0).cummax(1).values
     after = torch.where(mask, step, mask.shape[1] + 1).flip(1).cummin(1).values.flip(1)
@@ -71,14 +71,14 @@ def imputed(model: Any, batch: Mapping[str, Tensor], samples: int, seed: int) ->
 
 
 def sums(values: Tensor, gaps: Tensor, places: np.ndarray) -> np.ndarray:
-    """Sums (4, C) by clip of values (N, T, J) in all gaps, and in those of each range of lengths."""
+    """Return sums by clip of values (N, T, J) over all gaps, and over each range of gap lengths, as (4, C)."""
     ranges = [(gaps >= low) & (gaps <= (high or gaps.shape[1])) for low, high in ((1, None), *LENGTHS)]
     by_window = [torch.where(counted, values.double(), 0.0).sum((1, 2)).numpy() for counted in ranges]
     return np.stack([np.bincount(places, weights=each) for each in by_window])
 
 
 def cells(means: np.ndarray, weights: np.ndarray) -> list[str]:
-    """Means over what is hidden (4, C), and their standard errors, clustered by clip."""
+    """Return means over hidden entries with their standard errors, clustered by clip."""
     found = []
     for own, weight in zip(means, weights, strict=True):
         mean, deviations = linearised(own, np.maximum(weight, 1e-9))
@@ -87,7 +87,7 @@ def cells(means: np.ndarray, weights: np.ndarray) -> list[str]:
 
 
 def fitted(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
-    """A method, fitted to what is not hidden."""
+    """Fit a method to the observed entries."""
     train = data.windows("train")
     torch.manual_seed(seed)
     method = dvae.method(name, **METHODS[name], warm_up=steps // 3).resolve_defaults(train)
@@ -112,9 +112,9 @@ def main(
 
     Args:
         data: motion file.
-        page: where.
-        protocol: by which windows are cut and split.
-        share: of the joints that is hidden.
+        page: page of the table.
+        protocol: name of the protocol that cuts and splits windows.
+        share: hidden fraction of the joints.
         length: frames of a burst.
         stride: frames between test windows.
         seeds: fits of each method.
@@ -159,7 +159,7 @@ def main(
         average, spread = np.mean(found, 0), over([np.mean(spreads[name], 0)]) if name in spreads else ["–"]
         rows.append([name, *cells(average, weights), *spread, ", ".join(over(found)) if name in spreads else "–"])
         differences.append([name, *cells(average - made["straight line"][0], weights)])
-    said = f"{len(truth)} windows of {len(set(places))} clips, {int(weights[0].sum()):,} hidden places of joints.\n"
+    said = f"{len(truth)} windows of {len(set(places))} clips, {int(weights[0].sum()):,} hidden joint positions.\n"
     others = table(["minus straight line", *ranges], differences[1:])
     write(page, said, table(["", *ranges, "spread", "seeds"], rows), others)
 

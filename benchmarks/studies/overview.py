@@ -1,8 +1,8 @@
-"""Draws docs/img/overview.png, the picture of the README: its example, fitted for ten times as many steps.
+"""Draw docs/img/overview.png, the picture of the README: its example, fitted for ten times as many steps.
 
-That takes three minutes on one core. Below are ten futures of one test window, chosen by a rule that luck has no part
-in: of those windows in which a wrist is below its shoulder while the person is observed, and above the head at some
-time after, the one where the best of the ten is off by the median of all these windows.
+This takes three minutes on one core. The lower row shows ten futures of one test window, chosen by a fixed rule. In
+candidate windows, a wrist is below its shoulder in the observed frames and above the head at some time after. The
+selected one has the median error of the best of ten among all candidates.
 """
 
 from pathlib import Path

@@ -48,7 +48,7 @@ def package(module: str) -> str:
 
 
 def imports() -> nx.DiGraph:
-    """Packages, and an edge from each to what it imports; with "lines", how many it has."""
+    """Return the graph of imports between packages; the attribute "lines" of a node is its number of lines."""
     graph = nx.DiGraph()
     for file in sorted(glob("**/*.py", root_dir=ROOT, recursive=True)):  # which goes through links too
         parts = ("dvae", *Path(file).with_suffix("").parts)

@@ -29,7 +29,7 @@ def words(*header: str, rows: Iterable[Sequence[str]]) -> str:
 
 
 def tabled(rows: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]], head: str = "") -> str:
-    """A table of rows by their names, and of columns by what they say of a row."""
+    """Return a table with one line for each row and one column for each function of `columns`."""
     return table([head, *columns], [[name, *(cell(row) for cell in columns.values())] for name, row in rows.items()])
 
 
@@ -54,7 +54,7 @@ def write(page: Path | None, *tables: str, name: str = "tables") -> None:
     before, opened, rest = page.read_text(encoding="utf-8").partition(begin)
     _, closed, after = rest.partition(end)
     if not (opened and closed):
-        sys.exit(f"no marks for the table in {page}; it stands between lines {begin.strip()} and {end.strip()}")
+        sys.exit(f"no marks for the table in {page}; expected the lines {begin.strip()} and {end.strip()}")
     page.write_text(before + begin + "\n" + "\n".join(tables) + "\n" + end + after, encoding="utf-8")
 
 
@@ -67,14 +67,14 @@ def refuse_unknown(what: str, names: Iterable[str], known: Iterable[str]) -> Non
 
 
 def require_gpu(option: str) -> None:
-    """Ends the script where an option asks for a GPU and there is none."""
+    """End the script if an option asks for a GPU and torch finds none."""
     if not torch.cuda.is_available():
         built = "" if torch.version.cuda else ", as it is built without CUDA"
         sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or take a machine with one")
 
 
 def loaded(run: Path) -> Any:
-    """A run that the script was given; ends it where there is none."""
+    """Load a run; end the script with a message if that fails."""
     try:
         return dvae.load(run)
     except CheckpointError as error:
@@ -82,6 +82,6 @@ def loaded(run: Path) -> Any:
 
 
 def same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
-    """What evaluations have in common whose scores stand in one table."""
+    """Return the settings that evaluations must share to be compared in one table."""
     drawn = evaluation.samples, evaluation.seed, evaluation.emission, evaluation.bound_particles
     return evaluation.data, *drawn, evaluation.basis

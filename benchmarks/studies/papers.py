@@ -1,13 +1,13 @@
-"""Fits and scores the methods of three papers with their ablations, and writes the papers' tables with these beside.
+"""Fit and score the methods of three papers with their ablations, and write tables next to the papers' numbers.
 
-What is fitted stands in the folders of `benchmarks.studies.ranking`, which fits the methods themselves; options and
-training are those of the presets but for what a row is called after. Ablations have fewer steps than the presets, and
-stand beside the full method with as few. Scores are kept, and the script goes on where it was stopped, as there;
-without `--data` nothing is fitted. Printed numbers are of other data.
+Runs are in the folders of `benchmarks.studies.ranking`, which fits the methods themselves. Options and training are the
+presets', except for the changes that name a row. Ablations have fewer steps than the presets; their tables include the
+full method with as few steps. Scores are stored, and an interrupted script continues. Without `--data` nothing is
+fitted. Published numbers are from other data.
 
 Sources: Bie et al., 2022, arXiv 2204.01565, tables 1 to 3 and 5; Mao, Liu and Salzmann, 2021, arXiv 2108.08422,
-tables 1 to 3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6 (table 2 is the
-list of predictors that GSPS's has, on Human3.6M).
+tables 1 to 3; Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, tables 1 and 3 to 6, and figure 6. Its table 2 is
+the list of predictors in GSPS's tables, on Human3.6M.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class Further:
     """Views of some rows, with a table of their own.
 
     Args:
-        caption: what it is of.
-        views: the views.
-        rows: of the paper's.
-        columns: of that table; none for those of all its tables.
+        caption: caption of the table.
+        views: views of the rows.
+        rows: names of the paper's rows.
+        columns: scores of the table; empty for all columns of the paper.
         printed: rows of the paper.
-        apart: by what they are called there, rows that have a view of their own, and the view.
+        apart: rows with a separate view, as row and view by label.
     """
 
     caption: str
@@ -78,7 +78,7 @@ class Further:
     apart: Mapping[str, tuple[str, View]] = field(default_factory=dict)
 
     def views_of(self, row: str) -> list[View]:
-        """In which a row is scored for that table."""
+        """Return the views of a row in this table."""
         return [*(self.views if row in self.rows else ()), *(view for own, view in self.apart.values() if own == row)]
 
 
@@ -107,7 +107,7 @@ class Paper:
     further: Sequence[Further] = ()
 
     def views_of(self, row: str) -> list[View]:
-        """In which a row is scored."""
+        """Return all views of a row."""
         return list(dict.fromkeys([*self.views, *(view for each in self.further for view in each.views_of(row))]))
 
 
@@ -133,7 +133,7 @@ Found = Mapping[View, Mapping[str, Row]]
 
 
 def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[str, str]]) -> str:
-    """Rows, in each view, and what is printed beside them; references know no paths."""
+    """Return a table of rows in each view, followed by published rows; references use no given paths."""
     lines = []
     views = list(found)
     what = "given" if views[0].given is not None else "observed" if views[0].observed else ""
@@ -152,7 +152,7 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
 
 
 def changes(found: Found, paper: Paper) -> str:
-    """What each change does, paired: columns across, or, where there are several views, these."""
+    """Return a table of paired differences; columns are scores, or views if there are several."""
 
     def change(view: View, pair: tuple[str, str], column: str) -> str:
         having, lacking = (found[view].get(row) for row in pair)
@@ -210,7 +210,7 @@ def drawn(found: Found, paper: Paper) -> Figure:
 
 
 def captioned(caption: str, made: str) -> str:
-    """A table below what it is of; nothing where it has no rows."""
+    """Return a table below its caption; empty if the table has no rows."""
     return f"*{caption}:*\n\n{made}" if made.count("\n") > 2 else ""
 
 
@@ -226,19 +226,19 @@ def main(
     pages: Path | None = None,
     pictures: Path = DOCS / "img",
 ) -> None:
-    """Fit and score what is missing, and write the tables.
+    """Fit and score missing results, and write the tables.
 
     Args:
-        runs: where run directories lie.
+        runs: folder of the run directories.
         data: the folder with bandai/ and cmu/; without it nothing is fitted.
-        papers: which.
-        rows: of these alone; all of a paper where none is named.
-        seeds: of every row.
-        samples: futures of a window.
-        stored: the folder of scores and metric models.
-        accelerator: on which to train and to forecast, as of `benchmarks.studies.ranking`.
-        pages: the folder of the pages; without one tables are printed.
-        pictures: the folder of the pictures, which are drawn with the pages.
+        papers: names of papers.
+        rows: names of rows to fit; all rows of a paper if empty.
+        seeds: seeds of each row.
+        samples: number of futures of each window.
+        stored: folder of scores and metric models.
+        accelerator: device for training and forecasts, as in `benchmarks.studies.ranking`.
+        pages: folder of the pages; None prints the tables.
+        pictures: folder of the pictures, drawn only with the pages.
     """
     refuse_unknown("paper", papers, PAPERS)
     refuse_unknown("row", rows, (row for name in papers for row in PAPERS[name].rows))

@@ -1,8 +1,7 @@
-"""Fits SRNNs to some styles of bandai2, and writes the tables of docs/calibration.md: prediction bands on styles nobody
-has seen.
+"""Fit SRNNs to some styles of bandai2, and write the tables of docs/calibration.md: bands on unseen styles.
 
-A model is fitted to three of the five styles of groups A and B; the other two calibrate and test. The test
-group C is seen by nobody. A run that is there is not fitted again.
+A model is fitted to three of the five styles of groups A and B; the other two calibrate and test. The test group C is
+not used. Existing runs are not fitted again.
 """
 
 from __future__ import annotations
@@ -116,9 +115,9 @@ def main(
     Args:
         runs: folder of the runs.
         data: bandai2.npz.
-        page: where; without it, print.
-        models: choices of training styles, of ten; the first is that of bandai2-tuning.
-        halves: random halves of the clips, for each of them.
+        page: page of the tables; None prints them.
+        models: number of choices of training styles, at most ten; bandai2-tuning's comes first.
+        halves: number of random halves of the clips for each choice.
     """
     torch.set_num_threads(1)
     found: dict[str, list[dict[str, float]]] = {}

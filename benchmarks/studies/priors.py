@@ -1,11 +1,9 @@
-"""Writes the table of TrajeVAE's priors of docs/results/trajevae.md: how they fit the posteriors, and other
-distributions.
+"""Write the table of TrajeVAE's priors of docs/results/trajevae.md, with their fit to the posteriors.
 
-z, drawn from a window's posterior, is as far from the prior's mean as a draw of the prior where the prior is as wide as
-the posteriors ask: one, in units of the prior's deviation, root mean square. Below it the prior is too wide, above it
-too narrow. What that does is told by the same decoder with other distributions of z: the prior with its deviations
-multiplied, and with the mean, the deviation, or both, of the posteriors of all training windows together, number by
-number.
+The table gives the root-mean-square distance of posterior draws of z from the prior's mean, in units of the prior's
+deviation. A value of 1 means that the prior is as wide as the posteriors. Below 1 the prior is too wide, above 1 too
+narrow. The effect is measured with the same decoder and other distributions of z: the prior with scaled deviations, or
+with the mean, the deviation, or both, of the posteriors of all training windows together, number by number.
 """
 
 from __future__ import annotations
@@ -70,7 +68,7 @@ def together(posterior: Distribution) -> Distribution:
 def with_common(
     prior: Callable[..., Distribution], common: Distribution, what: tuple[str, ...]
 ) -> Callable[..., Distribution]:
-    """A prior with what is said to be common to all windows."""
+    """Return a prior with the mean, the deviation or both, as named in `what`, replaced by `common`."""
     mean, deviation = common
 
     def changed(*arguments: Any, **options: Any) -> Distribution:

@@ -1,10 +1,9 @@
-"""Fits every method for motion on every set, scores it on the test windows, and ranks them.
+"""Fit every method for motion on every set, score it on the test windows, and rank the methods.
 
-Methods have the options and the training of their presets, which the tuning protocol chose (docs/results/tuning.md);
-runs lie in `RUNS/SET/METHOD-seedN`. What tables are made of, scores by clip, is kept in `SCORES/SET` beside the metric
-models
-that gave them: the script goes on where it was stopped, there or on another machine, a further method is scored by the
-same metric models, and without `--data` nothing is fitted.
+Options and training are the presets', chosen with the tuning protocol (docs/results/tuning.md). Runs are stored in
+`RUNS/SET/METHOD-seedN`. Scores by clip, from which the tables are made, are stored in `SCORES/SET` with the metric
+models that computed them. An interrupted script therefore continues, also on another machine, and scores further
+methods with the same metric models. Without `--data` nothing is fitted.
 """
 
 from __future__ import annotations
@@ -54,19 +53,19 @@ ALIKE, ALIKE_PATHS = (
 
 @dataclass(frozen=True)
 class View:
-    """What of the test windows is predicted, and how.
+    """Conditions and options of a prediction of the test windows.
 
     Args:
-        given: joints whose paths are known, those of `JOINTS` first; None where methods take no paths.
-        single: one motion, at the mean of the prior, in place of draws.
-        exchanged: metres within which the given joints are in another window's pose, from which motions begin; 0 for
+        given: number of joints with given paths, in the order of `JOINTS`; None for methods without paths.
+        single: whether to predict one motion from the prior's mean instead of draws.
+        exchanged: largest distance in metres of the given joints in another window's pose, used as the start; 0 for
             the window's own.
-        own: of the windows that have such another one, with their own poses.
+        own: whether windows with such a pose keep their own one.
         truth: see `motion.ExchangedWindows`.
-        observed: frames, in place of the protocol's.
-        metric_models: names with + between, in place of the set's.
-        parts: how diverse the parts of the body are, alone, in "free" futures, in those that have the lower body's
-            draw "held", that of the first, or in those of many whose lower body is "nearest" the first one's.
+        observed: number of observed frames; None for the protocol's.
+        metric_models: names joined by +; empty for the set's.
+        parts: diversity of body parts, in "free" futures, in futures with the first draw of the lower body
+            "held", or in the futures with the lower body "nearest" to the first one's.
     """
 
     given: int | None = None
@@ -79,16 +78,16 @@ class View:
     parts: Literal["", "free", "held", "nearest"] = ""
 
     def windows(self, data: MotionData, split: str) -> Any:
-        """Windows of a part of the data, and what is told of them."""
+        """Return the windows of a split, with the given paths."""
         observed = self.observed or data.protocol.observed
         windows = motion.windows(data.motion, replace(data.protocol, observed=observed), split)
         if self.given is None:
             return windows
         others = [name for name in windows.joints if name not in JOINTS]
-        told = windows.given([*JOINTS, *others][: self.given])
+        conditioned = windows.given([*JOINTS, *others][: self.given])
         if not self.exchanged or split != "test":
-            return told
-        return motion.ExchangedWindows(told, self.exchanged, own=self.own, truth=self.truth)
+            return conditioned
+        return motion.ExchangedWindows(conditioned, self.exchanged, own=self.own, truth=self.truth)
 
     def evaluate(self, samples: int) -> dict[str, Any]:
         """Arguments of `dvae.evaluate`."""
@@ -96,19 +95,19 @@ class View:
 
     def member(self, run: str) -> str:
         """The name of the scores of a run in an archive."""
-        told = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
-        return f"{run}/{'-'.join(['scores', *told])}.json"
+        parts = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
+        return f"{run}/{'-'.join(['scores', *parts])}.json"
 
 
 @dataclass(frozen=True)
 class Set:
-    """The file of clips below the folder of data, and what is fitted and scored.
+    """A file of clips below the data folder, with the methods and views to fit and score.
 
     Args:
-        file: of the clips.
-        methods: by the rows that they are.
-        views: in which each is scored.
-        metric_models: of `METRIC_MODELS`.
+        file: path of the clips below the data folder.
+        methods: options of the methods by row.
+        views: views of each method.
+        metric_models: names in `METRIC_MODELS`.
         like: the set whose protocol, fitted metric models and reference rows it shares; its own where empty.
     """
 
@@ -156,7 +155,7 @@ LEVEL = 0.9
 
 
 def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
-    """What is kept of an evaluation: scores by clip of a run, or of all reference rows.
+    """Return the stored part of an evaluation: scores by clip of a run, or of all reference rows.
 
     Returns:
         `basis`, windows, draws and metric models, which all rows of a table share; windows by clip; scores, of four
@@ -171,13 +170,13 @@ def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
         }
         for name, row in evaluation.rows.items()
     }
-    found = {"basis": same(evaluation), "clips": evaluation.clips, "rows": rows, "minutes": 0.0, "config": {}}
+    result = {"basis": same(evaluation), "clips": evaluation.clips, "rows": rows, "minutes": 0.0, "config": {}}
     if run is not None:
-        fitted = Run(run)
-        options = {name: value for name, value in fitted.config["method"].items() if not name.endswith("_run")}
-        found["config"] = {"method": options, "training": fitted.config["training"]}
-        found["minutes"] = fitted.state.get("processor_seconds", 0.0) / 60
-    return found
+        fitted_run = Run(run)
+        options = {name: value for name, value in fitted_run.config["method"].items() if not name.endswith("_run")}
+        result["config"] = {"method": options, "training": fitted_run.config["training"]}
+        result["minutes"] = fitted_run.state.get("processor_seconds", 0.0) / 60
+    return result
 
 
 def fitted_metric_models(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
@@ -203,9 +202,9 @@ def grouped(data: MotionData) -> MotionData:
     return replace(data, motion=motion.MotionSet(clips, data.motion.skeleton, data.motion.name, copy=False))
 
 
-def judging(judged: Mapping[str, Path]) -> Any:
-    """The scores of motion that tables show, with those of metric models where there are some."""
-    models = {name: load(path).model for name, path in judged.items()}
+def judging(metric_models: Mapping[str, Path]) -> Any:
+    """Return the motion scores of the tables, including scores by the given metric models."""
+    models = {name: load(path).model for name, path in metric_models.items()}
     prior = models.pop("prior", None)
 
     def scores(windows: Any) -> list[Measure]:
@@ -224,19 +223,19 @@ def fit(
     accelerator: Accelerator = "cpu",
 ) -> Path:
     """The run directory of a method, fitted once; second stages stand on the first of the same seed."""
-    told, training = parted({**methods[row], "accelerator": accelerator})
-    method = told.pop("method", row)
-    if method in ("gsps", "hit-dvae") and prior is not None and told.get("pose_prior") != 0:
-        told["pose_prior_run"] = str(prior.absolute())
+    method_options, training = parted({**methods[row], "accelerator": accelerator})
+    method = method_options.pop("method", row)
+    if method in ("gsps", "hit-dvae") and prior is not None and method_options.get("pose_prior") != 0:
+        method_options["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
-        told["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
-    (path,) = swept(row, dvae.method(method, **told), data, runs, (seed,), training)
+        method_options["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
+    (path,) = swept(row, dvae.method(method, **method_options), data, runs, (seed,), training)
     return path
 
 
 def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Options of a method, and those of its training."""
-    # methods have options of that name, which make the schedule of training's
+    """Split options into options of the method and options of its training."""
+    # methods have an option of this name too, which sets the training schedule
     training = Training.__dataclass_fields__.keys() - {"scheduled_sampling"}
     return (
         {name: value for name, value in options.items() if name not in training},
@@ -255,34 +254,34 @@ def work(
     samples: int,
     accelerator: Accelerator = "cpu",
 ) -> None:
-    """Fits and scores what is not there yet, seed by seed, so that every method has one before any has two.
+    """Fit and score missing results, seed by seed, so that each method has one seed before any has two.
 
     Args:
         data: the folder of files.
-        runs: of all sets.
-        stored: scores of all sets.
-        name: of the set.
-        methods: by the rows that they are.
-        views: in which each is scored; the reference rows in all of them.
-        seeds: of every method.
-        samples: futures of a window.
-        accelerator: on which to train and to forecast.
+        runs: folder of the runs of all sets.
+        stored: folder of the scores of all sets.
+        name: name of the set.
+        methods: options of the methods by row.
+        views: views of each method; reference rows are scored in all views.
+        seeds: seeds of each method.
+        samples: number of futures of each window.
+        accelerator: device for training and forecasts.
     """
     if accelerator == "cuda":
         require_gpu("accelerator")
-    own, like = archive(stored, name), SETS[name].like or name
-    opened = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like])
-    judged = fitted_metric_models(opened, stored / like, SETS[name].metric_models)
+    store, like = archive(stored, name), SETS[name].like or name
+    dataset = MotionData.open(data / SETS[name].file, motion.PROTOCOLS[like])
+    metric_models = fitted_metric_models(dataset, stored / like, SETS[name].metric_models)
 
     def score(path: Path | None, row: str, view: View) -> dict[str, Any]:
-        data, by = opened, judged
+        data, by = dataset, metric_models
         if view.metric_models:
-            data, by = grouped(opened), fitted_metric_models(opened, stored / like, view.metric_models.split("+"))
+            data, by = grouped(dataset), fitted_metric_models(dataset, stored / like, view.metric_models.split("+"))
         elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
-            by = {metric_model: run for metric_model, run in judged.items() if metric_model != "prior"}
+            by = {metric_model: run for metric_model, run in metric_models.items() if metric_model != "prior"}
         models = {} if path is None else {row: load(path).model.to(accelerator)}
-        known: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
-        options = {"references": False} if models else known
+        extra: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
+        options = {"references": False} if models else extra
         windows, told = view.windows(data, "test"), view.evaluate(samples)
         if view.parts:
             ways: dict[str, Any] = {"held": Held, "nearest": partial(Nearest, lower=places(windows)["lower"])}
@@ -295,13 +294,13 @@ def work(
         member = view.member(REFERENCES)
         if not (view.single or view.exchanged or view.parts in ("held", "nearest") or member in references.names):
             references.add(member, score(None, REFERENCES, view))
-    every = {**SETS[name].methods, **methods}  # what a second stage stands on has the set's options, chosen or not
+    every = {**SETS[name].methods, **methods}  # a second stage uses the set's options of its first stage
     for seed, row in itertools.product(seeds, methods):
         members = {view: view.member(f"{folder(row)}-seed{seed}") for view in views[row]}
-        if missing := {view: member for view, member in members.items() if member not in own.names}:
-            path = fit(opened, row, every, seed, runs / name, judged.get("prior"), accelerator)
+        if missing := {view: member for view, member in members.items() if member not in store.names}:
+            path = fit(dataset, row, every, seed, runs / name, metric_models.get("prior"), accelerator)
             for view, member in missing.items():
-                own.add(member, score(path, row, view))
+                store.add(member, score(path, row, view))
 
 
 class Wrapped(nn.Module):
@@ -324,9 +323,9 @@ class Held(Wrapped):
 
 
 class Nearest(Wrapped):
-    """A model whose futures are those of `MANY` times as many whose lower body is nearest to the first one's.
+    """A model that draws `MANY` times as many futures and keeps those with the lower body nearest to the first one's.
 
-    As GSPS has DLow hold the lower body: the nearest 50 of 1,000.
+    GSPS selects DLow's futures with a fixed lower body in the same way: the nearest 50 of 1,000.
     """
 
     MANY = 20
@@ -337,10 +336,10 @@ class Nearest(Wrapped):
 
     def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
         """Futures, by the squared distance over all frames."""
-        made = self.model.forecast(past, horizon, self.MANY * samples, **options)["x"]
-        lower = made[..., self.lower]
+        candidates = self.model.forecast(past, horizon, self.MANY * samples, **options)["x"]
+        lower = candidates[..., self.lower]
         nearest = (lower - lower[0]).square().sum((2, 3)).topk(samples, 0, largest=False).indices
-        return {"x": made.take_along_dim(nearest[..., None, None], 0)}
+        return {"x": candidates.take_along_dim(nearest[..., None, None], 0)}
 
 
 def places(windows: Any) -> dict[str, list[int]]:
@@ -355,8 +354,8 @@ def diversities(windows: Any) -> list[Measure]:
     def of(place: Any) -> Any:
         return lambda forecasts, *_: average_pairwise_distance(forecasts[..., place])
 
-    scored = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
-    return [Measure(name, of(place), "m", "higher") for name, place in scored.items()]
+    selections = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
+    return [Measure(name, of(place), "m", "higher") for name, place in selections.items()]
 
 
 REFERENCES = "references"
@@ -368,32 +367,34 @@ def archive(stored: Path, name: str) -> Archive:
 
 
 def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict[str, Row]:
-    """What has been scored on a set: the reference rows, and methods with their seeds.
+    """Return the rows scored on a set: references, then methods with their seeds.
 
     Raises:
         ValueError: scores of other windows, samples, or metric models.
     """
-    found, basis = dict[str, Row](), None
-    own, like = archive(stored, name), archive(stored, SETS[name].like or name)
+    rows, basis = dict[str, Row](), None
+    store, like = archive(stored, name), archive(stored, SETS[name].like or name)
     if view.member(REFERENCES) in like.names:
         references = like.read([view.member(REFERENCES)])
         basis = references[0]["basis"]
-        found = {row: Row(references, row, trained=False) for row in references[0]["rows"]}
-    names = own.names
+        rows = {row: Row(references, row, trained=False) for row in references[0]["rows"]}
+    names = store.names
     for row in methods:
-        if chosen := fnmatch.filter(names, view.member(f"{folder(row)}-seed*")):
-            scored = own.read(chosen)
-            basis = basis or scored[0]["basis"]
-            if any(alike(each["basis"]) != alike(basis) for each in scored):
-                raise ValueError(f"scores of {row} in {own.file} are of other windows, samples, seed or metric models")
-            found[row] = Row(scored, row)
-    return found
+        if members := fnmatch.filter(names, view.member(f"{folder(row)}-seed*")):
+            runs = store.read(members)
+            basis = basis or runs[0]["basis"]
+            if any(alike(each["basis"]) != alike(basis) for each in runs):
+                raise ValueError(
+                    f"scores of {row} in {store.file} differ from the others in windows, samples, seed or metric models"
+                )
+            rows[row] = Row(runs, row)
+    return rows
 
 
 def rows_of(stored: Path, name: str, view: View) -> dict[str, Row]:
-    """What has been scored of a set's own rows, with the reference rows; nothing where no method has been."""
-    found = entries(stored, name, view, SETS[name].methods)
-    return found if any(entry.trained for entry in found.values()) else {}
+    """Return the scored rows of a set with the reference rows; empty if no method is scored."""
+    rows = entries(stored, name, view, SETS[name].methods)
+    return rows if any(entry.trained for entry in rows.values()) else {}
 
 
 EMISSION = 3
@@ -406,11 +407,11 @@ def alike(basis: Sequence[Any]) -> list[Any]:
 
 
 def titled(name: str, entry: Row) -> str:
-    """A row as it is called, with what sets it apart."""
+    """Return the label of a row, with the options that distinguish it."""
     first = entry.runs[0]
     modes = first["config"].get("method", {}).get("modes")
-    apart = ["drawn"] * (first["basis"][EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
-    return f"{name} ({', '.join(apart)})" if apart else name
+    details = ["drawn"] * (first["basis"][EMISSION] == "drawn") + ([] if modes is None else [f"{modes} modes"])
+    return f"{name} ({', '.join(details)})" if details else name
 
 
 TRAINED = ("seeds", "CPU minutes")
@@ -424,31 +425,31 @@ def trained(entry: Row) -> tuple[str, str]:
     return str(len(entry.runs)), f"{statistics.fmean(here):.1f}" if here else "GPU"
 
 
-def ranked(found: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
+def ranked(rows: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
     """The energy score of all but the truth, the best first."""
-    scores = {name: entry.crossed(RANKED) for name, entry in found.items() if name != "real motion"}
-    known = {name: score for name, score in scores.items() if score is not None}  # all motion has it
-    return dict(sorted(known.items(), key=lambda item: item[1].mean))
+    scores = {name: entry.crossed(RANKED) for name, entry in rows.items() if name != "real motion"}
+    complete = {name: score for name, score in scores.items() if score is not None}  # all motion has it
+    return dict(sorted(complete.items(), key=lambda item: item[1].mean))
 
 
-def ranking(found: Mapping[str, Row], columns: Sequence[str]) -> str:
-    """Rows in order of the energy score, each with what it has more than the neighbours and than the next better.
+def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> str:
+    """Return rows sorted by energy score, with differences to the neighbours and to the row above.
 
-    And below, the model confidence set.
+    The model confidence set follows the table.
     """
-    scores = ranked(found)
+    scores = ranked(rows)
     header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
     lines = []
     for name, above in zip(scores, [None, *scores], strict=False):
-        own = found[name]
+        row = rows[name]
         minus = [None if name == NEIGHBOURS else NEIGHBOURS, above]
         behind = [None if other is None else scores[name].estimate(scores[other]) for other in minus]
-        lines.append([titled(name, own), *trained(own), *map(cell, [*behind, *map(own.estimate, columns)])])
-    known = {name: score for name, score in scores.items() if score.count >= ENOUGH}
-    if not any(found[name].trained for name in known):
+        lines.append([titled(name, row), *trained(row), *map(cell, [*behind, *map(row.estimate, columns)])])
+    tested = {name: score for name, score in scores.items() if score.count >= ENOUGH}
+    if not any(rows[name].trained for name in tested):
         return table(header, lines)
     best = f"May be the best, at {100 * LEVEL:.0f} % over clips and seeds, of rows with {ENOUGH} seeds or more"
-    return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(known, level=LEVEL).members)}.\n"
+    return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(tested, level=LEVEL).members)}.\n"
 
 
 def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
@@ -485,35 +486,35 @@ def main(
     page: Path | None = None,
     picture: Path = DOCS / "img" / "ranking.png",
 ) -> None:
-    """Fit and score what is missing, and write the tables.
+    """Fit and score missing results, and write the tables.
 
     Args:
-        runs: where run directories lie.
+        runs: folder of the run directories.
         data: the folder with bandai/ and cmu/; without it nothing is fitted.
-        sets: which.
-        methods: of these alone; all of a set where none is named.
-        seeds: of every method.
-        samples: futures of a window.
-        scores: the folder of scores and metric models; in another than the project's own, all is fitted anew.
-        accelerator: on which to train and to forecast; runs on a GPU tell no minutes.
-        page: whose tables; without one they are printed.
-        picture: of all sets that tell no paths, drawn with a page.
+        sets: names of sets.
+        methods: names of methods to fit; all methods of a set if empty.
+        seeds: seeds of each method.
+        samples: number of futures of each window.
+        scores: folder of scores and metric models; an empty folder starts from the beginning.
+        accelerator: on which to train and to forecast; runs on a GPU record no minutes.
+        page: page of the tables; None prints them.
+        picture: figure of all sets without given paths; drawn only with a page.
     """
     refuse_unknown("set", sets, SETS)
     refuse_unknown("method", methods, {**FUTURES, **PATHS})
     for name in sets:
-        chosen = SETS[name]
+        selected = SETS[name]
         if data is not None:
-            named = {row: options for row, options in chosen.methods.items() if not methods or row in methods}
-            work(data, runs, scores, name, named, dict.fromkeys(named, chosen.views), seeds, samples, accelerator)
+            named = {row: options for row, options in selected.methods.items() if not methods or row in methods}
+            work(data, runs, scores, name, named, dict.fromkeys(named, selected.views), seeds, samples, accelerator)
         tables = []
-        for view in chosen.views:
+        for view in selected.views:
             if rows := rows_of(scores, name, view):
                 heading = "" if view.given is None else f"With {view.given} path{'s' * (view.given != 1)} given:\n\n"
-                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if chosen.metric_models else ())]))
+                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if selected.metric_models else ())]))
         if tables:
             write(page, *tables, name=name)
-    sought = {name: rows_of(scores, name, View()) for name, chosen in SETS.items() if View() in chosen.views}
+    sought = {name: rows_of(scores, name, View()) for name, selected in SETS.items() if View() in selected.views}
     futures = {name: rows for name, rows in sought.items() if rows}
     if page is not None and futures:
         drawn(futures).savefig(picture, dpi=110)

@@ -27,17 +27,17 @@ def root_mean_square(values: np.ndarray) -> float:
 
 
 def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
-    """What both diagnostics say of a guide."""
-    found = dvae.reference_posterior(model, x, progress=False, **nuts)
+    """Return the cells of both diagnostics of a guide."""
+    posterior = dvae.reference_posterior(model, x, progress=False, **nuts)
     tested = dvae.stein_discrepancy(model, x, progress=False)
-    steps = found.pairs["z, between steps"]
-    least, most = np.nanmin(found.ratio), np.nanmax(found.ratio)
-    reference, guide = (root_mean_square(part.correlation[:, steps]) for part in (found.reference, found.guide))
-    fared = found.sampling
+    steps = posterior.pairs["z, between steps"]
+    least, most = np.nanmin(posterior.ratio), np.nanmax(posterior.ratio)
+    reference, guide = (root_mean_square(part.correlation[:, steps]) for part in (posterior.reference, posterior.guide))
+    fared = posterior.sampling
     return [
         *([] if fared is None else [f"{np.nanmax(fared.rhat):.3f}, {np.nanmin(fared.effective):.0f}"]),
-        f"{root_mean_square(found.bias):.2f} ± {root_mean_square(found.bias_error):.2f}",
-        f"{np.exp(np.log(found.ratio).mean()):.2f} ({least:.2f} to {most:.2f})",
+        f"{root_mean_square(posterior.bias):.2f} ± {root_mean_square(posterior.bias_error):.2f}",
+        f"{np.exp(np.log(posterior.ratio).mean()):.2f} ({least:.2f} to {most:.2f})",
         f"{reference:.2f}",
         f"{guide:.2f}",
         f"{(tested.p_values <= 0.05).sum()} of {len(tested.sequences)}",
@@ -45,7 +45,7 @@ def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
     ]
 
 
-COLUMNS = ["bias (rms)", "deviation ratio", "correlations", "the guide’s", "told by KSD at 5 %", "p, together"]
+COLUMNS = ["bias (rms)", "deviation ratio", "correlations", "the guide’s", "detected by KSD at 5 %", "p, together"]
 
 
 def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
@@ -66,7 +66,7 @@ def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
 
 
 def power(steps: int, sequences: int) -> list[str]:
-    """Of the discrepancy: the share of sequences that are told."""
+    """Return the share of sequences with a detected error of the guide, by kind of error."""
     model = dvae.linear_gaussian_surrogate(
         bounds.MODEL, GUIDES["exact"], {"z": 1, "x": 1}, steps, scale=0.9
     ).requires_grad_(False)
@@ -74,9 +74,9 @@ def power(steps: int, sequences: int) -> list[str]:
     x, cells = model.sample(sequences, steps)["x"], [str(steps)]
     for wrong, draws in (("", 500), ("correlations", 100), ("correlations", 500), ("a deviation", 500)):
         guide = normal(dvae.Oracle(model, steps), wrong)
-        found = dvae.stein_discrepancy(model, x, guide=guide, draws=draws, bootstrap=200, progress=False)
-        cells.append(f"{(found.p_values <= 0.05).mean():.0%}")
-    return [*cells, f"{found.p_value:.2g}"]
+        test = dvae.stein_discrepancy(model, x, guide=guide, draws=draws, bootstrap=200, progress=False)
+        cells.append(f"{(test.p_values <= 0.05).mean():.0%}")
+    return [*cells, f"{test.p_value:.2g}"]
 
 
 def neural(inference: str, x: torch.Tensor, fitting: int) -> dvae.DynamicalVAE:
@@ -123,10 +123,10 @@ def main(
         model = neural(GUIDES[name], x[:320], fitting)
         start = process_time()
         cells = said(model, x[320:322], draws=draws, warmup=draws)
-        spent = process_time() - start
+        elapsed = process_time() - start
         bound = dvae.SequenceELBO(num_particles=20).terms(model, x[320:]).bound
-        told = f"{bound.mean():.2f} ± {bound.std() / len(bound) ** 0.5:.2f}"
-        rows.append([f"{code(GUIDES[name])}, {name}", told, *cells, f"{spent:.0f} s"])
+        bound_text = f"{bound.mean():.2f} ± {bound.std() / len(bound) ** 0.5:.2f}"
+        rows.append([f"{code(GUIDES[name])}, {name}", bound_text, *cells, f"{elapsed:.0f} s"])
     write(page, table(["fitted guide", "bound", "R-hat, draws", *COLUMNS, "CPU"], rows), name="fitted")
 
 

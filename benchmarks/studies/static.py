@@ -1,12 +1,12 @@
-"""Tables of what the static latent of runs knows, and what moves with it: linear probes, interpolations, swaps of w.
+"""Tables of the content of the static latent of runs: linear probes, interpolations, and swaps of w.
 
-A probe is fitted to the windows of every other clip of each class, and judged on the windows of the others: multinomial
-logistic regression to a label, and ridge regression to the lengths of bones, where people differ in these. Beside the
-posterior mean of w stand other things to read: the mean of z's posterior means over time, and of each window the mean
-and the spread of every coordinate over time, which are not made by a model.
+A probe is fitted to the windows of every other clip of each class, and evaluated on the windows of the other clips:
+multinomial logistic regression to a label, and ridge regression to bone lengths if they differ between people. The
+posterior mean of w is compared with other features: the mean of z's posterior means over time, and two features without
+a model, the mean and the spread of every coordinate over time.
 
-A swap decodes a window with one latent of another window, of another label; x runs free from its own past. What it
-moves is told apart: the mean pose over time, and the motion about it.
+A swap decodes a window with one latent of another window with another label; x runs free from its own past. The effect
+is measured separately on the mean pose over time, and on the motion about it.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def read_lengths(features: Tensor, lengths: Tensor, fitted: Tensor) -> float:
 
 
 def standardised(features: Tensor, fitted: Tensor) -> Tensor:
-    """Features of mean 0 and variance 1 over what a probe is fitted to; those that do not vary are 0."""
+    """Standardize features by the rows that a probe is fitted to; constant features become 0."""
     x = features.double()
     spread, mean = torch.std_mean(x[fitted], 0)
     return (x - mean) / spread.clamp(min=1e-6)

@@ -1,7 +1,7 @@
-"""Writes the table of docs/discrete.md: models with states that are summed out, on data that switch dynamics.
+"""Write the table of docs/discrete.md: models with states that are summed out, on data with switching dynamics.
 
-Beside the bounds stands the estimate of a bootstrap particle filter, that follows states and latents of the fitted
-model and knows nothing of its guide or of the sums.
+Next to the bounds is the estimate of a bootstrap particle filter over states and latents of the fitted model, which
+uses neither its guide nor the sums.
 """
 
 import math
@@ -77,7 +77,7 @@ def filtered(model: dvae.DynamicalVAE, x: Tensor, particles: int) -> Tensor:
 def _law(
     model: dvae.DynamicalVAE, name: str, last: Mapping[str, Tensor], now: Mapping[str, Tensor], first: bool
 ) -> TorchDistribution:
-    """Of a variable at one step, given the step before, of which a first one has none."""
+    """Return the conditional distribution of a variable at one step, given the step before if there is one."""
     conditional = model.generator[name]
     pairs = {p: torch.stack([last[p], now.get(p, last[p])], 1) for p in conditional.parents}
     given = {p: value[:, 1:] if first else value for p, value in pairs.items()}
@@ -86,7 +86,7 @@ def _law(
 
 
 def told(model: dvae.DynamicalVAE, x: Tensor, states: Tensor) -> str:
-    """Share of steps at which the likelier state, named after what it mostly goes with, is the true one."""
+    """Return the share of steps with the correct state, after naming each state by its most frequent true state."""
     if "k" not in model.summed:
         return "–"
     found = model.states(x, 8)["k"].mean(0).argmax(-1)
@@ -130,7 +130,7 @@ def main(
     torch.manual_seed(1)
     train, _ = switching(1024, steps)
     test = switching(200, steps)
-    header = ["model", "ELBO", f"IWAE, K = {particles}", "IWAE less the filter's", "states told"]
+    header = ["model", "ELBO", f"IWAE, K = {particles}", "IWAE minus the filter's", "correct states"]
     write(page, table(header, [row(name, train, test, fitting, particles, filtering) for name in MODELS]))
 
 

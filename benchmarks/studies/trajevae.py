@@ -81,10 +81,10 @@ def main(
 
     Args:
         run: a run directory.
-        page: where; with None it is printed.
-        joints: whose paths are given, one more in each row.
-        count: windows, spread evenly over those of the test set.
-        samples: motions of each.
+        page: page of the table; None prints it.
+        joints: joints with given paths, one more in each row.
+        count: number of test windows, evenly spaced.
+        samples: number of motions of each window.
     """
     torch.set_num_threads(1)
     write(page, exact_paths(run, joints, count, samples), name="exact paths")

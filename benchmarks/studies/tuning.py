@@ -1,8 +1,8 @@
-"""Fits and scores what options of methods for motion are chosen by, and writes the tables of docs/results/tuning.md.
+"""Fit and score the options that are tuned for motion methods, and write the tables of docs/results/tuning.md.
 
-Everything is under one protocol, bandai2-tuning: clips of group A train, those of group B, whose styles are not
-those of training, test, on every fourth window of each; no clip of the test group C is seen. Scores are kept,
-by section, in `benchmarks/scores/tuning`: the script goes on where it was stopped, and tables are of what is there.
+All runs use one protocol, bandai2-tuning. Training uses clips of group A. Tests use every fourth window of group B,
+whose styles differ from the training styles; no clip of the test group C is used. Scores are stored by section in
+`benchmarks/scores/tuning`. An interrupted script continues, and tables show the available scores.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ PATH_COLUMNS = tuple(f"{score}, {count} given" for score in ("ADE", "APD", "ener
 
 @dataclass(frozen=True)
 class Section:
-    """What is compared with one another.
+    """Cases of one method that are compared with one another.
 
     Args:
-        method: whose options.
-        training: of all its runs, where a case says nothing else.
-        cases: name to options; those of `Training` are among them.
-        options: of all cases, where one says nothing else: what a preset was need not be what it becomes.
-        protocol: of the windows.
-        judged: whether the pose prior is a part of the method.
-        seeds: of every case.
+        method: name of the method.
+        training: training options of all runs, unless a case overrides them.
+        cases: options by name of the case, including those of `Training`.
+        options: options of all cases, unless a case overrides them; later changes of a preset do not apply.
+        protocol: window protocol.
+        judged: whether the method uses the pose prior.
+        seeds: seeds of each case.
     """
 
     method: str
@@ -113,7 +113,7 @@ class Store:
         return self.all.get(self.section, {})
 
     def add(self, case: str, seed: int, scores: Mapping[str, float]) -> None:
-        """Beside what there is."""
+        """Add the scores of one seed of a case to the stored ones."""
         self.all = Store(self.file, self.section).all
         cases = self.all.setdefault(self.section, {})
         cases.setdefault(case, {})[str(seed)] = {name: round(value, 4) for name, value in scores.items()}
@@ -137,7 +137,7 @@ def of_metric_models(data: MotionData, runs: Path, store: Store) -> None:
 
 
 def of_metric_model(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
-    """What a metric model says of the predicted frames of real windows."""
+    """Return the scores of a metric model on the predicted frames of real windows."""
     if name == "prior":
         prior, motions = load(run).model, windows.all()["x"]
         poses = prior.facing(motions)[:, windows.protocol.observed :]
@@ -151,7 +151,7 @@ def of_metric_model(name: str, run: Path, windows: motion.Windows) -> dict[str, 
 
 
 def of_references(data: MotionData, store: Store, judged: Mapping[str, Path]) -> None:
-    """Scores what is not fitted; it knows no paths."""
+    """Score the missing references, which use no given paths."""
     drop, name = data.protocol.root == "drop", data.protocol.name
     rows = [row for row in REFERENCES if store.lacks(f"{name}: {row}", 0)]
     if not rows:
@@ -189,7 +189,7 @@ def evaluated(model: Any, windows: Any, scores: Any, **told: Any) -> dict[str, f
 
 
 def shown(name: str, scores: Sequence[Mapping[str, float]]) -> str:
-    """The mean over seeds, with that of each where there are several."""
+    """Return the mean over seeds, followed by the value of each seed if there are several."""
     values = [each.get(name, nan) for each in scores]
     if any(map(isnan, values)):
         return "–"
@@ -214,7 +214,7 @@ def spread() -> str:
 
 
 def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
-    """Fits and scores what is not there yet."""
+    """Fit and score missing results."""
     opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
     asked = [SECTIONS[name].protocol for name in sections if name != "metric_models"]
     judged = fitted_metric_models(opened[TUNING.name], runs) if any(each.root == "drop" for each in asked) else {}
@@ -243,15 +243,15 @@ def main(
     stored: Path = SCORES / "tuning.json",
     page: Path | None = None,
 ) -> None:
-    """Fit and score what is missing, and write the tables.
+    """Fit and score missing results, and write the tables.
 
     Args:
-        runs: where run directories lie.
+        runs: folder of the run directories.
         data: bandai2.npz; without it nothing is fitted.
-        sections: which.
-        jobs: runs at a time.
+        sections: names of sections.
+        jobs: number of runs at a time.
         stored: the file of scores.
-        page: whose tables; without one they are printed.
+        page: page of the tables; None prints them.
     """
     refuse_unknown("section", sections, ("metric_models", SEEDS, *SECTIONS))
     tried = [name for name in sections if name != SEEDS]

@@ -3,13 +3,13 @@
     python -m tests.record write            compute and store them
     python -m tests.record check [NAME…]    compute them again and list every difference
 
-Each method is built with a set of options in which every pair of values of two options occurs (a pairwise cover, as far
-as options can be chosen freely). Of each the file keeps, in double precision: the number of parameters, the
-terms of a bound from one seed, the norm of its gradient, the losses of three training steps, a forecast and an
-imputation; and of the first set of options also the scores of an evaluation and a comparison. Options that a
-method refuses are kept as refused. Numbers are equal to rounding where they differ by less than `TOLERANCE` of their
-size. The check belongs on the kind of processor that wrote the file: single precision draws differ between instruction
-sets, and some methods amplify them. On another one, write the record from the commit before the change first.
+Each method is built with sets of options that contain every pair of values of two options (a pairwise cover, as far as
+options can be chosen freely). For each set the file stores, in double precision: the number of parameters, the terms of
+a bound from one seed, the norm of its gradient, the losses of three training steps, a forecast and an imputation. The
+first set also has the scores of an evaluation and a comparison. Refused options are stored too. Numbers are equal
+to rounding if they differ by less than `TOLERANCE` of their size. Run the check on the kind of processor that wrote the
+file: single precision draws differ between instruction sets, and some methods amplify them. On another one, write the
+record from the commit before the change first.
 """
 
 import argparse
@@ -107,7 +107,7 @@ def levels(name: str, hint: Any, default: Any) -> tuple[Any, ...]:
 
 
 def cover(options: Mapping[str, tuple[Any, ...]], most: int = 24) -> list[dict[str, Any]]:
-    """Rows in which every pair of values occurs, chosen greedily; the first row has the first values."""
+    """Return rows that cover every pair of values, chosen greedily; the first row has the first values."""
     names = list(options)
     missing = {
         (a, i, b, j)
@@ -139,7 +139,7 @@ def cover(options: Mapping[str, tuple[Any, ...]], most: int = 24) -> list[dict[s
 
 
 def options_of(name: str, data: Any) -> list[dict[str, Any]]:
-    """Sets of options of a method, without values that it refuses beside the first value of every other option."""
+    """Return sets of options of a method, without values refused with the first values of the other options."""
     kind = dvae.methods()[name]
     hints = get_type_hints(kind, include_extras=True)
     known = {
@@ -218,7 +218,7 @@ def some(values: torch.Tensor) -> list[float]:
 
 
 def numbers(name: str, options: Mapping[str, Any], data: Any, whole: bool) -> dict[str, Any]:
-    """What the record keeps of one set of options."""
+    """Return the recorded numbers of one set of options."""
     found: dict[str, Any] = {}
     train, test = data.windows("train"), data.windows("test")
     method = dvae.method(name, **options).resolve_defaults(train)
@@ -292,7 +292,7 @@ def record(names: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    """What is not equal to rounding."""
+    """Yield a line for each number that differs by more than rounding."""
     for key in dict.fromkeys((*old, *new)):
         before, after = old.get(key), new.get(key)
         pair = [each if isinstance(each, list) else [each] for each in (before, after)]

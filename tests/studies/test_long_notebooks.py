@@ -1,4 +1,4 @@
-"""The longer notebooks show what is stored; the others are in tests/docs."""
+"""The longer notebooks reproduce their stored outputs; tests/docs checks the others."""
 
 from pathlib import Path
 

@@ -82,7 +82,7 @@ def page(tmp_path):
 
 
 def tables(page):
-    """The tables of a page, by their first column, and by row and column; what is around them is as it was."""
+    """Return the tables of a page as lists of rows, and check that the text around them is unchanged."""
     text = page.read_text(encoding="utf-8")
     assert text.startswith(f"# Before\n{pages.BEGIN}\n")
     assert text.endswith(f"\n{pages.END}After\n")
@@ -301,7 +301,7 @@ def short(monkeypatch):
 
 
 def test_motion_latent(tmp_path, page, monkeypatch):
-    """Fitted and scored once, whatever is asked again; an interrupted run goes on; seeds have errors."""
+    """Results are fitted and scored only once; an interrupted run continues; several seeds give errors."""
     people = motion.simulate(clips=12, frames=90, seed=1)
     told = [
         {**clip.labels, "file_group": "ABC"[n % 3], "content": ("walk", "run")[n % 2]} for n, clip in enumerate(people)
@@ -336,7 +336,7 @@ def test_motion_latent(tmp_path, page, monkeypatch):
 
 
 def test_completion(tmp_path, page, short, monkeypatch):
-    """Measured once, whatever is asked again; what is seen is not predicted, and nothing is nearer than the floor."""
+    """Results are measured only once; predictions exclude observed frames; no distance is below the floor."""
     small = method("motion-latent", latent=3, widths=(8,), finish=0.0)
     fit(small, dataset.SegmentData.open(), out=tmp_path / "a", **vars(Training(steps=2, batch_size=4, progress=False)))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
@@ -391,12 +391,12 @@ def test_recurrent_poses_are_put_where_segments_start(short):
             return {"x": self.turns(windows.all())["x"][:, cut.observed :]}
 
     errors = completion.references(held, Oracle())["rows"]
-    assert max(max(row) for row in errors[completion.SUP].values()) < 5  # mm, of which frames of chi lose 2
+    assert max(max(row) for row in errors[completion.SUP].values()) < 5  # mm; frames of chi account for 2
     assert min([*errors[completion.STILL].values()][-1]) > 50
 
 
 class MotionSpace:
-    """Frames and a body, of which surfaces are made."""
+    """Frames and a body, for surfaces."""
 
     def __init__(self, data):
         self.timed, self.body = data.timed, motion.bodies.human()
@@ -477,7 +477,7 @@ def test_what_a_prior_has_in_common_are_the_moments_of_the_posteriors_together()
     draws = (mean + deviation * torch.randn(20_000, 5, 3, 2)).flatten(0, 1)
     for found, of in zip(common, (draws.mean(0), draws.std(0)), strict=True):
         torch.testing.assert_close(found, of, atol=0.03, rtol=0)
-    own = torch.randn(7, 4, 2), torch.rand(7, 4, 2)  # of which the last step is not read
+    own = torch.randn(7, 4, 2), torch.rand(7, 4, 2)  # the last step is not used
     for what in ((), ("mean",), ("deviation",), ("mean", "deviation")):
         made = priors.with_common(lambda: own, common, what)()
         for name, values, before, after in zip(("mean", "deviation"), made, own, common, strict=True):
@@ -497,7 +497,7 @@ def test_occlusion(folder, page, monkeypatch):
 
 
 def test_ranking(folder, page, monkeypatch):
-    """Fitted and scored once; a difference of two rows is that of what they show; later runs join."""
+    """Results are fitted and scored only once; differences are between rows; later runs are added."""
     methods = {"cvae": {"width": 4, "latent": 2}, "srnn": {"width": 4, "latent": 2, "warm_up": 1}}
     small = {name: {**options, "steps": 2, "batch_size": 4} for name, options in methods.items()}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", small)})
@@ -664,7 +664,7 @@ def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, 
 
 
 def test_papers(folder, page, monkeypatch):
-    """Rows, in views that some have alone; what a change does is the difference of its rows, and printed cells stay."""
+    """Rows appear in their views; a change is the difference of its rows; published cells stay."""
     small = {"latent": 2, "width": 4, "feedforward": 4, "steps": 2, "batch_size": 4}
     paper = papers.Paper(
         "simulated-trajectories",
@@ -791,10 +791,10 @@ def test_irregular(tmp_path, page, monkeypatch):
     for kept in irregular.KEPT:
         whole, halves, less = (
             float(cell.split()[0])
-            for cell in (rows[f"whole, judged on {kept}"][0], *rows[f"halves, judged on {kept}"][:2])
+            for cell in (rows[f"whole, tested on {kept}"][0], *rows[f"halves, tested on {kept}"][:2])
         )
         assert abs(halves - whole - less) < 0.0016  # of three rounded numbers
-        assert f"frames apart, judged on {kept}" in rows
+        assert f"independent frames, tested on {kept}" in rows
 
 
 def test_halves_keep_times_between_frames_and_no_frame_twice():
@@ -817,7 +817,7 @@ def test_gaps_are_as_long_as_they_are():
 
 @pytest.fixture
 def benches(tmp_path, monkeypatch, capsys):
-    """Runs of benchmarks whose rows are given, one tuple a measurement; and what they say and keep."""
+    """Run benchmarks with given rows, one tuple for each measurement; return the status and the last line."""
     (tmp_path / "speed.md").write_text("<!-- history -->\n<!-- end of history -->\n")
     monkeypatch.setattr(bench, "HISTORY", tmp_path / "history.json")
     monkeypatch.setattr(bench, "page", partial(bench.page, path=tmp_path / "speed.md"))
@@ -862,7 +862,7 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(benches
 
 def test_a_target_that_was_missed_before_is_told_and_fails_nothing(benches):
     benches((2.5, 4.0, 7.0, 0.01), commit="a", keep=True)
-    assert benches((2.6, 4.0, 7.0, 0.01)) == (0, "speed: step: 2.60 is to be at most 2")
+    assert benches((2.6, 4.0, 7.0, 0.01)) == (0, "speed: step: 2.60 must be at most 2")
 
 
 def test_a_slower_row_is_measured_beside_the_code_of_the_release(benches, monkeypatch):
@@ -872,7 +872,7 @@ def test_a_slower_row_is_measured_beside_the_code_of_the_release(benches, monkey
     assert benches((9.0, 1.0, 9.0, 0.01))[0] == 0  # is not compared itself
     monkeypatch.delenv(bench.BESIDE)
     asked = []
-    beside = {"speed: step": 1.15, "speed: cost": 6.0}  # of which the second was not in doubt
+    beside = {"speed: step": 1.15, "speed: cost": 6.0}  # the second was not in doubt
     monkeypatch.setattr(bench, "there", lambda *given: asked.append(given[:2]) or beside)
     assert benches((1.2, 4.0, 7.0, 0.01), (1.2, 4.0, 7.0, 0.01))[0] == 0
     assert benches((1.3, 4.0, 7.0, 0.01), (1.3, 4.0, 7.0, 0.01)) == (
@@ -918,8 +918,8 @@ def test_a_release_is_measured_by_its_own_code(tmp_path, monkeypatch):
 
 def test_wrong_arguments_of_benchmarks_are_told_before_anything_is_measured(tmp_path):
     for options, message in (
-        ({"threads": 0}, "threads is 0, expected 1 or more"),
-        ({"out": tmp_path / "no" / "x.json"}, "has no folder to be written to; make .*no first"),
+        ({"threads": 0}, "threads must be at least 1, got 0"),
+        ({"out": tmp_path / "no" / "x.json"}, "is in a folder that does not exist; create .*no first"),
         ({"names": ("sped",)}, "sped"),
     ):
         with pytest.raises(SystemExit, match=message):
