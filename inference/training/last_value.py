@@ -7,8 +7,8 @@ past, the reference is this density given all steps before t.
 
 A model trained with scheduled sampling reads its own means. Its reference uses the mean and variance over training
 windows for observed steps, and the last observed value as x_s for all future steps. A discrete value has the
-probability of the interval around it. The class of the last value has the probability of no change, and all other classes share the
-rest equally.
+probability of the interval around it. The class of the last value has the probability of no change, and all other
+classes share the rest equally.
 """
 
 from __future__ import annotations
