@@ -276,7 +276,7 @@ def test_sequences_are_told_apart_by_all_their_ids():
     assert {one.name: one.values.item() for one in panel} == {"1/u": 1, "1/v": 2, "2/u": 3, "2/": 4}
     numbered = frame.assign(a=[10, 10, 2, 2])
     assert next(iter(Panel.of(numbered, Columns((Column("y"),), id=("a", "b"), time="t")))).name == "2/u"
-    with pytest.raises(ValueError, match="1 of 4 rows have no b, the first of them row 3; fill in which sequence"):
+    with pytest.raises(ValueError, match="1 of 4 rows have no b, first in row 3; fill in the id"):
         Panel.of(frame.assign(t=range(4)), Columns((Column("y"),), ("b",), "t"))
 
 

@@ -73,5 +73,5 @@ def domain(name: str, **options: Any) -> Panel:
     if name not in DOMAINS:
         raise ValueError(f"no domain {name!r}{nearest(name, DOMAINS)}; known: {', '.join(DOMAINS)}")
     module, _, function = DOMAINS[name].place.partition(":")
-    found: Panel = getattr(import_module(module), function)(**options)
-    return found
+    panel: Panel = getattr(import_module(module), function)(**options)
+    return panel
