@@ -46,7 +46,7 @@ class Control:
         """Return the windows with the given paths and exchanged poses.
 
         Raises:
-            UsageError: a run of another method.
+            UsageError: a run is of another method.
         """
         if self == Control():
             return windows
@@ -298,7 +298,7 @@ def _classifiers(scoring: ForecastScoring, data: str | None, scored_run: runs.Lo
     """Return the action classifiers of runs by label.
 
     Raises:
-        UsageError: a run is not an action classifier, repeats a label, or was fitted on other data than `judged`.
+        UsageError: a run is not an action classifier, repeats a label, or was fitted on other data than `scored_run`.
     """
     classifiers: dict[str, Any] = {}
     for path in scoring.classifier:

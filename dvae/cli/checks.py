@@ -197,7 +197,7 @@ def gap(
         particles: number of particles of IWAE and FIVO, and of draws over which ELBOs are averaged.
         temperatures: number of temperatures of annealed importance sampling; more give closer bounds.
         chains: number of chains for each window.
-        fitting: steps of the guides of single windows; 0 leaves out the parts of the gap.
+        fitting: number of optimiser steps of the guide of each window; 0 omits the parts of the gap.
         reach: steps between latents that these guides read linearly; by default all that the equations allow.
         seed: seed of the draws.
         batch_size: number of windows at once.
@@ -271,7 +271,7 @@ def coverage(
 
 
 def _calibration_and_test(loaded: runs.Loaded, data_set: Any, label: str | None, values: Sequence[str]) -> Any:
-    """Return windows to calibrate on and windows to test on.
+    """Return the windows for calibration and for the test.
 
     Raises:
         UsageError: the label divides no test clips.

@@ -150,11 +150,11 @@ class DataOptions(ColumnOptions):
         if kind == "windows":
             kind = "panel" if is_table(self.data) or table_options else "motion"
             if kind == "panel" and self.data == SIMULATED:
-                raise UsageError(f"--{table_options[0]} is about tables; name one with --data")
+                raise UsageError(f"--{table_options[0]} is for tables; name one with --data")
         for other, options in OF_KINDS.items():
             if other != kind and (inapplicable := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
                 raise UsageError(
-                    f"--{min(inapplicable).replace('_', '-')} is about {SAID[other]}, and {name} is fitted on "
+                    f"--{min(inapplicable).replace('_', '-')} is for {SAID[other]}, and {name} is fitted on "
                     f"{SAID[kind]}"
                 )
         columns = {field.name for field in fields(ColumnOptions)}
@@ -203,7 +203,7 @@ def fit(
         ERROR.print(f"{out} contains a run; continuing it")
         return resume(out, tensorboard=tensorboard)
     if Run(out).exists:
-        raise ValueError(f"{out} already holds a run; {runs.advice(out)}; or choose another directory")
+        raise ValueError(f"{out} already contains a run; {runs.advice(out)}; or choose another directory")
     with arguments():
         method.check()  # before reading the data, so wrong equations and options fail early
         options = given_options(training)
@@ -345,7 +345,7 @@ def _report(result: Fit) -> None:
 
 
 def _use(name: str, run: Path) -> str:
-    """Return the next commands for a fitted run, in words."""
+    """Describe the next commands for a fitted run."""
     if name in metric_models():
         target = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"

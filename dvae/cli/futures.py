@@ -360,7 +360,7 @@ def animate(
 def _load_window(
     source: str, clip: str | None, window: int | None, samples: int | None
 ) -> tuple[int, motion.Forecasts]:
-    """Return the number of a window among the windows of the clip in a file of forecasts, and its forecasts."""
+    """Return the index and the forecasts of one window of a clip in a file of forecasts."""
     stored = motion.Forecasts.load(source)
     indices = [n for n, key in enumerate(stored.keys) if clip in (None, key[1], f"{key[0]}/{key[1]}")]
     if not indices:
@@ -478,7 +478,7 @@ def _fixed_joints(futures: motion.Forecasts) -> list[int]:
 
 
 def _fastest_window(positions: np.ndarray, window: int | None) -> int:
-    """Return the given window, or the one of `positions` (N, T, J, 3) whose joints move fastest.
+    """Return the given window, or the window of `positions` (N, T, J, 3) with the fastest joints.
 
     Raises:
         UsageError: there are fewer windows.

@@ -26,7 +26,7 @@ Expert = Annotated[T, EXPERT]
 def command_stub(
     function: Callable[..., None], given: Sequence[str], everything: bool
 ) -> tuple[Callable[..., None], str]:
-    """Return a copy of a command's signature, from which its help is printed, and " METHOD" if a method is given.
+    """Return a function that has a command's signature, for its help, and " METHOD" if a method is given.
 
     Args:
         function: function of the command.

@@ -99,7 +99,9 @@ def show(
         model, *guides = figure.subplots(1, graphs, squeeze=False)[0]
         pair_audit.generative.draw(steps, ax=model, observed=observed).set_title("model")
         for axes in guides:
-            title = "guide" if pair_audit.exact else "guide (dashed: what the exact posterior also reads)"
+            title = (
+                "guide" if pair_audit.exact else "guide (dashed: dependencies of the exact posterior that it ignores)"
+            )
             pair_audit.draw(steps, ax=axes).set_title(title)
         save_figure(figure, out)
     OUT.print(str(pair_audit.generative), highlight=False, markup=False, soft_wrap=True)
@@ -108,7 +110,7 @@ def show(
         OUT.print(pair_audit.table())
         OUT.print(pair_audit.verdict)
     else:
-        reason = "all latents are summed out" if summed else "nothing is latent"
+        reason = "all latents are summed out" if summed else "the model has no latents"
         OUT.print(f"{reason}: there is no guide, and the bound is the log evidence")
     if method is not None:
         OUT.print("\n".join(_describe_trainings(kind.trainings)), highlight=False, soft_wrap=True)

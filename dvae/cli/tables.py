@@ -102,7 +102,7 @@ def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: 
         **cut: options of `Cut` that replace the values of the run, if not None.
 
     Raises:
-        UsageError: the run was fitted on whole sequences, for which there are no forecasts.
+        UsageError: the run was fitted on whole sequences, which have no forecasts.
     """
     if opened.schema.cut.length is None:
         raise UsageError(
@@ -161,7 +161,7 @@ def _note_omitted(samples: int, out: Path, figure: Path | None = None) -> None:
 
 
 def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
-    """Print a summary of each table and a schema to correct; columns without a given role are guessed."""
+    """Print a summary of each table and a schema to edit; columns without a given role are guessed."""
     if out is not None and len(paths) > 1:
         raise UsageError(f"--out writes the schema of one table, got {len(paths)} tables; name one")
     for path in paths:
@@ -193,11 +193,9 @@ def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
         if out is None:
             if schema_beside(path) == (None, None):
                 schema_path = Path(path).with_suffix(".toml")
-                OUT.print(
-                    f"schema to correct and keep as {schema_path} (--out {schema_path} writes it):\n", markup=False
-                )
+                OUT.print(f"schema to edit and save as {schema_path} (--out {schema_path} writes it):\n", markup=False)
             OUT.print(text, markup=False, highlight=False)
         else:
             with files.atomic_write(out) as file:
                 file.write(text.encode())
-            ERROR.print(f"wrote {out}: correct it, and `dvae fit METHOD --data {path} --out RUN` reads it")
+            ERROR.print(f"wrote {out}: edit it; `dvae fit METHOD --data {path} --out RUN` reads it")

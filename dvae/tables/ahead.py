@@ -13,9 +13,9 @@ from .windows import NAMED, PanelWindows
 
 
 def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> PanelWindows:
-    """Return one window for each sequence, whose future follows the last row with a target.
+    """Return one window for each sequence; its future follows the last row with a target.
 
-    Later rows contain covariates that are known in the future, with empty targets.
+    Later rows contain known covariates of the future and empty targets.
 
     Args:
         panel: the sequences.
@@ -23,7 +23,7 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
         horizon: steps of the future; by default those of the schema.
 
     Raises:
-        ValueError: if sequences are not cut, or no sequence is long enough with covariates for its future.
+        ValueError: if sequences are not cut into windows, or none is long enough and has the covariates of its future.
 
     Warns:
         UserWarning: if some sequences have no window; the message names them and the reason.

@@ -1,4 +1,4 @@
-"""Join the columns of a table that together are one time: a date and a clock, or year, month, day and hour."""
+"""Join columns of a table to one time: a date and a time of day, or year, month, day and hour."""
 
 from __future__ import annotations
 
@@ -103,12 +103,14 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
 
     label, first = " ".join(names), read_numbers(frame[names[0]])
     if len(names) > 6:
-        raise ValueError(f"{label} are {len(names)} columns of one time; expected at most year, month, …, second")
+        raise ValueError(
+            f"{label} are {len(names)} columns of one time; expected year, month, day, hour, minute, second"
+        )
     timestamps = compact(first.values) if first.is_numeric else dates(frame[names[0]])
     if timestamps is not None:
         if len(names) > 4:
             raise ValueError(
-                f"{label} are a date and {len(names) - 1} columns; expected a clock, or hour, minute, second"
+                f"{label} are a date and {len(names) - 1} columns; expected a time of day, or hour, minute, second"
             )
         timestamps = timestamps.set_axis(frame.index)
         for name, unit in zip(names[1:], ("hour", "minute", "second"), strict=False):
@@ -120,7 +122,8 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
         units = [next(order) for _ in names]
     if skipped := [fine for coarse, fine in pairwise(SECONDS) if fine in units and coarse not in units]:
         raise ValueError(
-            f"{label} have a {skipped[0]} and no larger unit before it; name the columns from the year or day on"
+            f"{label} have a {skipped[0]} without the next larger unit; name a column for each unit, "
+            "from the year or day on"
         )
     parts = {str(unit): _part(frame[name], str(unit)) for unit, name in zip(units, names, strict=True)}
     seconds = sum(

@@ -1,4 +1,4 @@
-"""Proposals: guesses of each column's type and role, as a schema that you can edit."""
+"""Guess each column's type and role, as a schema that you can edit."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ PART_OF_TIME = re.compile(r"\d{1,3}:\d\d([:.]\d+)*\s?([ap]\.?m\.?)?", re.IGNOREC
 QUANTITY = re.compile(r"([^\w\s.,+-]{0,3})\s?[-+−]?[.,]?\d[\d.,'’\s]*([^\d\s]\D{0,11})?")
 """A number, optionally with a unit before or after it."""
 NUMBERED = 5
-"""Minimum number of columns, named alike with a number, that suggest a table with one column per step."""
+"""Minimum number of numbered columns, such as x1 to x5, that suggest a table with one column per step."""
 DATED_NAME = re.compile(
     r"\d{4}([-/.]\d{1,2}){0,2}([T ]\d.*)?|\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{4}[-_ ]?[QM]\d{1,2}|"
     rf"({'|'.join(MONTHS)})[a-z]*[-/ .]?\d{{2,4}}",
@@ -130,9 +130,9 @@ class ColumnHints:
             static = ", ".join(
                 column.name for column in columns if column.role == "static" and column.name not in roles
             )
-            reason = f"; constant in each sequence are {static}" if static else ""
+            reason = f"; constant within each sequence: {static}" if static else ""
             candidates = ", ".join(names[:20]) or "none"
-            raise ValueError(f"no column is a target; given are {candidates}{reason}; name those to model (--columns)")
+            raise ValueError(f"no column is a target among {candidates}{reason}; name the columns to model (--columns)")
         numbers = [column for column in columns if column.family != "category"]
         marks = [mark for column in numbers for mark in inference.numbers[column.name].marks]
         schema = Columns(
@@ -152,7 +152,7 @@ class ColumnHints:
             if inference.is_constant(name):
                 warnings.warn(
                     f"column {name!r} is constant, {_first(frame[name])}, but was named as a target; its forecasts are "
-                    "trivial, and scores over all columns count it",
+                    "trivial, and scores over all columns include it",
                     stacklevel=3,
                 )
         inference.warn(schema, all_named=not self.columns)
@@ -180,13 +180,12 @@ def infer_columns(frame: Any) -> Columns:
 
     - Time: the first column with dates or with the name of a time. A date and a clock, or year, month, day and hour,
       are joined if one column alone leaves several rows at the same time.
-    - Ids: repeated texts, and integers with the name of an id, if with them no two rows of a sequence have the same
-      time.
+    - Ids: repeated texts, and integers with the name of an id, if they distinguish rows with the same time.
     - Static: columns that are constant within each of several sequences.
     - Targets: all other columns. Integers from 0 are counts, two values are binary, few texts are a category, and
       numbers above 0 whose standard deviation exceeds half their mean are positive.
 
-    A warning names the remaining columns, such as constant ones, which are omitted.
+    The remaining columns, such as constant ones, are omitted, and a warning names them.
 
     Args:
         frame: table.
@@ -198,14 +197,14 @@ def infer_columns(frame: Any) -> Columns:
 
 
 class _Inference:
-    """The inferred id, time and column families of a frame, without those that are given.
+    """Inference of the id, time and column families of a frame that the user does not give.
 
     Args:
-        told: roles given by the user.
+        hints: roles given by the user.
         frame: table in the long form.
         levels: names of columns that are levels of its index.
         times: columns of the time, if given.
-        aside: columns with a given role other than data.
+        key_columns: columns of the given id, time, group and split.
         families: given columns with their family, "" if none is given.
     """
 
@@ -451,7 +450,7 @@ class _Inference:
         ):
             headers = [str(value) for value in self.frame.iloc[:count].to_numpy().ravel() if value == value]
             raise ValueError(
-                f"above the numbers are {count + 1} rows of names, also {', '.join(map(brief, headers[:6]))}; "
+                f"the table has {count + 1} header rows, with texts such as {', '.join(map(brief, headers[:6]))}; "
                 "write one row of names, such as 'power MW', or read the table with pandas.read_csv("
                 f"…, header={[*range(count + 1)]}) and join them"
             )
@@ -502,7 +501,7 @@ class _Inference:
         if name in (*self.time, *self.id):
             return "the time" if name in self.time else "an id"
         if self._numbers_rows(name):
-            return "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
+            return "row numbers without a name" if name == "Unnamed: 0" else "row numbers"
         if name in self.levels:
             return "a level of the index that does not distinguish sequences"
         if not parsed.wrong.any() and np.isnan(parsed.values).all():
@@ -591,7 +590,7 @@ def is_date(values: Any) -> bool:
     """Return whether a column contains dates, or texts of them.
 
     Raises:
-        Undecided: if dates are ambiguous.
+        AmbiguousDates: if dates are ambiguous.
     """
     import pandas as pd
 

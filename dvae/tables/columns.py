@@ -82,8 +82,8 @@ class Column:
             )
         if (self.family == "category") != bool(self.classes):
             raise ValueError(
-                f"column {self.name!r} has family {self.family!r} and {len(self.classes)} classes; a category, "
-                'and no other family, has classes = ["…", "…"]'
+                f"column {self.name!r} has family {self.family!r} and {len(self.classes)} classes; a category "
+                'needs classes = ["…", "…"], and no other family has them'
             )
         if len(set(self.classes)) < len(self.classes) or len(self.classes) == 1 or len(self.classes) > MOST:
             raise ValueError(
@@ -143,7 +143,7 @@ class Columns:
         if len(names) > MOST:
             raise ValueError(f"{len(names)} columns; at most {MOST} are read")
         if not self.targets:
-            raise ValueError(f"no column is a target; given are {', '.join(self.names[:20]) or 'none'}")
+            raise ValueError(f"no column is a target among {', '.join(self.names[:20]) or 'none'}")
         if repeated := [name for name, count in Counter(names).items() if count > 1]:
             raise ValueError(f"column {repeated[0]!r} has two roles; every column must have one")
         if self.zone is not None:
@@ -180,7 +180,7 @@ class Columns:
 
         Args:
             name: name of the column.
-            **told: fields to change, such as family="count"; a new category also needs its classes.
+            **changes: fields to change, such as family="count"; a new category also needs its classes.
 
         Raises:
             ValueError: if the column does not exist or the fields do not fit together.
@@ -278,11 +278,11 @@ def parsed(text: str) -> dict[str, Any]:
             raise RecursionError
         return tomllib.loads(text)
     except RecursionError:
-        raise ValueError("it has nested tables, deeper than any schema") from None
+        raise ValueError("its tables are nested too deeply") from None
 
 
 def layout(told: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a schema about the whole table, with their types checked.
+    """Check and return the entries of a schema that describe the whole table.
 
     Raises:
         ValueError: if an entry is unknown or has another type.
@@ -309,7 +309,7 @@ def _refuse_others(entries: Mapping[str, Any], allowed: Iterable[str], owner: st
     names: Sequence[str] = list(allowed)
     for name in entries:
         if name not in names:
-            raise ValueError(f"{owner} has an entry {name!r}{nearest(name, names)}; known are {', '.join(names)}")
+            raise ValueError(f"{owner} has an entry {name!r}{nearest(name, names)}; known entries: {', '.join(names)}")
 
 
 def _quote_all(words: Iterable[str]) -> str:

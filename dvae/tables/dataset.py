@@ -67,9 +67,8 @@ class PanelData:
             path: path of a CSV, Parquet, npz or npy file, or of a folder of npy files; or the name of a data set of
                 `dvae.tables.domains`.
             columns: a schema, or the targets as in `ColumnHints`; replaces the schema file.
-            cut: how to split and cut sequences; by default from the schema file, otherwise a choice that suits the
-                data.
-            **told: further fields of `ColumnHints` and of `Cut`.
+            cut: how to split and cut sequences; by default from the schema file, or else `default_cut`.
+            **options: further fields of `ColumnHints` and of `Cut`.
 
         Raises:
             FileNotFoundError: if the file does not exist.
@@ -132,13 +131,13 @@ class PanelData:
         return descriptions
 
     def ahead(self, horizon: int | None = None) -> PanelWindows:
-        """Return windows whose future follows the end of each sequence, as in `dvae.tables.ahead`.
+        """Return one window for each sequence; its future follows the last target, as in `dvae.tables.ahead`.
 
         Args:
             horizon: steps of the future; by default those of the schema.
 
         Raises:
-            ValueError: if sequences are not cut, are too short, or have no covariates for the future.
+            ValueError: if sequences are not cut into windows, are too short, or have no covariates of the future.
         """
         return ahead(self.panel, self.schema, horizon)
 

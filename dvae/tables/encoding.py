@@ -38,9 +38,9 @@ from .protocol import Cut
 COVARIATES, STATICS, GAPS = "c", "s", "d"
 """Names of context in batches."""
 EVEN = 1.3
-"""Steps are evenly spaced up to this ratio of longest gap to median, and of median to shortest gap; months are."""
+"""Maximum ratio of longest gap to median, and of median to shortest gap, of evenly spaced steps; months are even."""
 LEAST = 1e-7
-"""Standard deviation of logarithms below which values are a constant with rounding errors."""
+"""Standard deviation of logarithms below which values count as constant up to rounding errors."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
 LOGARITHMIC = ("positive", "log-normal", "power")
 """Families whose logarithms networks read."""
@@ -49,14 +49,14 @@ SCALED = (*LOGARITHMIC, *COUNTS)
 
 @dataclass(frozen=True)
 class PanelSchema(Schema):
-    """The schema of a panel; the module describes the encoding.
+    """Schema of a panel; the module docstring describes the encoding.
 
     Args:
         columns: schema of the table.
         cut: how sequences are split and cut.
         means, scales: means and scales of the standardised columns, over the training data.
-        logarithms: for columns read as logarithms, the smallest value, and mean and deviation of the logarithms.
-        lacking: names of columns with an indicator: those with missing training values, or known only up to the
+        logarithms: smallest value, and mean and standard deviation of the logarithms, of columns read as logarithms.
+        with_missing: names of columns with an indicator: those with missing training values, or known only up to the
             present.
         step: median time between steps; 0 if steps are evenly spaced.
         calendar: kind, time zone and calendar step of the times.
@@ -93,7 +93,9 @@ class PanelSchema(Schema):
                 f"no mean and scale of {', '.join(sorted(missing))}; models need both to standardise values"
             )
         if missing := {c.name for c in self.columns.of("past")} - {*self.with_missing}:
-            raise ValueError(f"no indicator of {', '.join(sorted(missing))}, whose values end with the present")
+            raise ValueError(
+                f"no indicator of {', '.join(sorted(missing))}; covariates known up to the present need one"
+            )
 
     @classmethod
     def from_data(cls, panel: Panel, cut: Cut) -> Self:
@@ -136,7 +138,9 @@ class PanelSchema(Schema):
         _warn_of_levels(panel.columns, means, training_values)
         shares = np.array([means[c.name] for c in panel.columns.targets if c.family == "binary"])
         spread = float(np.sqrt((shares * (1 - shares)).mean())) if len(shares) else 0.0
-        scales |= {c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"}  # some are rare
+        scales |= {
+            c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"
+        }  # one scale, as some events are rare
         gaps = np.concatenate(
             [np.diff(sequence.times[part]) if sequence.times is not None else np.empty(0) for sequence, part in parts]
         )
@@ -291,7 +295,7 @@ class PanelSchema(Schema):
 
     @cached_property
     def ending(self) -> tuple[list[int], list[int]]:
-        """Coordinates of c that are known up to the present, and of their indicators."""
+        """Indices in c of the covariates that are known up to the present, and of their indicators."""
         coordinates: list[int] = []
         indicators, start = [], 0
         for column in self.columns.of("known", "past"):
@@ -312,7 +316,7 @@ class PanelSchema(Schema):
     @classmethod
     @override
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Return the schema that `config` described."""
+        """Return the schema from its `config`."""
         options = tuples(config)
         options |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
         options["logarithms"] = tuples(config["logarithms"])
@@ -329,7 +333,7 @@ def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
 
 
 def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Warn if float32 does not resolve how a column varies in sequences, after the mean of all is subtracted."""
+    """Warn if float32 does not resolve how a column varies within a sequence, after the overall mean is subtracted."""
     center = np.array([means.get(name, 0.0) for name in columns.names])
     imprecise = np.array([is_imprecise(ColumnSummary.of(blocks(values)), center) for _, values in training])
     for column, mean, sequences in zip(columns.columns, center, imprecise.T, strict=True):

@@ -27,7 +27,7 @@ BANDS = {0.95: 0.15, 0.8: 0.3, 0.5: 0.5}
 """Opacity of the prediction bands in figures, by level."""
 FORMATS = (".csv", ".parquet", ".npz")
 FEW = 12
-"""Maximum number of columns with a score each."""
+"""Maximum number of columns that are also scored separately."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class PanelImputed:
 
     Args:
         draws: (K, N, T, D) of the coordinates; observed values are equal in all draws.
-        lacking: (N, T, D), True where a coordinate is missing.
+        missing: (N, T, D), True where a coordinate is missing.
         columns: coordinate to its unit.
         keys: (sequence, first step) of each window.
         times: (N, T) of the steps, as in `Calendar`; None for step numbers.
@@ -225,7 +225,7 @@ def _quantile(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
 
 
 def _save(result: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **arrays: np.ndarray) -> None:
-    """Write a table, or arrays with the sequences, steps and columns that they belong to."""
+    """Write the table of a result, or arrays with the names of their sequences, steps and columns."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         raise ValueError(f"{path} must end in one of {', '.join(FORMATS)}")

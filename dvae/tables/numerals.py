@@ -1,4 +1,4 @@
-"""Parse a column of a table as float64 numbers, and report every other cell."""
+"""Parse a column of a table as float64 numbers, and report the cells that are not numbers."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ class Panel:
             label = f"sequence {sequence.name!r} of {self.name}"
             if sequence.name in names:
                 raise ValueError(
-                    f"{self.name} has two sequences {sequence.name!r}; name the columns that tell them apart (id)"
+                    f"{self.name} has two sequences {sequence.name!r}; name the id columns that distinguish them"
                 )
             names.add(sequence.name)
             if sequence.values.ndim != 2 or sequence.values.shape[1] != len(self.columns.columns) or not len(sequence):
@@ -115,7 +115,7 @@ class Panel:
             if sequence.times is not None and (
                 sequence.times.shape != (len(sequence),) or not (np.diff(sequence.times) > 0).all()
             ):
-                raise ValueError(f"{label} has times that do not increase, or two rows with one time")
+                raise ValueError(f"{label} has times that are not strictly increasing")
         object.__setattr__(self, "complete", self._check())
 
     def _check(self) -> frozenset[str]:
@@ -137,14 +137,12 @@ class Panel:
                     owner, column = np.searchsorted(ends, start + row, "right"), self.columns.columns[indices[offset]]
                     sequence, size = self.series[owner], f", below {LARGEST:g} in size" if valid[row, offset] else ""
                     advice = (
-                        "give it another family"
-                        if np.isfinite(cells[row, offset])
-                        else "where none is known, write NaN"
+                        "give it another family" if np.isfinite(cells[row, offset]) else "write NaN for missing values"
                     )
                     raise ValueError(
                         f"sequence {sequence.name!r} of {self.name} has {cells[row, offset]:g} in row "
-                        f"{start + row - ends[owner] + len(sequence)} of column {column.name!r}, and the family "
-                        f"{column.family!r} is of {domain}{size}; {advice}"
+                        f"{start + row - ends[owner] + len(sequence)} of column {column.name!r}, but the family "
+                        f"{column.family!r} requires {domain}{size}; {advice}"
                     )
             rows = start + np.flatnonzero(absent[:, self._targets].any(1))
             incomplete |= {*np.searchsorted(ends, rows, "right").tolist()}
@@ -247,8 +245,8 @@ class Panel:
         arrays = [data] if hasattr(data, "ndim") and data.ndim == 2 else data
         if not isinstance(arrays, np.ndarray | torch.Tensor | list | tuple):
             raise TypeError(
-                f"a table is built from a pandas frame, an xarray Dataset, arrays (N, T, D) or a list of arrays (T, "
-                f"D), not of {type(data).__name__}"
+                "expected a pandas frame, an xarray Dataset, an array (N, T, D) or a list of arrays (T, D), got "
+                f"{type(data).__name__}"
             )
         for array in arrays:
             check_real(array, "the table")
@@ -269,7 +267,7 @@ class Panel:
         if not sequences or any(array.ndim != 2 for array in sequences):
             inputs = [data] if getattr(data, "ndim", 0) == 1 else sequences
             shapes = ", ".join(str(tuple(array.shape)) for array in inputs[:3])
-            advice = "; one sequence of one column is (T, 1), as of x[:, None]" if shapes else ""
+            advice = "; for a single column, give (T, 1), such as x[:, None]" if shapes else ""
             raise ValueError(f"sequences are (T, D); got {shapes or 'none'}{advice}")
         columns = plain_columns(columns, sequences[0].shape[1])
         return cls([Series(str(number), array) for number, array in enumerate(sequences)], columns, name)
@@ -309,7 +307,7 @@ def plain_columns(columns: Columns | ColumnHints | Sequence[str] | None, size: i
     if isinstance(columns, ColumnHints):
         if inapplicable := [name for name, value in vars(columns).items() if value and name != "columns"]:
             raise ValueError(
-                f"arrays have no column names, so {', '.join(inapplicable)} cannot be found; give a schema, in Python "
+                f"arrays have no column names, so {', '.join(inapplicable)} do not apply; give a schema, in Python "
                 "as columns=Columns(...), or as FILE.toml next to the file"
             )
         words = (f"{word}::".split(":")[:3] for word in columns.columns)
@@ -318,7 +316,7 @@ def plain_columns(columns: Columns | ColumnHints | Sequence[str] | None, size: i
     if isinstance(columns, Columns):
         if inapplicable := [name for name in ("id", "time", "group", "split") if getattr(columns, name)]:
             raise ValueError(
-                f"the schema names a column of {inapplicable[0]}, but arrays have only numbers; leave it out"
+                f"the schema names a {inapplicable[0]} column, but arrays have no column names; leave it out"
             )
         return columns
     return Columns(tuple(map(Column, columns or [f"x{number}" for number in range(size)])))
@@ -327,7 +325,7 @@ def plain_columns(columns: Columns | ColumnHints | Sequence[str] | None, size: i
 def _validity_test(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
     """Return a test for the values of a column's family, except NaN, and its description."""
     tests: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
-        "category": (lambda v: _counts(v) & (v < len(column.classes)), "the places of its classes"),
+        "category": (lambda v: _counts(v) & (v < len(column.classes)), "indices of its classes"),
         "binary": (lambda v: (v == 0) | (v == 1), "0 or 1"),
         **dict.fromkeys(COUNTS, (_counts, "whole numbers from 0")),
         **dict.fromkeys(("positive", "log-normal"), (lambda v: v > 0, "numbers above 0")),

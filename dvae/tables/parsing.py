@@ -57,9 +57,7 @@ class UnparsedDates(ValueError):
     def __init__(self, cells: Any, wrong: np.ndarray):
         self.wrong = wrong
         row = int(np.argmax(wrong))
-        super().__init__(
-            f"{brief(cells.iloc[row])} in row {row} among them; write dates as {WANTED}, durations as 02:30:00"
-        )
+        super().__init__(f"{brief(cells.iloc[row])} in row {row}; write dates as {WANTED}, durations as 02:30:00")
 
 
 class AmbiguousDates(ValueError):
@@ -128,7 +126,7 @@ def dates(column: Any) -> Any:
     Dates with several offsets from UTC are converted to UTC.
 
     Raises:
-        Undecided: if nothing determines the order of day, month and year, or only some dates have an offset from UTC.
+        AmbiguousDates: if the order of day, month and year is not determined, or only some dates have an offset.
         TypeError, ValueError: if the column contains other values, or dates in several formats.
     """
     import pandas as pd
@@ -265,7 +263,7 @@ def times(
         try:
             parsed = dates(column)
         except AmbiguousDates as error:
-            raise ValueError(f"column {column.name!r} holds {error}") from error
+            raise ValueError(f"column {column.name!r}: {error}") from error
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"the times of column {column.name!r} are neither numbers, dates nor durations: {str(error)[:200]}"
@@ -305,8 +303,8 @@ def _localize(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, col
             except ValueError:
                 row = rows[is_repeated[rows].argmax()]
                 raise ValueError(
-                    f"row {row} of column {column.name!r} is {local[row]}, an hour that the clocks of {zone} show "
-                    "twice, and its sequence does not have it twice in order; write its offset from UTC, as in "
+                    f"row {row} of column {column.name!r} is {local[row]}, which the clocks of {zone} show twice, "
+                    "but its sequence does not contain both times in order; write its offset from UTC, as in "
                     f"{moments.iloc[row].isoformat()}, or leave the zone out"
                 ) from None
     return type(local)(moments)
@@ -335,13 +333,12 @@ def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: s
             value = labels[unknown].iloc[0]
             raise ValueError(
                 f"column {told.name!r} has {brief(value)}{nearest(value, indices)}, which is not one of its classes: "
-                f"{', '.join(told.classes[:10])}; a class can replace all others: other = {told.classes[-1]!r}"
+                f"{', '.join(told.classes[:10])}; to read all other values as one, set other = {told.classes[-1]!r}"
             )
         return labels.map(indices).to_numpy(np.float64)  # type: ignore[no-any-return]
     if column.dtype.kind in "mMc":
         raise ValueError(
-            f"column {told.name!r} holds {column.dtype}, which are not numbers; leave it out, or give it the family "
-            "'category'"
+            f"column {told.name!r} has type {column.dtype}, not numbers; leave it out, or give it the family 'category'"
         )
     numbers = read_numbers(column, na_values, decimal, column.attrs.get("decimal"))
     numbers.check(column, "or give the column the family 'category'")
@@ -354,4 +351,4 @@ def said_of_marks(marks: Mapping[str, tuple[int, int]]) -> str:
     """Describe the cells of a column of numbers that are read as missing."""
     cells = ", ".join(f"{brief(mark)} (row {row}, {count} in all)" for mark, (row, count) in marks.items())
     quoted = ", ".join(f'"{mark}"' for mark in marks)
-    return f"holds {cells} among numbers, read as missing; na_values = [{quoted}] says so without this warning"
+    return f"holds {cells} among numbers, read as missing; set na_values = [{quoted}] to omit this warning"

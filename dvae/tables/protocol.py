@@ -46,9 +46,7 @@ class Cut:
         if (self.observed is None) != (self.horizon is None):
             raise ValueError(f"observed is {self.observed} and horizon {self.horizon}; give both, or neither")
         if self.split == "time" and self.observed is None:
-            raise ValueError(
-                "sequences are divided by time into windows; give the number of observed steps, and a horizon"
-            )
+            raise ValueError('split="time" needs windows; give the number of observed steps, and a horizon')
         if self.season is not None and self.season > (self.observed or 0):
             raise ValueError(
                 f"season is {self.season} and observed {self.observed}; a period must be within the observed steps"
@@ -118,8 +116,8 @@ class Cut:
             return [sequence.split for sequence in panel.series]
         if self.split == "group" and not any(units):
             raise ValueError(
-                f'split="group" holds out groups, but no column of {panel.name} gives the group of a sequence; '
-                'name one, such as group="region" of its columns, or --group region'
+                f'split="group" needs groups, but no column of {panel.name} has the role group; name one, such as '
+                'group="region", or --group region'
             )
         names = sorted(dict.fromkeys(units), key=lambda name: hashlib.sha256(f"{self.seed} {name}".encode()).digest())
         test, validation = (int(np.ceil(share * len(names))) for share in (self.test, self.validation))

@@ -273,7 +273,7 @@ def read_panel(path: str | os.PathLike[str], columns: Columns | ColumnHints | No
     if is_domain(name):
         panel = domain(name)
         if columns not in (None, ColumnHints(), panel.columns):
-            raise ValueError(f"{name} has columns of its own: {', '.join(panel.columns.names[:10])}, …")
+            raise ValueError(f"{name} has fixed columns, {', '.join(panel.columns.names[:10])}, …; give no others")
         return panel
     if is_of_arrays(path):
         return _read_mapped(Path(path), columns)
@@ -298,7 +298,7 @@ def _read_mapped(path: Path, columns: Columns | ColumnHints | None) -> Panel:
         if others := [file for file in files_in if file.suffix.lower() != ".npy"]:
             raise ValueError(
                 f"{path} holds {others[0].relative_to(path)} in addition to npy files; a folder must have npy files "
-                "only, so write it as one, or move it elsewhere"
+                "only, so convert it to npy, or move it elsewhere"
             )
         if not 0 < len(files_in) <= MOST_FILES:
             count = f"more than {MOST_FILES:,}" if files_in else "none"
@@ -342,7 +342,9 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
     except Exception as error:
         raise ValueError(f"{path} cannot be read as npz: {str(error)[:300]}") from error
     if not set(arrays) - {"lengths"}:
-        raise ValueError(f"{path} holds {', '.join(npz.files[:20]) or 'nothing'}; expected an array 'x', or one alone")
+        raise ValueError(
+            f"{path} holds {', '.join(npz.files[:20]) or 'nothing'}; expected an array 'x', or a single array"
+        )
     return arrays
 
 
@@ -370,7 +372,7 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | ColumnHints |
             try:
                 return read_schema(files.read(file, LARGEST_SCHEMA, links=True).decode())
             except (UnicodeDecodeError, ValueError, TypeError) as error:
-                raise ValueError(f"{file} is not the schema of a table: {error}") from error
+                raise ValueError(f"{file} is not a valid schema of a table: {error}") from error
     return None, None
 
 
@@ -384,7 +386,9 @@ def read_schema(text: str) -> tuple[Columns | ColumnHints | None, Cut | None]:
         allowed = [field.name for field in fields(Cut)]
         for name in cut:
             if name not in allowed:
-                raise ValueError(f"[cut] has an entry {name!r}{nearest(name, allowed)}; known are {', '.join(allowed)}")
+                raise ValueError(
+                    f"[cut] has an entry {name!r}{nearest(name, allowed)}; known entries: {', '.join(allowed)}"
+                )
     columns = (
         Columns.from_config(entries) if "columns" in entries else ColumnHints(**layout(entries)) if entries else None
     )

@@ -70,9 +70,9 @@ class PanelWindows:
         }
         steps = [panel.present(sequence) for sequence in panel]
         message = (
-            f"{panel.name} has no {split} window of {schema.cut.name}; up to their last targets its {len(panel)} "
-            f"sequences have {min(steps)} to {max(steps)} steps"
-            f"{f', and {split} has a share of 0 of them' if getattr(schema.cut, split, 1) == 0 else ''}"
+            f"{panel.name} has no {split} window of {schema.cut.name}; its {len(panel)} sequences have {min(steps)} to "
+            f"{max(steps)} steps up to their last targets"
+            f"{f', and the share of {split} is 0' if getattr(schema.cut, split, 1) == 0 else ''}"
         )
         if not self._ranges:
             raise ValueError(message)
@@ -94,7 +94,7 @@ class PanelWindows:
         if unforeseen := schema.unforeseen(parts):
             warnings.warn(
                 f"the {split} part of {panel.name} has missing values in {', '.join(unforeseen)}, where training data "
-                "have none; the last value before, or the mean, replaces them, and models receive no indicator",
+                "have none; they are replaced by the previous value or the mean, and models receive no indicator",
                 stacklevel=2,
             )
         self._context = {}
@@ -105,7 +105,7 @@ class PanelWindows:
         if STATICS in schema.sizes:
             self._static = torch.from_numpy(np.stack([schema.static(sequence) for sequence in sequences])).float()
         if self._missing and not len(self):
-            raise ValueError(f"{message}, and left out are {self.left_out}")
+            raise ValueError(f"{message}; left out are {self.left_out}")
         self._weights = (self._last - self._low + 1).double().cumsum(0)
 
     @property
@@ -118,7 +118,7 @@ class PanelWindows:
         """Description of omitted sequences and windows; empty if none are omitted."""
         parts = [self.too_short] if self.skipped else []
         if self.n_unobserved:
-            parts.append(f"{self.n_unobserved} windows, in whose past or future no target was observed")
+            parts.append(f"{self.n_unobserved} windows without an observed target in their past or future")
         return " and ".join(parts)
 
     @property
@@ -126,12 +126,12 @@ class PanelWindows:
         """Names and lengths of the sequences that are too short for a window; empty if none are."""
         examples = [f"{name}: {steps}" for name, steps in islice(self.skipped.items(), NAMED)]
         more = f" and {len(self.skipped) - NAMED} more" if len(self.skipped) > NAMED else ""
-        text = f"{len(self.skipped)} sequences, which have fewer than {self.length} steps there"
+        text = f"{len(self.skipped)} sequences with fewer than {self.length} steps in this split"
         return f"{text} ({', '.join(examples)}{more})" if examples else ""
 
     @property
     def n_unobserved(self) -> int:
-        """Number of windows that are not listed, since no target was observed in their past or future."""
+        """Number of windows that are not listed because no target was observed in their past or future."""
         return int(self._counts.sum()) - len(self._list_windows()[0])
 
     @property
@@ -159,7 +159,7 @@ class PanelWindows:
 
     @property
     def clusters(self) -> list[tuple[str, str, int]]:
-        """Keys by group instead of sequence, if the data have groups, whose sequences are not independent evidence."""
+        """Keys by group instead of sequence if the data have groups, since sequences of a group are dependent."""
         if not self.schema.columns.group:
             return self.keys
         groups = [self.panel.series[self._ranges[index][0]].group for index in self._windows[0].tolist()]
@@ -285,7 +285,7 @@ class PanelWindows:
         require(Count, samples=samples, particles=particles)
         batch = self.all()
         if (mask := batch.mask()) is None:
-            raise ValueError(f"nothing is missing in {self.panel.name}")
+            raise ValueError(f"no target is missing in {self.panel.name}")
         with seeded_evaluation(model, seed):
             parts = [
                 model.impute(on_device_of(model, part), samples, draw=True, particles=particles)["x"].cpu().numpy()
@@ -390,7 +390,7 @@ class PanelWindows:
 
 
 def carry_forward(context: Tensor, observed: int, schema: PanelSchema) -> Tensor:
-    """Return covariates (B, T, C) as known at the present: those of role "past" repeat their last value."""
+    """Replace future values of "past" covariates (B, T, C) by their last observed value, and their indicators by 0."""
     values, indicators = schema.ending
     if values:
         context[:, observed:, values] = context[:, observed - 1 : observed, values]

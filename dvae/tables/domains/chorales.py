@@ -137,7 +137,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             return settings
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         pass
-    raise ValueError(f"{path} does not contain the pitches of chorales; delete it, and it is built again")
+    raise ValueError(f"{path} does not contain the pitches of chorales; delete it to build it again")
 
 
 def _settings() -> dict[str, np.ndarray]:
