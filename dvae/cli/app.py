@@ -72,8 +72,8 @@ def named(given: Sequence[str]) -> str | None:
         return None
     name = " ".join(words)
     if name not in COMMANDS:
-        known = [other for other in COMMANDS if len(words) == 1 or other.startswith(f"{words[0]} ")]
-        raise UsageError(f"unknown command {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+        available = [other for other in COMMANDS if len(words) == 1 or other.startswith(f"{words[0]} ")]
+        raise UsageError(f"unknown command {name!r}{nearest(name, available)}; known: {', '.join(available)}")
     return name
 
 
@@ -95,13 +95,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: arguments of the command line; by default the arguments of the process.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in given
-    given = [argument for argument in given if argument != "--debug"]
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [argument for argument in words if argument != "--debug"]
     warnings.showwarning = note
     OUT.quiet = ERROR.quiet = not is_first_process()
     PlainConsole.unread = False
-    return _ended(given, debug) or (UNREAD if _is_unread() else 0)
+    return _run_to_exit_code(words, debug) or (UNREAD if _is_unread() else 0)
 
 
 def exit_code(run: Callable[[], int]) -> int:
@@ -124,15 +124,15 @@ def _is_unread(line: str = "") -> bool:
     return PlainConsole.unread
 
 
-def _ended(given: list[str], debug: bool) -> int:
+def _run_to_exit_code(arguments: list[str], debug: bool) -> int:
     """Run the command with its arguments, print its error if it fails, and return its exit code."""
     try:
-        _run(given)
+        _run(arguments)
         return 0
     except SystemExit as stop:  # tyro, after --help or wrong arguments
         if stop.code:
-            for meant in _meant(given):
-                ERROR.print(meant, markup=False)
+            for suggestion in _suggestions(arguments):
+                ERROR.print(suggestion, markup=False)
         return stop.code if isinstance(stop.code, int) else 2
     except KeyboardInterrupt as stop:
         ERROR.print(str(stop) or "interrupted")
@@ -150,25 +150,25 @@ def _ended(given: list[str], debug: bool) -> int:
         return 2 if isinstance(error, UsageError) else 1
 
 
-def _run(given: list[str]) -> None:
+def _run(arguments: list[str]) -> None:
     """Run the command with its arguments, or print help."""
-    name, meant = named(given), command(given)
-    if meant is not None and name is not None:
-        rest = given[len(name.split()) :]
+    name, function = named(arguments), command(arguments)
+    if function is not None and name is not None:
+        remaining = arguments[len(name.split()) :]
         config: tuple[Any, ...] = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes)
-        if HELP & {*rest}:
+        if HELP & {*remaining}:
             from .help import command_stub
 
-            meant, method = command_stub(meant, rest, everything="--help-all" in rest)
-            name, rest, config = name + method, ["--help"], (*config, tyro.conf.DisallowNone)
-        tyro.cli(meant, prog=f"dvae {name}", args=rest, config=config)
-    elif given == ["--version"]:
+            function, method = command_stub(function, remaining, everything="--help-all" in remaining)
+            name, remaining, config = name + method, ["--help"], (*config, tyro.conf.DisallowNone)
+        tyro.cli(function, prog=f"dvae {name}", args=remaining, config=config)
+    elif arguments == ["--version"]:
         OUT.print(f"dvae {__version__}")
-    elif unknown := [argument for argument in given if argument.startswith("-") and argument not in HELP]:
+    elif unknown := [argument for argument in arguments if argument.startswith("-") and argument not in HELP]:
         raise UsageError(f"unknown option {unknown[0]}; dvae takes a command, --help or --version")
     else:
-        _overview(given[0] if given and given[0] in FAMILIES else "")
-        if not HELP & {*given}:
+        _overview(arguments[0] if arguments and arguments[0] in FAMILIES else "")
+        if not HELP & {*arguments}:
             raise SystemExit(2)
 
 
@@ -181,38 +181,38 @@ def _overview(family: str) -> None:
     if not family:
         OUT.print("Dynamical variational autoencoders from their factorizations.\n", highlight=False)
     for group, commands in GROUPS.items():
-        chosen = {name: about for name, (_, about) in commands.items() if name.startswith(family)}
-        if chosen:
+        selected = {name: description for name, (_, description) in commands.items() if name.startswith(family)}
+        if selected:
             OUT.print(group, style="bold", highlight=False)
-            for name, about in chosen.items():
-                OUT.print(f"  {name:<18} {about}", highlight=False)
+            for name, description in selected.items():
+                OUT.print(f"  {name:<18} {description}", highlight=False)
     OUT.print("\n--help lists the common options of a command, --help-all all of them; --debug shows tracebacks.")
 
 
-def _meant(given: Sequence[str]) -> Iterator[str]:
+def _suggestions(arguments: Sequence[str]) -> Iterator[str]:
     """Yield suggestions for misspelt options, methods and choices of options."""
-    if (called := command(given)) is None:
+    if (function := command(arguments)) is None:
         return
     from ..models.registry import methods, metric_models
 
-    name = named(given) or ""
-    rest = given[len(name.split()) :]
-    hints = get_type_hints(called)
+    name = named(arguments) or ""
+    remaining = arguments[len(name.split()) :]
+    hints = get_type_hints(function)
     kinds = [*filter(is_dataclass, hints.values()), *(methods().values() if name in ("fit", "sweep") else ())]
     for kind in kinds:  # nested dataclasses are appended during the loop
-        hints = (own := get_type_hints(kind)) | hints
-        kinds += filter(is_dataclass, own.values())
+        hints = (nested := get_type_hints(kind)) | hints
+        kinds += filter(is_dataclass, nested.values())
     options = {f"--{option.replace('_', '-')}" for option in [*hints, "from", "help", "help-all"]}
-    for word in (word.partition("=")[0].replace("--no-", "--") for word in rest if word.startswith("--")):
-        if word not in options and (meant := nearest(word, options)):
-            yield f"{word} is no option of dvae {name}{meant}"
+    for word in (word.partition("=")[0].replace("--no-", "--") for word in remaining if word.startswith("--")):
+        if word not in options and (suggestion := nearest(word, options)):
+            yield f"{word} is no option of dvae {name}{suggestion}"
     choices = {option: _choices(hint) for option, hint in hints.items()}
     names = {"fit": [*methods(), *metric_models()], "sweep": choices.get("method")}.get(name)
-    for before, word in pairwise(["", *rest]):
-        option = before if before.startswith("--") else ""
-        known = choices.get(option.removeprefix("--").replace("-", "_")) if option else names
-        if known and word not in known and not word.startswith("-") and (meant := nearest(word, known)):
-            yield f"{option} {word!r} is unknown{meant}".lstrip()
+    for previous, word in pairwise(["", *remaining]):
+        option = previous if previous.startswith("--") else ""
+        allowed = choices.get(option.removeprefix("--").replace("-", "_")) if option else names
+        if allowed and word not in allowed and not word.startswith("-") and (suggestion := nearest(word, allowed)):
+            yield f"{option} {word!r} is unknown{suggestion}".lstrip()
 
 
 def _choices(hint: Any) -> list[str]:

@@ -46,18 +46,18 @@ class Control:
         """Return the windows with the given paths and exchanged poses.
 
         Raises:
-            UsageError: a run of another method.
+            UsageError: a run is of another method.
         """
         if self == Control():
             return windows
-        for each in loaded:
-            if not isinstance(each.model, TrajectoryModel):
+        for run in loaded:
+            if not isinstance(run.model, TrajectoryModel):
                 raise UsageError(
-                    f"--joints, --exchange and --temperature are for methods that take trajectories; {each.path} holds "
-                    f"{each.method.name}"
+                    f"--joints, --exchange and --temperature are for methods that take trajectories; {run.path} holds "
+                    f"{run.method.name}"
                 )
-        given = windows.given(joint_names(self.joints or ()))
-        return given if self.exchange is None else motion.ExchangedWindows(given, self.exchange)
+        conditioned = windows.given(joint_names(self.joints or ()))
+        return conditioned if self.exchange is None else motion.ExchangedWindows(conditioned, self.exchange)
 
     def __str__(self) -> str:
         parts = ["", *joint_names(self.joints or ())]
@@ -106,9 +106,9 @@ def evaluate(
     at_least(1, samples=samples, batch_size=batch_size)
     at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
     check_files(out, figure, ".json")
-    how = ForecastScoring(samples, log_score_particles, pose_prior, classifier, control, missing, failed)
+    scoring = ForecastScoring(samples, log_score_particles, pose_prior, classifier, control, missing, failed)
     score = _segments if loading.kind_of(run, data) == "segments" else _forecasts
-    result, record = score(run, data, how, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
+    result, record = score(run, data, scoring, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
     save_and_print(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
 
 
@@ -129,38 +129,40 @@ class ForecastScoring:
     failed: bool = False
 
 
-def _forecasts(paths: Sequence[Path], data: str | None, how: ForecastScoring, **settings: Any) -> tuple[Any, str]:
+def _forecasts(paths: Sequence[Path], data: str | None, scoring: ForecastScoring, **settings: Any) -> tuple[Any, str]:
     """Score forecasts of test windows; return the scores and the name of their file."""
-    loaded = loading.with_equal_windows(paths, data, failed=how.failed)
-    opened = loading.data_of(data, *loaded, missing=how.missing)
-    windows = loading.windows_to_test(loaded[0], opened, whole=False)
-    temperature = how.control.temperature
+    loaded = loading.with_equal_windows(paths, data, failed=scoring.failed)
+    data_set = loading.data_of(data, *loaded, missing=scoring.missing)
+    windows = loading.windows_to_test(loaded[0], data_set, whole=False)
+    temperature = scoring.control.temperature
     scores: Scores = loading.SCORES[loaded[0].config.kind]
     if loaded[0].config.kind == "motion":
-        classifiers = _classifiers(how, data, loaded[0])
-        scores = partial(motion.scores, pose_prior=_pose_prior(how, data, windows.skeleton), classifiers=classifiers)
-        windows = how.control.windows(windows, loaded)
-    elif odd := [name for name in OF_MOTION if getattr(how, name) != getattr(ForecastScoring, name)]:
+        classifiers = _classifiers(scoring, data, loaded[0])
+        scores = partial(
+            motion.scores, pose_prior=_pose_prior(scoring, data, windows.skeleton), classifiers=classifiers
+        )
+        windows = scoring.control.windows(windows, loaded)
+    elif inapplicable := [name for name in OF_MOTION if getattr(scoring, name) != getattr(ForecastScoring, name)]:
         raise UsageError(
-            f"--{odd[0].replace('_', '-')} is for motion, and {paths[0]} was fitted on a table; leave it out"
+            f"--{inapplicable[0].replace('_', '-')} is for motion, and {paths[0]} was fitted on a table; leave it out"
         )
     result = evaluate_models(
-        {name: each.model for name, each in zip(loading.names(loaded), loaded, strict=True)},
+        {name: run.model for name, run in zip(loading.names(loaded), loaded, strict=True)},
         windows,
         scores=scores,
-        samples=how.samples,
-        log_score_particles=how.log_score_particles,
-        training_windows=_remembered(opened) if loading.is_training_data(loaded[0], opened) else None,
-        configs={name: Run(each.path).config for name, each in zip(loading.names(loaded), loaded, strict=True)},
+        samples=scoring.samples,
+        log_score_particles=scoring.log_score_particles,
+        training_windows=_reference_windows(data_set) if loading.is_training_data(loaded[0], data_set) else None,
+        configs={name: Run(run.path).config for name, run in zip(loading.names(loaded), loaded, strict=True)},
         options={} if temperature is None else {"temperature": temperature},
         **settings,
     )
-    return result, f"{loading.record('evaluation', loaded[0], opened)}{how.control}"
+    return result, f"{loading.record('evaluation', loaded[0], data_set)}{scoring.control}"
 
 
-def _remembered(opened: Any) -> Any:
+def _reference_windows(data_set: Any) -> Any:
     """Return training windows for the references that use them; None if they exceed `MOST_REMEMBERED`."""
-    windows = opened.windows("train+validation")
+    windows = data_set.windows("train+validation")
     size = 4 * len(windows) * windows.length * windows.schema.sizes["x"]
     if size <= MOST_REMEMBERED:
         return windows
@@ -171,30 +173,31 @@ def _remembered(opened: Any) -> Any:
     return None
 
 
-def _segments(paths: Sequence[Path], data: str | None, how: ForecastScoring, **settings: Any) -> tuple[Any, str]:
+def _segments(paths: Sequence[Path], data: str | None, scoring: ForecastScoring, **settings: Any) -> tuple[Any, str]:
     """Score the reconstruction of test segments; return the scores and the name of their file."""
-    if odd := [
-        name for name, value in vars(how).items() if name != "failed" and value != getattr(ForecastScoring, name)
+    if inapplicable := [
+        name for name, value in vars(scoring).items() if name != "failed" and value != getattr(ForecastScoring, name)
     ]:
-        options = "--joints, --exchange and --temperature are" if odd[0] == "control" else f"--{odd[0]} is"
+        option = inapplicable[0]
+        options = "--joints, --exchange and --temperature are" if option == "control" else f"--{option} is"
         raise UsageError(f"{options.replace('_', '-')} for forecasts, and {paths[0]} generates whole segments")
-    loaded = loading.with_equal_windows(paths, data, ("segments",), how.failed)
-    opened = loading.data_of(data, *loaded)
-    called = dict(zip(loading.names(loaded), loaded, strict=True))
+    loaded = loading.with_equal_windows(paths, data, ("segments",), scoring.failed)
+    data_set = loading.data_of(data, *loaded)
+    by_name = dict(zip(loading.names(loaded), loaded, strict=True))
     try:
-        own = opened if loading.is_training_data(loaded[0], opened) else replace(loaded[0], where=None).data
-        training = own.windows("train")
+        own_data = data_set if loading.is_training_data(loaded[0], data_set) else replace(loaded[0], where=None).data
+        training = own_data.windows("train")
     except CheckpointError as error:
         note(f"omitted principal components, which need the training segments: {error}")
         training = None
     result = motion.reconstruct_segments(
-        {name: each.model for name, each in called.items()},
-        opened.windows("test"),
+        {name: run.model for name, run in by_name.items()},
+        data_set.windows("test"),
         training,
-        configs={name: Run(each.path).config for name, each in called.items()},
+        configs={name: Run(run.path).config for name, run in by_name.items()},
         **settings,
     )
-    return result, loading.record("evaluation", loaded[0], opened)
+    return result, loading.record("evaluation", loaded[0], data_set)
 
 
 def save_and_print(result: Any, paths: Sequence[Path], figure: Path | None) -> None:
@@ -252,16 +255,16 @@ def compare(
     at_least(0, contrasts=contrasts, filter_particles=filter_particles)
     check_files(out, figure, ".json")
     loaded = loading.with_equal_windows(run, data, failed=True)
-    opened = loading.data_of(data, *loaded, missing=missing)
-    if stopped := [str(each.path) for each in loaded if each.unfinished]:
+    data_set = loading.data_of(data, *loaded, missing=missing)
+    if unfinished := [str(each.path) for each in loaded if each.unfinished]:
         raise ValueError(
-            f"{', '.join(stopped)} did not finish and cannot be compared; leave it out, or "
-            + "; ".join(runs.advice(path) for path in stopped)
+            f"{', '.join(unfinished)} did not finish and cannot be compared; leave it out, or "
+            + "; ".join(runs.advice(path) for path in unfinished)
         )
-    windows = loading.windows_to_test(loaded[0], opened, stride)
-    shown = loading.rows(loaded)
+    windows = loading.windows_to_test(loaded[0], data_set, stride)
+    rows = loading.rows(loaded)
     result = compare_models(
-        {name: [each.model for each in row] for name, row in shown.items()},
+        {name: [each.model for each in row] for name, row in rows.items()},
         windows,
         scores=loading.SCORES[loaded[0].config.kind],
         particles=particles,
@@ -272,43 +275,43 @@ def compare(
         draw_emission=draw_emission,
         seed=seed,
         batch_size=batch_size,
-        configs={name: loading.config_without_seed(row[0]) for name, row in shown.items()},
+        configs={name: loading.config_without_seed(row[0]) for name, row in rows.items()},
     )
     save_and_print(result, [] if out is None else [out], figure)
 
 
-def _pose_prior(how: ForecastScoring, data: str | None, skeleton: motion.Skeleton) -> Any:
+def _pose_prior(scoring: ForecastScoring, data: str | None, skeleton: motion.Skeleton) -> Any:
     """Return the pose prior of a run for a skeleton; None if no run is given.
 
     Raises:
         UsageError: the run is not a pose prior of this skeleton.
     """
-    if (path := how.pose_prior) is None:
+    if (path := scoring.pose_prior) is None:
         return None
-    model = loading.load(path, data, how.failed).model
+    model = loading.load(path, data, scoring.failed).model
     if not isinstance(model, PosePriorModel) or model.skeleton != skeleton:
         raise UsageError(f"--pose-prior {path} is not a run of a pose-prior for the skeleton {skeleton.name!r}")
     return model
 
 
-def _classifiers(how: ForecastScoring, data: str | None, judged: runs.Loaded) -> dict[str, Any]:
+def _classifiers(scoring: ForecastScoring, data: str | None, scored_run: runs.Loaded) -> dict[str, Any]:
     """Return the action classifiers of runs by label.
 
     Raises:
-        UsageError: a run is not an action classifier, repeats a label, or was fitted on other data than `judged`.
+        UsageError: a run is not an action classifier, repeats a label, or was fitted on other data than `scored_run`.
     """
-    found: dict[str, Any] = {}
-    for path in how.classifier:
-        loaded = loading.load(path, data, how.failed)
+    classifiers: dict[str, Any] = {}
+    for path in scoring.classifier:
+        loaded = loading.load(path, data, scoring.failed)
         if loaded.method.name != "action-classifier":
             raise UsageError(f"--classifier {path} is a fitted {loaded.method.name}, not an action-classifier")
-        if loaded.model.label in found:
+        if loaded.model.label in classifiers:
             raise UsageError(f"--classifier {path} is the second for the label {loaded.model.label!r}; give only one")
-        if not loaded.alike(judged):
-            there, here = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (loaded, judged))
+        if not loaded.alike(scored_run):
+            source, other = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (loaded, scored_run))
             raise UsageError(
-                f"--classifier {path} was fitted on other data or under another protocol ({there}) than the runs "
-                f"({here}); it may have seen test clips"
+                f"--classifier {path} was fitted on other data or under another protocol ({source}) than the runs "
+                f"({other}); it may have seen test clips"
             )
-        found[loaded.model.label] = loaded.model
-    return found
+        classifiers[loaded.model.label] = loaded.model
+    return classifiers

@@ -83,14 +83,14 @@ def calibration(
     at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
     at_least(19, samples=samples)
     check_files(out, figure, ".json")
-    loaded, opened = loading.forecaster(run, data, missing, failed)
-    model, windows = loaded.model, loading.windows_to_test(loaded, opened, whole=False)
+    loaded, data_set = loading.forecaster(run, data, missing, failed)
+    model, windows = loaded.model, loading.windows_to_test(loaded, data_set, whole=False)
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     document: dict[str, Any] = {}
-    path = out or run / f"{loading.record('calibration', loaded, opened)}.json"
+    path = out or run / f"{loading.record('calibration', loaded, data_set)}.json"
     if model.context:
-        given = ", ".join(model.context)
-        ERROR.print(f"no calibration: {loaded.method.name} conditions on {given}, which cannot be simulated")
+        context = ", ".join(model.context)
+        ERROR.print(f"no calibration: {loaded.method.name} conditions on {context}, which cannot be simulated")
     elif not model.latents:
         ERROR.print(f"no calibration: {loaded.method.name} has no latents, and so no guide")
     else:
@@ -146,17 +146,17 @@ def posterior(
     at_least(2, chains=chains, stein_draws=stein_draws)
     at_least(4, draws=draws)
     check_files(out, figure, ".json")
-    loaded, opened = loading.forecaster(run, data, missing, failed)
-    batch = opened.windows("test").all()
-    some = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
-    kept = batch.map(lambda value: value[some, :frames] if value.dim() == 3 else value[some])
-    if kept.lengths is not None and frames is not None:
-        kept["lengths"] = kept.lengths.clamp(max=frames)
-    document: dict[str, Any] = {"windows": some.tolist(), "frames": frames}
-    path = out or run / f"{loading.record('posterior', loaded, opened)}.json"
-    stein = stein_discrepancy(loaded.model, kept, draws=stein_draws, seed=seed)
+    loaded, data_set = loading.forecaster(run, data, missing, failed)
+    batch = data_set.windows("test").all()
+    indices = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
+    selected = batch.map(lambda value: value[indices, :frames] if value.dim() == 3 else value[indices])
+    if selected.lengths is not None and frames is not None:
+        selected["lengths"] = selected.lengths.clamp(max=frames)
+    document: dict[str, Any] = {"windows": indices.tolist(), "frames": frames}
+    path = out or run / f"{loading.record('posterior', loaded, data_set)}.json"
+    stein = stein_discrepancy(loaded.model, selected, draws=stein_draws, seed=seed)
     _add(document, "stein", stein, path, figure, "stein")
-    reference = reference_posterior(loaded.model, kept, draws=draws, chains=chains, warmup=warmup, seed=seed)
+    reference = reference_posterior(loaded.model, selected, draws=draws, chains=chains, warmup=warmup, seed=seed)
     _add(document, "posterior", reference, path, figure, "posterior")
 
 
@@ -197,7 +197,7 @@ def gap(
         particles: number of particles of IWAE and FIVO, and of draws over which ELBOs are averaged.
         temperatures: number of temperatures of annealed importance sampling; more give closer bounds.
         chains: number of chains for each window.
-        fitting: steps of the guides of single windows; 0 leaves out the parts of the gap.
+        fitting: number of optimiser steps of the guide of each window; 0 omits the parts of the gap.
         reach: steps between latents that these guides read linearly; by default all that the equations allow.
         seed: seed of the draws.
         batch_size: number of windows at once.
@@ -207,10 +207,10 @@ def gap(
     at_least(1, count=count, particles=particles, temperatures=temperatures, chains=chains, batch_size=batch_size)
     at_least(0, fitting=fitting, reach=reach)
     check_files(out, figure, ".json")
-    loaded, opened = loading.forecaster(run, data, missing, failed)
+    loaded, data_set = loading.forecaster(run, data, missing, failed)
     result = bracket(
         loaded.model,
-        loading.windows_to_test(loaded, opened),
+        loading.windows_to_test(loaded, data_set),
         count=count,
         particles=particles,
         temperatures=temperatures,
@@ -220,7 +220,7 @@ def gap(
         seed=seed,
         batch_size=batch_size,
     )
-    save_and_print(result, [out or run / f"{loading.record('gap', loaded, opened)}.json"], figure)
+    save_and_print(result, [out or run / f"{loading.record('gap', loaded, data_set)}.json"], figure)
 
 
 def coverage(
@@ -260,18 +260,18 @@ def coverage(
     check_files(out, figure, ".json")
     if bool(values) != (label is not None):
         raise UsageError("--label and --values select the test clips for calibration; give both")
-    loaded, opened = loading.forecaster(run, data, missing, failed)
-    kept, tested = _kept_and_tested(loaded, opened, label, values)
-    found = conformal_bands(loaded.model, kept, level, samples=samples, seed=seed, batch_size=batch_size)
-    path = out or run / f"{loading.record('coverage', loaded, opened)}.json"
-    save_and_print(found, [path], figure)
+    loaded, data_set = loading.forecaster(run, data, missing, failed)
+    calibration_windows, test_windows = _calibration_and_test(loaded, data_set, label, values)
+    bands = conformal_bands(loaded.model, calibration_windows, level, samples=samples, seed=seed, batch_size=batch_size)
+    path = out or run / f"{loading.record('coverage', loaded, data_set)}.json"
+    save_and_print(bands, [path], figure)
     save_and_print(
-        found.coverage({loaded.method.name: loaded.model}, tested), [path.with_stem(f"{path.stem}-test")], None
+        bands.coverage({loaded.method.name: loaded.model}, test_windows), [path.with_stem(f"{path.stem}-test")], None
     )
 
 
-def _kept_and_tested(loaded: runs.Loaded, opened: Any, label: str | None, values: Sequence[str]) -> Any:
-    """Return windows to calibrate on and windows to test on.
+def _calibration_and_test(loaded: runs.Loaded, data_set: Any, label: str | None, values: Sequence[str]) -> Any:
+    """Return the windows for calibration and for the test.
 
     Raises:
         UsageError: the label divides no test clips.
@@ -279,19 +279,19 @@ def _kept_and_tested(loaded: runs.Loaded, opened: Any, label: str | None, values
     if loaded.config.kind == "panel":
         if label is not None:
             raise UsageError(f"--label is for motion, and {loaded.path} was fitted on a table; leave it out")
-        return [tables.windows(loaded, opened, split) for split in ("validation", "test")]
+        return [tables.windows(loaded, data_set, split) for split in ("validation", "test")]
     if label is None:
-        return [opened.windows(split) for split in ("validation", "test")]
-    clips, whole = opened.windows("test").clips, opened.motion
-    found = {clip.labels.get(label, "") for clip in clips}
-    if unknown := sorted({*values} - found):
-        raise UsageError(f"no test clip has {label} {', '.join(unknown)}; there are {', '.join(sorted(found))}")
-    test = motion.MotionSet(clips, whole.skeleton, opened.path, missing=whole.missing)
-    others = tuple(sorted(found - {*values}))
+        return [data_set.windows(split) for split in ("validation", "test")]
+    clips, motion_set = data_set.windows("test").clips, data_set.motion
+    label_values = {clip.labels.get(label, "") for clip in clips}
+    if unknown := sorted({*values} - label_values):
+        raise UsageError(f"no test clip has {label} {', '.join(unknown)}; there are {', '.join(sorted(label_values))}")
+    test = motion.MotionSet(clips, motion_set.skeleton, data_set.path, missing=motion_set.missing)
+    others = tuple(sorted(label_values - {*values}))
     if not others:
         raise UsageError(f"--values {' '.join(values)} selects all test clips; leave some {label} to test on")
     return [
-        motion.windows(test, replace(opened.protocol, split_by=label, train=(), test=part), "test")
+        motion.windows(test, replace(data_set.protocol, split_by=label, train=(), test=part), "test")
         for part in (tuple(values), others)
     ]
 
@@ -344,20 +344,20 @@ def edges(
         raise UsageError("give the name of a method, or --generative, with --inference for your own guide")
     if method is not None and inference is not None:
         raise UsageError(f"--inference is the guide of --generative; {method} has its own")
-    trained = [value for value in vars(training).values() if value not in (None, False)]
-    if out is None and (trained or source != DataOptions()):
+    training_values = [value for value in vars(training).values() if value not in (None, False)]
+    if out is None and (training_values or source != DataOptions()):
         raise UsageError("fits need a directory for their runs: give --out DIR")
     if out is not None and (out.is_file() or not seeds):
         raise UsageError(f"give at least one seed, and a directory for the runs: --out {out} --seeds {seeds}")
     with arguments():
         guide = FAITHFUL if inference is None else inference
-        named = registry.method(method) if method else Equations(generative=generative or "", inference=guide)
-        given = {**vars(model), **vars(networks), "latent": latent}
-        chosen = {name: value for name, value in given.items() if value is not None}
-        replace(as_equations(named), **chosen).check()
-        how = given_options(training)
-    opened = None if out is None else source.open(named)
-    whole = replace(as_equations(named, None if opened is None else opened.schema), **chosen)
+        base = registry.method(method) if method else Equations(generative=generative or "", inference=guide)
+        overrides = {**vars(model), **vars(networks), "latent": latent}
+        changes = {name: value for name, value in overrides.items() if value is not None}
+        replace(as_equations(base), **changes).check()
+        training_options = given_options(training)
+    data_set = None if out is None else source.open(base)
+    full = replace(as_equations(base, None if data_set is None else data_set.schema), **changes)
     settings: dict[str, Any] = {"steps": surrogate_steps, "surrogates": surrogates, "bound_particles": bound_particles}
-    result = ablate(whole, opened, out, seeds, how, jobs, **settings)
+    result = ablate(full, data_set, out, seeds, training_options, jobs, **settings)
     save_and_print(result, [] if out is None else [out / "edges.json"], figure)

@@ -47,7 +47,7 @@ class UsageError(ValueError):
 
 
 def note(message: Warning | str, *_: object, **__: object) -> None:
-    """Print a warning for a user of the command line, without the place in the code."""
+    """Print a warning for a user of the command line, without its location in the code."""
     ERROR.print(f"note: {message}", markup=False)
 
 
@@ -86,9 +86,9 @@ def check_figure(path: Path | None, option: str) -> None:
     if path is not None:
         from matplotlib.backend_bases import FigureCanvasBase
 
-        known = FigureCanvasBase.get_supported_filetypes()
-        if path.suffix.lower().removeprefix(".") not in known:
-            raise UsageError(f"--{option} {path}: the end of the name is the format, one of {', '.join(sorted(known))}")
+        formats = FigureCanvasBase.get_supported_filetypes()
+        if path.suffix.lower().removeprefix(".") not in formats:
+            raise UsageError(f"--{option} {path}: the suffix selects the format, one of {', '.join(sorted(formats))}")
 
 
 def check_files(out: Path | None, figure: Path | None, *suffixes: str) -> None:

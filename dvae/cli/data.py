@@ -42,16 +42,16 @@ def info(
         skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
     """
     files = files or (SIMULATED,)
-    found = [file for file in files if tables.is_table(file)]
-    if table != tables.ColumnOptions() and len(found) < len(files):
+    table_files = [file for file in files if tables.is_table(file)]
+    if table != tables.ColumnOptions() and len(table_files) < len(files):
         raise UsageError("options of columns are for tables; leave them out for motion files")
-    if out and len(found) < len(files):
+    if out and len(table_files) < len(files):
         raise UsageError("--out writes the schema of a table; for motion files, leave it out")
-    if found:
-        tables.info(found, out, table)
+    if table_files:
+        tables.info(table_files, out, table)
     for file in files:
-        if file not in found:
-            OUT.print(_read(file, metres, up, recorded, skip_bad, missing).info())
+        if file not in table_files:
+            OUT.print(_read_motion(file, metres, up, recorded, skip_bad, missing).info())
 
 
 def convert(
@@ -81,18 +81,18 @@ def convert(
         recorded: frames per second of the files, if they state a wrong rate.
         skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
     """
-    known = _skeleton(onto)
+    target = _skeleton(onto)
     if files in ((), (SIMULATED,)):
         if metres or up or recorded:
             raise UsageError("--metres, --up and --recorded correct what files state; simulated motion has no files")
         people = motion.simulate() if fps is None else motion.simulate().resampled(fps)
-        people = people if known is None else reading.select_joints(people, onto=known)
-        said = f"{len(writing.write_motion(out, people, format))} files"
+        people = people if target is None else reading.select_joints(people, onto=target)
+        description = f"{len(writing.write_motion(out, people, format))} files"
     else:
-        told = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad, "missing": missing}
+        corrections = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad, "missing": missing}
         paths = [Path(file) for file in files]
-        said = writing.convert(paths, out, format, fps, known, jobs, **told)  # type: ignore[arg-type]
-    ERROR.print(f"wrote {out}: {said}", markup=False)
+        description = writing.convert(paths, out, format, fps, target, jobs, **corrections)  # type: ignore[arg-type]
+    ERROR.print(f"wrote {out}: {description}", markup=False)
 
 
 def get(
@@ -109,11 +109,11 @@ def get(
     """
     from ..motion.files.download import get as downloaded
 
-    got = downloaded(collection, out, url)
-    ERROR.print(f"{len(got)} files of {collection} in {out}; dvae data info {out}", markup=False)
+    paths = downloaded(collection, out, url)
+    ERROR.print(f"{len(paths)} files of {collection} in {out}; dvae data info {out}", markup=False)
 
 
-def _read(
+def _read_motion(
     file: str, metres: float | None, up: str | None, recorded: float | None, skip_bad: bool, missing: bool
 ) -> motion.MotionSet:
     if file == SIMULATED:

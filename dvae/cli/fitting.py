@@ -53,15 +53,15 @@ def options_of(name: str, kind: type[Any], *aside: str, common: Collection[str] 
         common: names of the options that `--help` shows; all by default.
     """
     hints = get_type_hints(kind, include_extras=True)
-    found, schedules = [], {*get_args(Schedule)}
+    options, schedules = [], {*get_args(Schedule)}
     for option in fields(kind):
         hint = hints[option.name]
         if schedules & {*get_args(hint)}:
             hint = reduce(or_, [part for part in get_args(hint) if part not in schedules])
-        given: Any = Annotated[bool, tyro.conf.FlagCreatePairsOff] if hint is bool else hint | None
-        shown = given if common is None or option.name in common else Annotated[given, EXPERT]
-        found.append((option.name, shown, False if hint is bool else None))
-    kept = [option for option in found if option[0] not in aside]
+        optional: Any = Annotated[bool, tyro.conf.FlagCreatePairsOff] if hint is bool else hint | None
+        annotated = optional if common is None or option.name in common else Annotated[optional, EXPERT]
+        options.append((option.name, annotated, False if hint is bool else None))
+    kept = [option for option in options if option[0] not in aside]
     return make_dataclass(name, kept, frozen=True, namespace={"__doc__": kind.__doc__})
 
 
@@ -140,30 +140,33 @@ class DataOptions(ColumnOptions):
         """
         kinds = {method.fitted_on: method.name for method in methods}
         if len(kinds) > 1:
-            said = " and ".join(f"{name} on {SAID.get(kind, kind)}" for kind, name in kinds.items())
-            raise UsageError(f"these methods are fitted on different kinds of data, {said}; give methods of one kind")
+            descriptions = " and ".join(f"{name} on {SAID.get(kind, kind)}" for kind, name in kinds.items())
+            raise UsageError(
+                f"these methods are fitted on different kinds of data, {descriptions}; give methods of one kind"
+            )
         ((kind, name),) = kinds.items()
         given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
-        told = [option for option in OF_KINDS["panel"] if option in given]
+        table_options = [option for option in OF_KINDS["panel"] if option in given]
         if kind == "windows":
-            kind = "panel" if is_table(self.data) or told else "motion"
+            kind = "panel" if is_table(self.data) or table_options else "motion"
             if kind == "panel" and self.data == SIMULATED:
-                raise UsageError(f"--{told[0]} is about tables; name one with --data")
+                raise UsageError(f"--{table_options[0]} is for tables; name one with --data")
         for other, options in OF_KINDS.items():
-            if other != kind and (strange := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
+            if other != kind and (inapplicable := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
                 raise UsageError(
-                    f"--{min(strange).replace('_', '-')} is about {SAID[other]}, and {name} is fitted on {SAID[kind]}"
+                    f"--{min(inapplicable).replace('_', '-')} is for {SAID[other]}, and {name} is fitted on "
+                    f"{SAID[kind]}"
                 )
         columns = {field.name for field in fields(ColumnOptions)}
         given = {name: value for name, value in given.items() if name not in columns} | self.given()
         with arguments() if kind == "panel" else nullcontext():  # the columns of a table are arguments
-            opened = DATA[kind].open(given.pop("data", SIMULATED), **given)
-        if isinstance(opened, PanelData | motion.MotionData):
-            for said in opened.parts().values():
-                ERROR.print(said, markup=False)
-        if isinstance(opened, PanelData):
+            data_set = DATA[kind].open(given.pop("data", SIMULATED), **given)
+        if isinstance(data_set, PanelData | motion.MotionData):
+            for description in data_set.parts().values():
+                ERROR.print(description, markup=False)
+        if isinstance(data_set, PanelData):
             warnings.filterwarnings("ignore", "training leaves out")  # the lines above list the omitted parts
-        return opened
+        return data_set
 
 
 OF_KINDS = {
@@ -200,13 +203,13 @@ def fit(
         ERROR.print(f"{out} contains a run; continuing it")
         return resume(out, tensorboard=tensorboard)
     if Run(out).exists:
-        raise ValueError(f"{out} already holds a run; {runs.advice(out)}; or choose another directory")
+        raise ValueError(f"{out} already contains a run; {runs.advice(out)}; or choose another directory")
     with arguments():
         method.check()  # before reading the data, so wrong equations and options fail early
-        how = given_options(training)
-    opened = source.open(method)
-    with _reported():
-        _report(fit_method(method, opened, out=out, trackers=[TensorBoard(out)] if tensorboard else [], **how))
+        options = given_options(training)
+    data_set = source.open(method)
+    with _resume_hint():
+        _report(fit_method(method, data_set, out=out, trackers=[TensorBoard(out)] if tensorboard else [], **options))
 
 
 def resume(
@@ -229,11 +232,11 @@ def resume(
         accelerator: device to continue on, such as a CPU after a GPU.
         tensorboard: also write TensorBoard files to the run directory.
     """
-    given = {"steps": steps, "learning_rate": learning_rate, "accelerator": accelerator}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    values = {"steps": steps, "learning_rate": learning_rate, "accelerator": accelerator}
+    options: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     with arguments():
         Training(**options)
-    with _reported():
+    with _resume_hint():
         _report(runs.resume(run, data, [TensorBoard(run)] if tensorboard else [], progress=True, **options))
 
 
@@ -275,21 +278,25 @@ def sweep(
         raise UsageError(f"--out {out} is a file; name a directory for the runs")
     given = {name: value for name, value in vars(model).items() if value is not None}
     with arguments():
-        how = given_options(training)
-        chosen: Any
+        options = given_options(training)
+        models: Any
         if grid is None:
             sizes: list[dict[str, int]] = [{"latent": size} for size in latent] or [{}]
-            chosen = fitted = [registry.method(name, **given, **size) for name in method for size in sizes]
-            for each in fitted:
-                each.check()
+            models = fitted = [registry.method(name, **given, **size) for name in method for size in sizes]
+            for instance in fitted:
+                instance.check()
         else:
-            told = Grid.read(grid, given)
-            chosen, seeds, how = told.methods, seeds or told.seeds, {**told.training, **how}
-            fitted = [*told.methods.values()]
-            Training(**how)
-    opened = source.open(*fitted)
+            parsed_grid = Grid.read(grid, given)
+            models, seeds, options = (
+                parsed_grid.methods,
+                seeds or parsed_grid.seeds,
+                {**parsed_grid.training, **options},
+            )
+            fitted = [*parsed_grid.methods.values()]
+            Training(**options)
+    data_set = source.open(*fitted)
     with nullcontext() if scheduler is None else _cluster(scheduler):
-        results = sweep_methods(chosen, opened, out, seeds or (0, 1, 2), how, jobs)
+        results = sweep_methods(models, data_set, out, seeds or (0, 1, 2), options, jobs)
     if failed := [result for result in results if result.status == "failed"]:
         raise RuntimeError(
             f"{len(failed)} of {len(results)} runs failed; the same command retries them\n"
@@ -309,7 +316,7 @@ def given_options(training: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def _reported() -> Iterator[None]:
+def _resume_hint() -> Iterator[None]:
     """Add the command that resumes the run to the message of an interrupted fit."""
     try:
         yield
@@ -330,24 +337,24 @@ def _cluster(scheduler: str) -> Iterator[None]:
 
 
 def _report(result: Fit) -> None:
-    took = f"{result.processor_seconds:.0f} s of processor time"
-    found = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best, took]))
-    OUT.print(found, highlight=False, soft_wrap=True)
+    duration = f"{result.processor_seconds:.0f} s of processor time"
+    summary = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best, duration]))
+    OUT.print(summary, highlight=False, soft_wrap=True)
     assert result.run is not None
     OUT.print(_use(Run(result.run).config["method"]["method"], result.run), highlight=False, soft_wrap=True)
 
 
 def _use(name: str, run: Path) -> str:
-    """Return the next commands for a fitted run, in words."""
+    """Describe the next commands for a fitted run."""
     if name in metric_models():
-        what = "the poses of forecasts" if name == "pose-prior" else "forecasts"
+        target = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"
-        return f"score {what} with: dvae evaluate RUN {option} {run}"
-    scored = f"score it with: dvae evaluate {run}"
+        return f"score {target} with: dvae evaluate RUN {option} {run}"
+    advice = f"score it with: dvae evaluate {run}"
     if Run(run).config["data"].get("kind") == "panel":
-        return f"{scored}, forecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
+        return f"{advice}, forecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
     if methods()[name].fitted_on == "segments":
-        return f"{scored}, recover a segment from a part of it with: dvae impute {run} --from CLIP --seen markers"
+        return f"{advice}, recover a segment from a part of it with: dvae impute {run} --from CLIP --seen markers"
     if issubclass(methods()[name], TrajectoryMethod):
-        return f"{scored} --joints JOINT …, move it with: dvae forecast {run} --joints JOINT … --out FILE.npz"
-    return scored
+        return f"{advice} --joints JOINT …, move it with: dvae forecast {run} --joints JOINT … --out FILE.npz"
+    return advice

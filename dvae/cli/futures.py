@@ -102,51 +102,51 @@ def forecast(
     at_least(1, samples=samples, horizon=horizon)
     at_least(0, window=along.window)
     check_files(out, figure)
-    loaded, opened = forecaster(run, data, missing, failed)
+    loaded, data_set = forecaster(run, data, missing, failed)
     if loaded.config.kind == "panel":
         of_motion = {"fix": bool(fix), "missing": missing, "draw-emission": draw_emission is not None}
         of_motion |= {name: value != getattr(Paths, name) for name, value in vars(along).items()}
-        if given := [name for name, is_given in of_motion.items() if is_given]:
-            raise UsageError(f"--{given[0]} is for motion, and {run} was fitted on a table; leave it out")
-        tables.forecast(loaded, opened, out, clip, horizon, samples, seed, figure, beyond)
+        if inapplicable := [name for name, is_given in of_motion.items() if is_given]:
+            raise UsageError(f"--{inapplicable[0]} is for motion, and {run} was fitted on a table; leave it out")
+        tables.forecast(loaded, data_set, out, clip, horizon, samples, seed, figure, beyond)
         return
     if beyond:
         raise UsageError(f"--beyond is for tables, and {run} was fitted on motion; leave it out")
-    windows, samples = windows_of(opened, clip), samples or SAMPLES
+    windows, samples = windows_of(data_set, clip), samples or SAMPLES
     if along != Paths():
         check_files(out, figure, ".npz")
         if horizon or fix or draw_emission is not None:
             raise UsageError("--horizon, --fix and --draw-emission do not apply to motion along --joints or --paths")
-        _completed(loaded, windows, along, samples, seed, out, figure)
+        _follow_paths(loaded, windows, along, samples, seed, out, figure)
         return
     suffix = out.suffix.lower()
     check_files(out, figure, ".npz", ".bvh", "")
-    chosen: Sequence[int] = range(len(windows))
+    selected: Sequence[int] = range(len(windows))
     if suffix == ".bvh":
-        chosen = [_liveliest(windows.positions(windows.all().mask_to_nan()).numpy(), None)]
+        selected = [_fastest_window(windows.positions(windows.all().mask_to_nan()).numpy(), None)]
     if draw_emission is None and suffix == ".npz":
         draw_emission = loaded.model.is_drawn()
-    futures = draw_futures(loaded, windows, chosen, samples, seed, horizon, fix, draw_emission)
-    after, protocol = "", windows.protocol
+    futures = draw_futures(loaded, windows, selected, samples, seed, horizon, fix, draw_emission)
+    context, protocol = "", windows.protocol
     if suffix == ".npz":
         futures.save(out)
     else:
-        played = futures.window(0, 1) if suffix else futures
+        written = futures.window(0, 1) if suffix else futures
         motion.write_motion(
-            out, (played if protocol.root == "drop" else _in_world(played, windows, chosen)).motion(), "bvh"
+            out, (written if protocol.root == "drop" else _in_world(written, windows, selected)).motion(), "bvh"
         )
-        after = f", after {futures.observed.shape[1]} observed frames"
+        context = f", after {futures.observed.shape[1]} observed frames"
     frames = futures.forecasts.shape[2]
-    said = f"the first of {samples} futures" if suffix == ".bvh" else f"{samples} futures"
+    description = f"the first of {samples} futures" if suffix == ".bvh" else f"{samples} futures"
     dropped = f"; relative to the root: the protocol {protocol.name} removes the root's path"
     ERROR.print(
-        f"wrote {out}: {said} of {frames} frames for each of {len(chosen)} windows{after}, "
+        f"wrote {out}: {description} of {frames} frames for each of {len(selected)} windows{context}, "
         f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
     )
     _save_futures(futures, figure)
 
 
-def _completed(
+def _follow_paths(
     loaded: runs.Loaded, windows: motion.Windows, paths: Paths, samples: int, seed: int, out: Path, figure: Path | None
 ) -> None:
     """Draw motions along given paths, from the first pose of one window, and write them."""
@@ -157,20 +157,22 @@ def _completed(
     if paths.exact and not (paths.joints or paths.paths):
         raise UsageError("--exact requires paths; give them with --joints or --paths")
     positions = windows.positions(windows.all().mask_to_nan()).numpy()
-    chosen = _liveliest(positions, paths.window)
-    pose, truth = positions[chosen, 0], positions[chosen, 1:]
-    given = _told(joint_names(paths.joints), truth, paths.paths, windows.skeleton)
-    how: dict[str, Any] = {"exact": paths.exact, "temperature": paths.temperature, "progress": True}
+    index = _fastest_window(positions, paths.window)
+    pose, truth = positions[index, 0], positions[index, 1:]
+    path_by_joint = _given_paths(joint_names(paths.joints), truth, paths.paths, windows.skeleton)
+    options: dict[str, Any] = {"exact": paths.exact, "temperature": paths.temperature, "progress": True}
     with seeded(seed):
-        done = loaded.model.complete(pose, given, None if given else len(truth), samples, **how)
-    before_and_after = pose[None, None], truth[None, : done.positions.shape[1]]
+        completion = loaded.model.complete(
+            pose, path_by_joint, None if path_by_joint else len(truth), samples, **options
+        )
+    before_and_after = pose[None, None], truth[None, : completion.positions.shape[1]]
     motions = motion.Forecasts(
-        windows.skeleton, [windows.keys[chosen]], done.positions[:, None], *before_and_after, "mean"
+        windows.skeleton, [windows.keys[index]], completion.positions[:, None], *before_and_after, "mean"
     )
     motions.save(out)
-    ERROR.print(f"wrote {out}: window {chosen}, {_title(motions)}")
-    _save_futures(motions, figure, given)
-    OUT.print(str(done))
+    ERROR.print(f"wrote {out}: window {index}, {_title(motions)}")
+    _save_futures(motions, figure, path_by_joint)
+    OUT.print(str(completion))
 
 
 def impute(
@@ -221,19 +223,19 @@ def impute(
     at_least(0 if kind == "segments" else 1, samples=samples)
     check_files(out, None)
     options = {"filled": filled, "clip": clip, "draw-emission": draw_emission}
-    given = [name for name, value in options.items() if value is not None]
+    inapplicable = [name for name, value in options.items() if value is not None]
     if kind == "segments":
-        if given or particles > 1 or missing:
-            raise UsageError(f"--{[*given, 'particles' if particles > 1 else 'missing'][0]} is not for segments")
+        if inapplicable or particles > 1 or missing:
+            raise UsageError(f"--{[*inapplicable, 'particles' if particles > 1 else 'missing'][0]} is not for segments")
         recovery.run(run, out, 5 if samples is None else samples, seed, data, failed)
         return
     if recovery != Recovery():
         raise UsageError(f"--from, --file and --seen are for runs of motion-latent, and {run} is not one")
-    loaded, opened = forecaster(run, data, missing, failed)
+    loaded, data_set = forecaster(run, data, missing, failed)
     if kind == "panel":
-        if out is None or given:
+        if out is None or inapplicable:
             raise UsageError("for a table, impute writes draws to --out FILE.csv, .parquet or .npz")
-        tables.impute(loaded, opened, out, samples, particles, seed)
+        tables.impute(loaded, data_set, out, samples, particles, seed)
         return
     samples = samples or SAMPLES
     if particles > 1:
@@ -241,58 +243,58 @@ def impute(
     check_files(out, None, ".npz")
     if out is None and filled is None:
         raise UsageError("impute writes a file; name it with --out or --filled")
-    form = None if filled is None else format_of(filled, None if filled.suffix else "bvh")
-    windows, model = windows_of(opened, clip, whole=clip is not None), loaded.model
-    if filled is not None and filled.suffix and form != "npz" and len(windows.clips) > 1:
+    file_format = None if filled is None else format_of(filled, None if filled.suffix else "bvh")
+    windows, model = windows_of(data_set, clip, whole=clip is not None), loaded.model
+    if filled is not None and filled.suffix and file_format != "npz" and len(windows.clips) > 1:
         raise UsageError(
             f"--filled {filled} can contain one of {len(windows.clips)} clips; name it with --clip, or end the file in "
             ".npz"
         )
     if out is not None:
-        found = _fillings(model, windows, samples, seed, model.is_drawn() if draw_emission is None else draw_emission)
-        seen = found.observed
-        found.save(out)
-        spread = 1000 * found.spread[~seen].mean() if not seen.all() else 0.0
+        imputed = _fillings(model, windows, samples, seed, model.is_drawn() if draw_emission is None else draw_emission)
+        observed = imputed.observed
+        imputed.save(out)
+        spread = 1000 * imputed.spread[~observed].mean() if not observed.all() else 0.0
         ERROR.print(
-            f"wrote {out}: {samples} fillings of each of {len(windows)} windows, in which {1 - seen.mean():.1%} of the "
-            f"joints were missing; spread {spread:.0f} mm, {EMISSIONS[found.emission]}"
+            f"wrote {out}: {samples} fillings of each of {len(windows)} windows, in which {1 - observed.mean():.1%} of "
+            f"the joints were missing; spread {spread:.0f} mm, {EMISSIONS[imputed.emission]}"
         )
     if filled is not None:
-        drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
-        found = _fillings(model, windows, 1, seed, drawn)
-        whole = windows.fill_missing(torch.from_numpy(found.filled[0]))
-        motion.write_motion(filled, whole, form)
-        left = sum(int(np.isnan(each.positions).any(-1).sum()) for each in whole)
+        is_drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
+        imputed = _fillings(model, windows, 1, seed, is_drawn)
+        clips = windows.fill_missing(torch.from_numpy(imputed.filled[0]))
+        motion.write_motion(filled, clips, file_format)
+        n_missing = sum(int(np.isnan(each.positions).any(-1).sum()) for each in clips)
         ERROR.print(
-            f"wrote {filled}: {len(whole)} clips"
-            + (f"; {left} joints are missing in frames outside all windows" if left else "")
+            f"wrote {filled}: {len(clips)} clips"
+            + (f"; {n_missing} joints are missing in frames outside all windows" if n_missing else "")
         )
 
 
-def _fillings(model: Any, windows: motion.Windows, samples: int, seed: int, drawn: bool) -> motion.Imputed:
+def _fillings(model: Any, windows: motion.Windows, samples: int, seed: int, is_drawn: bool) -> motion.Imputed:
     """Return motion with its missing joints filled in."""
-    listed, parts = windows.all(), []
+    batch, parts = windows.all(), []
     with seeded(seed):
-        for some in torch.arange(len(windows)).split(64):
-            made = model.impute(listed.rows(some), samples, draw=drawn)["x"]
-            parts.append(windows.positions(made).numpy())
-    seen = windows.skeleton.with_root(listed.mask().unflatten(-1, (-1, 3)), True)[..., 0].numpy()
-    emission = "drawn" if drawn else "mean"
-    return motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), seen, emission)
+        for indices in torch.arange(len(windows)).split(64):
+            values = model.impute(batch.rows(indices), samples, draw=is_drawn)["x"]
+            parts.append(windows.positions(values).numpy())
+    observed = windows.skeleton.with_root(batch.mask().unflatten(-1, (-1, 3)), True)[..., 0].numpy()
+    emission = "drawn" if is_drawn else "mean"
+    return motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), observed, emission)
 
 
-def _told(joints: Sequence[str], truth: Any, paths: Path | None, skeleton: motion.Skeleton) -> dict[str, Any]:
+def _given_paths(joints: Sequence[str], truth: Any, paths: Path | None, skeleton: motion.Skeleton) -> dict[str, Any]:
     """Return the true paths of some joints, and the paths in a file for others, by joint.
 
     Raises:
         UsageError: a joint has both.
     """
-    given = {joint: truth[:, skeleton.find(joint)] for joint in joints}
-    drawn = {} if paths is None else motion.read_paths(paths)
-    if twice := set(map(skeleton.find, given)) & set(map(skeleton.find, drawn)):
-        names = ", ".join(skeleton.names[joint] for joint in twice)
+    true_paths = {joint: truth[:, skeleton.find(joint)] for joint in joints}
+    from_file = {} if paths is None else motion.read_paths(paths)
+    if repeated := set(map(skeleton.find, true_paths)) & set(map(skeleton.find, from_file)):
+        names = ", ".join(skeleton.names[joint] for joint in repeated)
         raise UsageError(f"{names}: both --joints and {paths} give a path; leave one out")
-    return given | drawn
+    return true_paths | from_file
 
 
 def animate(
@@ -336,35 +338,37 @@ def animate(
             )
         loaded = load_run(Path(source), data, failed=failed)
         windows = windows_of(data_of(data, loaded, missing=missing), clip)
-        chosen = _liveliest(windows.positions(windows.all().mask_to_nan()).numpy(), window)
-        futures = draw_futures(loaded, windows, [chosen], samples or 5, seed, fix=fix)
+        index = _fastest_window(windows.positions(windows.all().mask_to_nan()).numpy(), window)
+        futures = draw_futures(loaded, windows, [index], samples or 5, seed, fix=fix)
     elif fix:
         raise UsageError(f"--fix is for futures drawn from a run; {source} is not a run directory; leave it out")
     elif data is not None:
         raise UsageError(f"--data is the path of the data of a run; {source} is not a run directory; leave it out")
     elif source != SIMULATED and motion.is_forecasts(source):
-        chosen, futures = _stored(source, clip, window, samples)
+        index, futures = _load_window(source, clip, window, samples)
     elif window is not None or samples is not None or figure is not None:
         raise UsageError(f"--window, --samples and --figure are for futures; {source} has none; leave them out")
     else:
         _play_clip(source, clip, missing, every, out)
         return
-    now = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
-    _play(out, futures.skeleton, *now, fixed=_alike(futures), every=every, title=_title(futures))
-    ERROR.print(f"wrote {out}: window {chosen}, {_title(futures)}")
+    frames = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
+    _play(out, futures.skeleton, *frames, fixed=_fixed_joints(futures), every=every, title=_title(futures))
+    ERROR.print(f"wrote {out}: window {index}, {_title(futures)}")
     _save_futures(futures, figure)
 
 
-def _stored(source: str, clip: str | None, window: int | None, samples: int | None) -> tuple[int, motion.Forecasts]:
-    """Return the number of a window among the windows of the clip in a file of forecasts, and its forecasts."""
+def _load_window(
+    source: str, clip: str | None, window: int | None, samples: int | None
+) -> tuple[int, motion.Forecasts]:
+    """Return the index and the forecasts of one window of a clip in a file of forecasts."""
     stored = motion.Forecasts.load(source)
-    known = [n for n, key in enumerate(stored.keys) if clip in (None, key[1], f"{key[0]}/{key[1]}")]
-    if not known:
+    indices = [n for n, key in enumerate(stored.keys) if clip in (None, key[1], f"{key[0]}/{key[1]}")]
+    if not indices:
         raise ValueError(f"{source} has no window of a clip {clip!r}; name one of its clips")
     if samples is not None and samples > len(stored.forecasts):
         raise UsageError(f"--samples {samples}: {source} has only {len(stored.forecasts)} futures of each window")
-    chosen = _liveliest(np.concatenate([stored.observed, stored.truth], 1)[known], window)
-    return chosen, stored.window(known[chosen], samples or 5)
+    index = _fastest_window(np.concatenate([stored.observed, stored.truth], 1)[indices], window)
+    return index, stored.window(indices[index], samples or 5)
 
 
 def _play_clip(source: str, name: str | None, missing: bool, every: int | None, out: Path) -> None:
@@ -386,14 +390,16 @@ def joint_names(given: Sequence[str]) -> list[str]:
 
 
 def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
-    found = [clip for clip in clips if name in (clip.name, f"{clip.split}/{clip.name}")]
-    if not found:
-        meant = nearest(name, [known for clip in clips for known in (clip.name, f"{clip.split}/{clip.name}")])
-        raise ValueError(f"no clip {name!r}{meant} in {clips.name}; `dvae data info` lists the clips")
-    if len(found) > 1:
-        keys = " or ".join("/".join(clip.key) for clip in found)
-        raise ValueError(f"{name!r} is the name of {len(found)} clips; give {keys}")
-    return found[0]
+    matches = [clip for clip in clips if name in (clip.name, f"{clip.split}/{clip.name}")]
+    if not matches:
+        suggestion = nearest(
+            name, [candidate for clip in clips for candidate in (clip.name, f"{clip.split}/{clip.name}")]
+        )
+        raise ValueError(f"no clip {name!r}{suggestion} in {clips.name}; `dvae data info` lists the clips")
+    if len(matches) > 1:
+        keys = " or ".join("/".join(clip.key) for clip in matches)
+        raise ValueError(f"{name!r} is the name of {len(matches)} clips; give {keys}")
+    return matches[0]
 
 
 def windows_of(opened: Any, clip: str | None, whole: bool = False) -> motion.Windows:
@@ -406,10 +412,10 @@ def windows_of(opened: Any, clip: str | None, whole: bool = False) -> motion.Win
     """
     if clip is None:
         return opened.windows("test")  # type: ignore[no-any-return]
-    found, own = _clip(opened.motion, clip), opened.motion
-    chosen = motion.MotionSet([found], own.skeleton, opened.path, missing=own.missing)
-    anywhere = replace(opened.protocol, split_by="split", test=tuple(chosen.splits), train=())
-    return motion.windows(chosen, anywhere, "test", found.frames if whole else None)
+    selected, motion_set = _clip(opened.motion, clip), opened.motion
+    subset = motion.MotionSet([selected], motion_set.skeleton, opened.path, missing=motion_set.missing)
+    protocol = replace(opened.protocol, split_by="split", test=tuple(subset.splits), train=())
+    return motion.windows(subset, protocol, "test", selected.frames if whole else None)
 
 
 def draw_futures(
@@ -430,7 +436,7 @@ def draw_futures(
         UsageError: `fix` names something that the model cannot fix.
     """
     model = loaded.model
-    drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
+    is_drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
     free = {*(model.view.parts or ()), *(name for name in model.latents if not model.generative.local(name))}
     if unknown := [name for name in fix if name not in free]:
         raise UsageError(
@@ -439,40 +445,40 @@ def draw_futures(
         )
     observed, horizon = loaded.schema.protocol.observed, horizon or loaded.schema.protocol.predicted
     keys = windows.keys
-    some = windows.all().rows(list(chosen))
-    past, future = some.past(observed), some.mask_to_nan()[:, observed:][:, :horizon]
+    batch = windows.all().rows(list(chosen))
+    past, future = batch.past(observed), batch.mask_to_nan()[:, observed:][:, :horizon]
     with seeded(seed):
-        whole = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # a part is fixed at all frames
+        n_frames = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # a part is fixed at all frames
         parts = []
-        for given in Sequences(past).batches(64):
-            once = model.forecast(given, whole, 1, draw_emission=drawn) if fix else {}
-            held = {"fix": {name: once[name][0] for name in fix}} if fix else {}
-            made = model.forecast(given, whole, samples, draw_emission=drawn, **held)["x"][:, :, :horizon]
-            parts.append(windows.positions(made).numpy())
-            del made  # with many samples, the largest object here
+        for past_part in Sequences(past).batches(64):
+            shared = model.forecast(past_part, n_frames, 1, draw_emission=is_drawn) if fix else {}
+            fixed = {"fix": {name: shared[name][0] for name in fix}} if fix else {}
+            values = model.forecast(past_part, n_frames, samples, draw_emission=is_drawn, **fixed)["x"][:, :, :horizon]
+            parts.append(windows.positions(values).numpy())
+            del values  # with many samples, the largest object here
     observed_frames, truth = (windows.positions(x).numpy() for x in (past.mask_to_nan(), future))
-    forecasts, emission = np.concatenate(parts, axis=1), "drawn" if drawn else "mean"
+    forecasts, emission = np.concatenate(parts, axis=1), "drawn" if is_drawn else "mean"
     return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], forecasts, observed_frames, truth, emission)
 
 
-def _in_world(futures: motion.Forecasts, windows: motion.Windows, chosen: Sequence[int]) -> motion.Forecasts:
+def _in_world(futures: motion.Forecasts, windows: motion.Windows, indices: Sequence[int]) -> motion.Forecasts:
     """Return futures at the position, height and heading of their clips."""
     names = ("forecasts", "observed", "truth")
-    placed: dict[str, Any] = {
-        n: windows.to_world(torch.from_numpy(getattr(futures, n)), list(chosen)).numpy() for n in names
+    arrays: dict[str, Any] = {
+        n: windows.to_world(torch.from_numpy(getattr(futures, n)), list(indices)).numpy() for n in names
     }
-    return replace(futures, **placed)
+    return replace(futures, **arrays)
 
 
-def _alike(futures: motion.Forecasts) -> list[int]:
+def _fixed_joints(futures: motion.Forecasts) -> list[int]:
     """Return the joints, except the root, that move equally in all futures of the first window, if it has several."""
     sampled = futures.forecasts[:, 0]
     alike = (sampled == sampled[:1]).all((0, 1, 3)) & (len(sampled) > 1)
     return [joint for joint in np.flatnonzero(alike).tolist() if joint != futures.skeleton.root]
 
 
-def _liveliest(positions: np.ndarray, window: int | None) -> int:
-    """Return the given window, or the one of `positions` (N, T, J, 3) whose joints move fastest.
+def _fastest_window(positions: np.ndarray, window: int | None) -> int:
+    """Return the given window, or the window of `positions` (N, T, J, 3) with the fastest joints.
 
     Raises:
         UsageError: there are fewer windows.

@@ -26,7 +26,7 @@ Expert = Annotated[T, EXPERT]
 def command_stub(
     function: Callable[..., None], given: Sequence[str], everything: bool
 ) -> tuple[Callable[..., None], str]:
-    """Return a copy of a command's signature, from which its help is printed, and " METHOD" if a method is given.
+    """Return a function that has a command's signature, for its help, and " METHOD" if a method is given.
 
     Args:
         function: function of the command.
@@ -40,48 +40,48 @@ def command_stub(
     kind = next((known[word] for word in given if word in known), None)
     if known and kind is None:
         _list_methods(known)
-    own = dict.fromkeys((option.name for option in fields(Training)), "default: the method's")
-    defaults = own if kind is None else _trainings(kind)
-    kept = []
+    training_defaults = dict.fromkeys((option.name for option in fields(Training)), "default: the method's")
+    defaults = training_defaults if kind is None else _training_defaults(kind)
+    parameters = []
     for parameter in inspect.signature(function).parameters.values():
         hint = hints[parameter.name]
         if known and parameter.name == "method":
             if kind is None:
                 continue
-            hint = _of_method(kind, everything)
+            hint = _method_options(kind, everything)
         elif EXPERT in get_args(hint) and not everything:
             continue
         elif is_dataclass(hint):
-            hint = _copied(hint, everything, defaults)
+            hint = _copy_options(hint, everything, defaults)
         else:
-            hint = _hinted(hint, parameter.default)
-        kept.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+            hint = _with_default(hint, parameter.default)
+        parameters.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
 
     def shown(**_: Any) -> None:
         """Do nothing: only the help of this function is printed."""
 
     shown.__doc__ = function.__doc__
-    shown.__signature__ = inspect.Signature(kept)  # type: ignore[attr-defined]
-    shown.__annotations__ = {parameter.name: parameter.annotation for parameter in kept}
+    shown.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    shown.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return shown, "" if kind is None else f" {kind.name}"
 
 
-def _hinted(hint: Any, default: Any, said: str | None = None) -> Any:
+def _with_default(hint: Any, default: Any, description: str | None = None) -> Any:
     """Return the type of an option with its default in words, for defaults that are flags, missing or empty."""
     if not (default is None or isinstance(default, bool) or default in ((), "", {})):
         return hint
-    words = said or (f"default: {_worded(default)}" if isinstance(default, bool) else "optional")
+    words = description or (f"default: {_in_words(default)}" if isinstance(default, bool) else "optional")
     return Annotated[hint, tyro.conf.arg(help_behavior_hint=f"({words})")]
 
 
-def _worded(value: Any) -> str:
+def _in_words(value: Any) -> str:
     """Return a default in words."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     return "none" if value is None or value in ((), "", {}) else str(value)
 
 
-def _copied(kind: Any, everything: bool, defaults: Mapping[str, str], expert: Sequence[str] = ()) -> Any:
+def _copy_options(kind: Any, everything: bool, defaults: Mapping[str, str], expert: Sequence[str] = ()) -> Any:
     """Return a subclass of a dataclass of options, for its help.
 
     Args:
@@ -98,14 +98,14 @@ def _copied(kind: Any, everything: bool, defaults: Mapping[str, str], expert: Se
         hidden = not everything and (option.name in expert or EXPERT in get_args(hint))
         plain = get_args(hint)[0] if get_origin(hint) is Annotated else hint
         if is_dataclass(plain):
-            hint = _copied(plain, everything, defaults)
+            hint = _copy_options(plain, everything, defaults)
             values[option.name] = field(default_factory=hint)
             hint = Annotated[hint, tyro.conf.Suppress] if hidden else hint
         else:
             if hidden:
                 hint = Annotated[hint, tyro.conf.Suppress]
             if default is not MISSING:
-                hint = _hinted(hint, default, defaults.get(option.name))
+                hint = _with_default(hint, default, defaults.get(option.name))
                 factory = option.default_factory  # a mutable default needs one
                 values[option.name] = field(default=default) if factory is MISSING else field(default_factory=factory)
         annotations[option.name] = hint
@@ -113,35 +113,38 @@ def _copied(kind: Any, everything: bool, defaults: Mapping[str, str], expert: Se
     return dataclass(frozen=True)(type(kind.__name__, (kind,), body))
 
 
-def _of_method(kind: type[Trainable], everything: bool) -> Any:
+def _method_options(kind: type[Trainable], everything: bool) -> Any:
     """Return the options of a method; options shared with other methods are expert options."""
-    own = {name for each in kind.__mro__ if each.__module__ == kind.__module__ for name in each.__annotations__}
-    shared = [option.name for option in fields(kind) if option.name not in own and option.name != "latent"]
+    own_options = {name for base in kind.__mro__ if base.__module__ == kind.__module__ for name in base.__annotations__}
+    shared = [option.name for option in fields(kind) if option.name not in own_options and option.name != "latent"]
     presets: Mapping[str, Mapping[str, Any]] = getattr(kind, "presets", {})
     defaults = {}
     for option in fields(kind):
         by_data = {name: preset[option.name] for name, preset in presets.items() if option.name in preset}
         if by_data:
             defaults[option.name] = _by_preset(by_data)
-    return _copied(kind, everything, defaults, shared)
+    return _copy_options(kind, everything, defaults, shared)
 
 
-def _trainings(kind: type[Trainable]) -> dict[str, str]:
+def _training_defaults(kind: type[Trainable]) -> dict[str, str]:
     """Return the training defaults of a method, in words."""
     names = [option.name for option in fields(next(iter(kind.trainings.values())))]
     return {
-        name: _by_preset({of or kind.name: getattr(training, name) for of, training in kind.trainings.items()})
+        name: _by_preset(
+            {data_name or kind.name: getattr(training, name) for data_name, training in kind.trainings.items()}
+        )
         for name in names
     }
 
 
 def _by_preset(values: Mapping[str, Any]) -> str:
     """Return the values by data preset, in words; a single value if all are equal."""
-    said = {name: _worded(value) for name, value in values.items()}
-    if len({*said.values()}) == 1:
-        name, value = next(iter(said.items())) if len(said) == 1 else ("", next(iter(said.values())))
+    descriptions = {name: _in_words(value) for name, value in values.items()}
+    if len({*descriptions.values()}) == 1:
+        name, value = next(iter(descriptions.items()))
+        name = name if len(descriptions) == 1 else ""
         return f"default: {value}" + (f" ({name})" if name else "")
-    return "default: " + ", ".join(f"{value} ({name or 'other data'})" for name, value in said.items())
+    return "default: " + ", ".join(f"{value} ({name or 'other data'})" for name, value in descriptions.items())
 
 
 def _list_methods(known: Mapping[str, type[Trainable]]) -> None:

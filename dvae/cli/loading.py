@@ -75,8 +75,8 @@ def kind_of(paths: Sequence[Path], data: str | None) -> str:
     """
     kinds = {runs.read_config(path).kind: path for path in paths}
     if len(kinds) > 1:
-        said = " and ".join(f"{path} on {kind}" for kind, path in kinds.items())
-        raise UsageError(f"these runs were fitted on several kinds of data, {said}; give runs of one kind")
+        descriptions = " and ".join(f"{path} on {kind}" for kind, path in kinds.items())
+        raise UsageError(f"these runs were fitted on several kinds of data, {descriptions}; give runs of one kind")
     return next(iter(kinds), "motion")
 
 
@@ -88,20 +88,20 @@ def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> An
     Raises:
         UsageError: `missing` does not apply to these data.
     """
-    most = next((run for run in shared if type(run.schema.view) is not View), shared[0])
-    if missing and most.config.kind == "panel":
-        raise UsageError(f"--missing is for motion, and {most.path} was fitted on a table; leave it out")
+    widest = next((run for run in shared if type(run.schema.view) is not View), shared[0])
+    if missing and widest.config.kind == "panel":
+        raise UsageError(f"--missing is for motion, and {widest.path} was fitted on a table; leave it out")
     if path is None:
-        if missing and not most.data.motion.missing:
+        if missing and not widest.data.motion.missing:
             raise UsageError("--missing is for other data (--data); the data of the run have no missing joints")
-        return most.data
-    found = most.with_data(path, **({"missing": True} if missing else {}))
-    if found.onto:
-        note(f"{path} has another skeleton; its joints are matched with those of {most.path} by their names")
+        return widest.data
+    other_data = widest.with_data(path, **({"missing": True} if missing else {}))
+    if other_data.onto:
+        note(f"{path} has another skeleton; its joints are matched with those of {widest.path} by their names")
     for run in shared:
-        if not is_training_data(run, found):
+        if not is_training_data(run, other_data):
             note(f"{path} is not the data that {run.path} was fitted on")
-    return found
+    return other_data
 
 
 def windows_to_test(loaded: runs.Loaded, opened: Any, stride: int | None = None, whole: bool = True) -> Any:
@@ -140,17 +140,17 @@ def with_equal_windows(
     """
     if not paths:
         raise UsageError("give at least one run directory")
-    twice, count = Counter(map(str, paths)).most_common(1)[0]
+    path_repeated, count = Counter(map(str, paths)).most_common(1)[0]
     if count > 1:
-        raise UsageError(f"a run is named twice: {twice}; name it once")
+        raise UsageError(f"a run is named twice: {path_repeated}; name it once")
     loaded = [load_run(each, path, kinds, failed) for each in paths]
     first = loaded[0]
     for other in loaded[1:]:
         if not (other.alike(first) if path is None else other.schema.windows == first.schema.windows):
-            there, here = (f"{run.config.data.path}, {_cut(run)}" for run in (other, first))
+            source, first_source = (f"{run.config.data.path}, {_cut(run)}" for run in (other, first))
             raise ValueError(
-                f"{other.path} has other test windows ({there}) than {first.path} ({here}); give runs of the same data "
-                "and protocol"
+                f"{other.path} has other test windows ({source}) than {first.path} ({first_source}); give runs of the "
+                "same data and protocol"
             )
     return loaded
 
@@ -191,29 +191,32 @@ def rows(loaded: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     firsts = [row[0] for row in rows.values()]
     names = [first.method.name for first in firsts]
     for name in [name for name, count in Counter(names).items() if count > 1]:
-        places = [place for place, other in enumerate(names) if other == name]
-        grid = [_of_grid(list(rows.values())[place]) for place in places]
+        indices = [index for index, other in enumerate(names) if other == name]
+        grid = [_sweep_name(list(rows.values())[index]) for index in indices]
         if name == Equations.name and all(grid) and len({*grid}) == len(grid):  # shorter than the differing options
-            names = [grid[places.index(place)] if place in places else other for place, other in enumerate(names)]
+            names = [grid[indices.index(index)] if index in indices else other for index, other in enumerate(names)]
             continue
-        for place, said in zip(places, _apart([firsts[place] for place in places]), strict=True):
-            names[place] = f"{name} ({said})"
+        for index, label in zip(indices, _distinct_labels([firsts[index] for index in indices]), strict=True):
+            names[index] = f"{name} ({label})"
     return dict(zip(names, rows.values(), strict=True))
 
 
-def _of_grid(row: Sequence[runs.Loaded]) -> str:
+def _sweep_name(row: Sequence[runs.Loaded]) -> str:
     """Return the common directory name of a row of several runs, without the seed, as in a sweep; "" otherwise."""
     stems = {re.sub(r"-seed\d+$", "", run.path.absolute().name) for run in row}
     return stems.pop() if len(stems) == 1 and len(row) > 1 else ""
 
 
-def _apart(loaded: Sequence[runs.Loaded]) -> list[str]:
+def _distinct_labels(loaded: Sequence[runs.Loaded]) -> list[str]:
     """Return labels that distinguish runs of one method: options, or directory names, or whole paths."""
     options = [_options(run) for run in loaded]
-    keys = dict.fromkeys(key for own in options for key in own)
-    differing = [key for key in keys if len({str(own.get(key)) for own in options}) > 1]
-    said = [", ".join(f"{key.partition('.')[2]} {own[key]}" for key in differing if key in own) for own in options]
-    candidates = (said, [run.path.absolute().name for run in loaded], [str(run.path) for run in loaded])
+    keys = dict.fromkeys(key for run_options in options for key in run_options)
+    differing = [key for key in keys if len({str(run_options.get(key)) for run_options in options}) > 1]
+    option_labels = [
+        ", ".join(f"{key.partition('.')[2]} {run_options[key]}" for key in differing if key in run_options)
+        for run_options in options
+    ]
+    candidates = (option_labels, [run.path.absolute().name for run in loaded], [str(run.path) for run in loaded])
     return next(texts for texts in candidates if all(texts) and len(set(texts)) == len(texts))
 
 

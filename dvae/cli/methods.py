@@ -63,11 +63,11 @@ def show(
         if out is not None:
             raise UsageError(f"{method} is a metric model and has no graph; leave out --out")
         metric_model = metric_models()[method]
-        said = [
+        lines = [
             f"{method} has no equations: it is a metric model of forecasts ({metric_model.source})",
-            *_fitted(metric_model.trainings),
+            *_describe_trainings(metric_model.trainings),
         ]
-        OUT.print("\n".join(said), highlight=False, soft_wrap=True)
+        OUT.print("\n".join(lines), highlight=False, soft_wrap=True)
         return
     if method is not None:
         with arguments():
@@ -90,39 +90,42 @@ def show(
     else:
         raise UsageError("give the name of a method, or --generative, with --inference for the audit of a guide")
     with arguments():
-        found = audit(*pair, observed=observed, summed=summed)
+        pair_audit = audit(*pair, observed=observed, summed=summed)
     if out is not None:
         from matplotlib.figure import Figure
 
-        graphs = 2 if found.inference.factors else 1
+        graphs = 2 if pair_audit.inference.factors else 1
         figure = Figure(figsize=(graphs * (0.85 * steps + 1.6), 4.2 if graphs == 2 else 1.6), layout="constrained")
         model, *guides = figure.subplots(1, graphs, squeeze=False)[0]
-        found.generative.draw(steps, ax=model, observed=observed).set_title("model")
+        pair_audit.generative.draw(steps, ax=model, observed=observed).set_title("model")
         for axes in guides:
-            title = "guide" if found.exact else "guide (dashed: what the exact posterior also reads)"
-            found.draw(steps, ax=axes).set_title(title)
+            title = (
+                "guide" if pair_audit.exact else "guide (dashed: dependencies of the exact posterior that it ignores)"
+            )
+            pair_audit.draw(steps, ax=axes).set_title(title)
         save_figure(figure, out)
-    OUT.print(str(found.generative), highlight=False, markup=False, soft_wrap=True)
-    if found.inference.factors:
-        OUT.print(str(found.inference), highlight=False, markup=False, soft_wrap=True)
-        OUT.print(found.table())
-        OUT.print(found.verdict)
+    OUT.print(str(pair_audit.generative), highlight=False, markup=False, soft_wrap=True)
+    if pair_audit.inference.factors:
+        OUT.print(str(pair_audit.inference), highlight=False, markup=False, soft_wrap=True)
+        OUT.print(pair_audit.table())
+        OUT.print(pair_audit.verdict)
     else:
-        why = "all latents are summed out" if summed else "the model has no latents"
-        OUT.print(f"{why}: there is no guide, and the bound is the log evidence")
+        reason = "all latents are summed out" if summed else "the model has no latents"
+        OUT.print(f"{reason}: there is no guide, and the bound is the log evidence")
     if method is not None:
-        OUT.print("\n".join(_fitted(kind.trainings)), highlight=False, soft_wrap=True)
+        OUT.print("\n".join(_describe_trainings(kind.trainings)), highlight=False, soft_wrap=True)
 
 
-def _fitted(trainings: Mapping[str, Training]) -> list[str]:
+def _describe_trainings(trainings: Mapping[str, Training]) -> list[str]:
     """Return the training defaults of a method by skeleton, in words."""
     lines = []
-    for skeleton, told in trainings.items():
-        rate = told.rate
-        ends = "" if rate(0) == rate(told.steps) else f", at the end {rate(told.steps):g}"
+    for skeleton, training in trainings.items():
+        rate = training.rate
+        ends = "" if rate(0) == rate(training.steps) else f", at the end {rate(training.steps):g}"
         on = f"to {skeleton}" if skeleton else "to other data" if len(trainings) > 1 else "to data"
         lines.append(
-            f"fitted {on} in {told.steps} steps of {told.batch_size}, {told.optimizer}, learning rate {rate(0):g}{ends}"
+            f"fitted {on} in {training.steps} steps of {training.batch_size}, {training.optimizer}, "
+            f"learning rate {rate(0):g}{ends}"
         )
     return lines
 

@@ -77,31 +77,34 @@ def report(
     at_least(0, windows=windows)
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
     check_files(out, None, ".html", ".htm")
-    ablated = None if edges is None else _ablation(edges)
+    ablation = None if edges is None else _ablation(edges)
     loaded = loading.with_equal_windows(run, data, failed=failed)
     of_table = loaded[0].config.kind == "panel"
     if evaluate:
         evaluate_runs(run, Control(), data=data, missing=missing, failed=failed, seed=seed)
-    named = dict(zip(loading.names(loaded), loaded, strict=True))
+    by_name = dict(zip(loading.names(loaded), loaded, strict=True))
 
     with progress_bar(True) as bar:
-        shown = [make(named) for make in bar.track(OF_DIRECTORIES, description="run directories")]
-    shown += [] if ablated is None else [sections.edges(ablated)]
+        page_sections = [make(by_name) for make in bar.track(OF_DIRECTORIES, description="run directories")]
+    page_sections += [] if ablation is None else [sections.edges(ablation)]
     try:
-        opened = loading.data_of(data, *loaded, missing=missing)
-        test: Any = opened.windows("test")
+        data_set = loading.data_of(data, *loaded, missing=missing)
+        test: Any = data_set.windows("test")
     except CheckpointError as error:
         text = f"Bounds, latents and futures need the data. {error_message(error)}; give their path with --data."
-        shown.append(Section("Latents and futures", before=missing_part(text)))
+        page_sections.append(Section("Latents and futures", before=missing_part(text)))
     else:
-        few = sections.SelectedWindows(test, bound_windows)
-        shown += [sections.weighed(named, few, particles, seed), sections.posteriors(named, few, seed)]
+        selected = sections.SelectedWindows(test, bound_windows)
+        page_sections += [
+            sections.weighed(by_name, selected, particles, seed),
+            sections.posteriors(by_name, selected, seed),
+        ]
         futures = _fans if of_table else _futures
-        shown += [futures(named, test, windows, samples, seed)] if windows else []
-    text = document("Report: " + ", ".join(named), shown, [] if of_table else [SCRIPT])
+        page_sections += [futures(by_name, test, windows, samples, seed)] if windows else []
+    text = document("Report: " + ", ".join(by_name), page_sections, [] if of_table else [SCRIPT])
     with files.atomic_write(out) as file:
         file.write(text.encode(errors="replace"))
-    ERROR.print(f"wrote {out}: {', '.join(named)}, {len(text) / 1e6:.1f} MB")
+    ERROR.print(f"wrote {out}: {', '.join(by_name)}, {len(text) / 1e6:.1f} MB")
 
 
 def _ablation(path: Path) -> Ablation:
@@ -111,42 +114,42 @@ def _ablation(path: Path) -> Ablation:
         raise UsageError(f"--edges {path}: {error_message(error)}") from error
 
 
-def _fans(named: Mapping[str, Any], windows: PanelWindows, count: int, samples: int, seed: int) -> Section:
+def _fans(by_name: Mapping[str, Any], windows: PanelWindows, count: int, samples: int, seed: int) -> Section:
     """Return the section of a few windows with their true futures and the forecast intervals of each run."""
     if windows.length is None:
         text = "These runs were fitted on whole sequences. To see futures, fit with --observed and --horizon."
         return Section("Futures", before=missing_part(text))
-    few = windows.some(sections.SelectedWindows(windows, count).chosen)
+    selected = windows.some(sections.SelectedWindows(windows, count).chosen)
 
     def cell(run: runs.Loaded) -> Markup:
-        found = few.forecast(run.model, max(samples, QUANTILES), seed)
-        shown = ((found.plot(place, most=COLUMNS), key) for place, key in enumerate(found.keys))
+        forecasts = selected.forecast(run.model, max(samples, QUANTILES), seed)
+        figures = ((forecasts.plot(index, most=COLUMNS), key) for index, key in enumerate(forecasts.keys))
         return side_by_side(
-            *(picture(figure, f"forecasts of {name} from step {step}") for figure, (name, step) in shown)
+            *(picture(figure, f"forecasts of {name} from step {step}") for figure, (name, step) in figures)
         )
 
-    about = "Grey: observed. Black: true future. Blue: median, and intervals of 50, 80 and 95 % of the forecasts."
-    return Section("Futures", sections.cells(named, cell, "futures"), about)
+    caption = "Grey: observed. Black: true future. Blue: median, and intervals of 50, 80 and 95 % of the forecasts."
+    return Section("Futures", sections.cells(by_name, cell, "futures"), caption)
 
 
-def _futures(named: Mapping[str, Any], windows: Any, count: int, samples: int, seed: int) -> Section:
+def _futures(by_name: Mapping[str, Any], windows: Any, count: int, samples: int, seed: int) -> Section:
     """Return the section of a few windows with their true futures and the forecasts of each run, as skeletons."""
-    few = sections.SelectedWindows(windows, count)
+    selected = sections.SelectedWindows(windows, count)
 
     def cell(run: runs.Loaded) -> Markup:
-        found = draw_futures(run, windows, few.chosen, samples, seed)
+        futures = draw_futures(run, windows, selected.chosen, samples, seed)
         names = [str(k + 1) for k in range(samples)]
         scenes = {
             f"{split}/{clip} from frame {start}": make_scene(
-                found.skeleton, found.observed[n], found.forecasts[:, n], found.truth[n], names=names
+                futures.skeleton, futures.observed[n], futures.forecasts[:, n], futures.truth[n], names=names
             )
-            for n, (split, clip, start) in enumerate(found.keys)
+            for n, (split, clip, start) in enumerate(futures.keys)
         }
         return player(scenes)
 
-    about = (
+    caption = (
         f"Black: observed. Green: true future. In colour: {samples} futures, each from one draw of the latents. "
         "Models with latents show the mean of the emission, without its noise. Drag a skeleton, or press the arrow "
         "keys, to turn it."
     )
-    return Section("Futures", sections.cells(named, cell, "futures"), about)
+    return Section("Futures", sections.cells(by_name, cell, "futures"), caption)

@@ -37,22 +37,24 @@ APART, FARTHER = 3.0, 1.3
 """Thresholds of the notes: nats that a search may still improve, and standard deviations from the observations."""
 
 
-def _save_page(out: Path, made: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None) -> None:
+def _save_page(
+    out: Path, motions: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None
+) -> None:
     """Write a page with clips that move side by side; a shorter clip keeps its last pose."""
     from ..motion.drawing.player import animate
 
-    clips = [*made, *(truth or ())]
+    clips = [*motions, *(truth or ())]
     frames = max(clip.frames for clip in clips)
     still = np.stack([np.pad(c.positions, ((0, frames - c.frames), (0, 0), (0, 0)), mode="edge") for c in clips])
-    samples, real = still[: len(made), 1:], None if truth is None else still[-1, 1:]
-    animate(made.skeleton, still[0, :1], samples, real, names=names).save(out)
+    samples, real = still[: len(motions), 1:], None if truth is None else still[-1, 1:]
+    animate(motions.skeleton, still[0, :1], samples, real, names=names).save(out)
 
 
-def _alone(made: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:
+def _single_clip(motions: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:
     """Return one of the clips, with the rest pose of its own body."""
-    alone = replace(made, clips=[clip])
-    rest = tuple(resting_offsets(alone).flatten().tolist())
-    return replace(alone, skeleton=replace(made.skeleton, rest=rest))
+    single = replace(motions, clips=[clip])
+    rest = tuple(resting_offsets(single).flatten().tolist())
+    return replace(single, skeleton=replace(motions.skeleton, rest=rest))
 
 
 @dataclass(frozen=True)
@@ -92,14 +94,14 @@ class Glimpse:
         if self.seen == "surfaces" and self.gaps:
             raise UsageError("--gaps is for points or markers; surfaces have no gaps")
         x, shape = truth[WHOLE], truth[SHAPE]
-        chosen = None
+        frames = None
         if self.frames is not None:
             if self.frames > model.timed.frames:
                 raise UsageError(f"--frames is {self.frames}; segments of this run have {model.timed.frames}")
-            chosen = np.linspace(0, model.timed.frames - 1, self.frames).round().tolist()
-        how: dict[str, Any] = {"seconds": self.seconds, "frames": chosen, "points": self.points, "gaps": self.gaps}
-        found = simulate_observations(model, x, shape, self.seen, fps=self.fps or 30.0, seed=seed, **how)
-        return found | ({SHAPE: shape} if self.known_body else {})
+            frames = np.linspace(0, model.timed.frames - 1, self.frames).round().tolist()
+        options: dict[str, Any] = {"seconds": self.seconds, "frames": frames, "points": self.points, "gaps": self.gaps}
+        observations = simulate_observations(model, x, shape, self.seen, fps=self.fps or 30.0, seed=seed, **options)
+        return observations | ({SHAPE: shape} if self.known_body else {})
 
 
 @dataclass(frozen=True)
@@ -134,33 +136,33 @@ class Recovery:
         loaded = loading.load_run(run, data, ("segments",), failed)
         model, truth, takes = loaded.model, None, set()
         if self.file is None:
-            opened = loading.data_of(data, loaded)
-            chosen = [opened.found(name) for name in self.source]
-            clips = [clip for each in chosen for clip in each.motion]
+            data_set = loading.data_of(data, loaded)
+            selected = [data_set.found(name) for name in self.source]
+            clips = [clip for segments in selected for clip in segments.motion]
             keys, takes = [clip.key for clip in clips], {clip.labels["source"] for clip in clips}
             if len({*keys}) < len(keys):
                 raise UsageError(f"--from {' '.join(self.source)} names a segment twice")
-            truth = {name: torch.cat([each.all()[name] for each in chosen]) for name in (WHOLE, SHAPE)}
+            truth = {name: torch.cat([segments.all()[name] for segments in selected]) for name in (WHOLE, SHAPE)}
             seen = self.glimpse.of(model, truth, seed)
         else:
-            seen, opened = read_seen(self.file, model), _known_data(loaded, data)
+            seen, data_set = read_seen(self.file, model), _known_data(loaded, data)
             keys = [("seen", f"segment-{n:02d}") for n in range(len(next(iter(seen.values()))))]
         if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
             raise UsageError(
                 f"--out {out} can show one of {len(keys)} segments; end its name in .npz, or use no suffix"
             )
-        known = None if opened is None else _known(opened, takes)
-        how: dict[str, Any] = {"truth": truth, "deviations": self.deviations, "known": known}
-        how |= {"descent": self.descent, "aggregate": self.aggregate}
-        found = recover_segments(model, seen, keys, **how, seed=seed, progress=True)
-        for doubt in _doubts(found, self.deviations):
-            note(doubt)
+        training_segments = None if data_set is None else _other_segments(data_set, takes)
+        options: dict[str, Any] = {"truth": truth, "deviations": self.deviations, "known": training_segments}
+        options |= {"descent": self.descent, "aggregate": self.aggregate}
+        recovered = recover_segments(model, seen, keys, **options, seed=seed, progress=True)
+        for warning in _warnings(recovered, self.deviations):
+            note(warning)
         if out is not None:
             drawn = 0 if out.suffix.lower() == ".bvh" else draws
-            _write_recovered(out, found, drawn)
+            _write_recovered(out, recovered, drawn)
             names = ", ".join(map("/".join, keys))
             ERROR.print(f"wrote {out}: {names}, the most probable" + f" and {drawn} draws of each" * (drawn > 0))
-        OUT.print(found.table())
+        OUT.print(recovered.table())
 
 
 def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
@@ -172,42 +174,42 @@ def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
         return None
 
 
-def _known(opened: Any, takes: Collection[str]) -> Mapping[str, Any] | None:
+def _other_segments(data_set: Any, takes: Collection[str]) -> Mapping[str, Any] | None:
     """Return training segments from takes other than `takes`; None without such segments."""
-    others = [clip for clip in opened.segments if clip.split == "train" and clip.labels["source"] not in takes]
+    others = [clip for clip in data_set.segments if clip.split == "train" and clip.labels["source"] not in takes]
     clips = subsample_clips(others, MOST_KNOWN)
-    return motion.Segments(replace(opened.segments, clips=clips), opened.timed).all() if clips else None
+    return motion.Segments(replace(data_set.segments, clips=clips), data_set.timed).all() if clips else None
 
 
-def _doubts(found: Recovered, deviations: Deviations) -> Iterator[str]:
+def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:
     """Yield warnings for readers of the table."""
-    left = found.found.posterior.left
-    if many := int((left > APART).sum()):
+    remaining = recovered.found.posterior.left
+    if n_unconverged := int((remaining > APART).sum()):
         yield (
-            f"{many} of {len(left)} segments not converged, with up to {float(left.max()):,.0f} nats left; give more "
-            "--steps or --starts, or allow larger deviations"
+            f"{n_unconverged} of {len(remaining)} segments not converged, with up to {float(remaining.max()):,.0f} "
+            "nats left; give more --steps or --starts, or allow larger deviations"
         )
-    for name, away in found.away.items():
+    for name, distances in recovered.away.items():
         option, allowed = name.removesuffix("s"), deviations.of(name)
-        apart = float(away.max()) / (8 / pi) ** 0.5  # the mean length of three normal coordinates
-        if apart > FARTHER * allowed:
+        deviation = float(distances.max()) / (8 / pi) ** 0.5  # the mean length of three normal coordinates
+        if deviation > FARTHER * allowed:
             yield (
-                f"the {name} are up to {1000 * float(away.max()):.0f} mm from the output of this run, and --{option} "
-                f"{allowed:g} allows {1000 * allowed:g} mm in each coordinate: intervals are too narrow; try "
-                f"--{option} {apart:.2g}"
+                f"the {name} are up to {1000 * float(distances.max()):.0f} mm from the output of this run, and "
+                f"--{option} {allowed:g} allows {1000 * allowed:g} mm in each coordinate: intervals are too narrow; "
+                f"try --{option} {deviation:.2g}"
             )
 
 
-def _write_recovered(out: Path, found: Recovered, draws: int) -> None:
+def _write_recovered(out: Path, recovered: Recovered, draws: int) -> None:
     """Write the most probable segments and draws as a motion file, an html page, a BVH file, or a folder of these."""
-    made, suffix = found.motion(draws), out.suffix.lower()
+    motions, suffix = recovered.motion(draws), out.suffix.lower()
     if suffix == ".npz":
-        motion.write_motion(out, made)
+        motion.write_motion(out, motions)
     elif suffix in (".html", ".htm"):
         names = ["most probable", *(f"draw {n}" for n in range(1, draws + 1))]
-        _save_page(out, made, names, found.true_motion())
+        _save_page(out, motions, names, recovered.true_motion())
     elif suffix:
-        motion.write_motion(out, _alone(made, made.clips[0]))
+        motion.write_motion(out, _single_clip(motions, motions.clips[0]))
     else:
-        for clip in made:
-            motion.write_motion(out, _alone(made, clip), "bvh")
+        for clip in motions:
+            motion.write_motion(out, _single_clip(motions, clip), "bvh")

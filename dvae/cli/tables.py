@@ -59,9 +59,9 @@ class ColumnOptions:
 
     def given(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, under their names in `PanelData.open`."""
-        found = {each.name: getattr(self, each.name) for each in fields(ColumnOptions)}
-        found["static"] = found.pop("attributes")  # a method may have an option `static`
-        return {name: value for name, value in found.items() if value}
+        options = {option.name: getattr(self, option.name) for option in fields(ColumnOptions)}
+        options["static"] = options.pop("attributes")  # a method may have an option `static`
+        return {name: value for name, value in options.items() if value}
 
 
 def is_table(path: str) -> bool:
@@ -84,12 +84,12 @@ def is_table(path: str) -> bool:
         return not any({f"{name[:-2]}_{axis}" for axis in "xyz"} <= names for name in names if name.endswith("_x"))
     try:
         with files.open_plain(place, links=True) as file, zipfile.ZipFile(file) as archive:
-            held = [entry.removesuffix(".npy") for entry in archive.namelist()]
+            entries = [entry.removesuffix(".npy") for entry in archive.namelist()]
     except zipfile.BadZipFile:
         return False
     skeletons = (place.with_name(name) for name in (f"{place.name}.skeleton.json", "skeleton.json"))
-    of_motion = "positions_3d" in held or any(skeleton.is_file() for skeleton in skeletons)
-    return not of_motion and ("x" in held or len(held) == 1)
+    of_motion = "positions_3d" in entries or any(skeleton.is_file() for skeleton in skeletons)
+    return not of_motion and ("x" in entries or len(entries) == 1)
 
 
 def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: int | None) -> PanelWindows:
@@ -102,7 +102,7 @@ def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: 
         **cut: options of `Cut` that replace the values of the run, if not None.
 
     Raises:
-        UsageError: the run was fitted on whole sequences, for which there are no forecasts.
+        UsageError: the run was fitted on whole sequences, which have no forecasts.
     """
     if opened.schema.cut.length is None:
         raise UsageError(
@@ -128,53 +128,57 @@ def forecast(
     opened = opened if sequence is None else opened.only([sequence])
     samples = samples or SAMPLES
     split = "test" if sequence is None else "all"
-    held = opened.ahead(horizon) if beyond else windows(loaded, opened, split, horizon=horizon)
-    found = held.forecast(loaded.model, samples, seed)
-    found.save(out)
-    ERROR.print(f"wrote {out}: {samples} futures of {found.draws.shape[2]} steps for each of {len(found.keys)} windows")
-    _say_left_out(samples, out, figure)
+    selected = opened.ahead(horizon) if beyond else windows(loaded, opened, split, horizon=horizon)
+    forecasts = selected.forecast(loaded.model, samples, seed)
+    forecasts.save(out)
+    ERROR.print(
+        f"wrote {out}: {samples} futures of {forecasts.draws.shape[2]} steps for each of {len(forecasts.keys)} windows"
+    )
+    _note_omitted(samples, out, figure)
     if figure is not None:
-        save_figure(found.plot(), figure)
+        save_figure(forecasts.plot(), figure)
 
 
 def impute(loaded: runs.Loaded, opened: PanelData, out: Path, samples: int | None, particles: int, seed: int) -> None:
     """Draw the missing entries of a table, and write them."""
     check_files(out, None, *FORMATS)
-    samples, held = samples or SAMPLES, opened.whole()
+    samples, sequences = samples or SAMPLES, opened.whole()
     with arguments():
-        found = held.impute(loaded.model, samples, seed, particles)
-    found.save(out)
-    ERROR.print(f"wrote {out}: {samples} fillings of {found.missing.sum()} missing entries of {held.panel.name}")
-    _say_left_out(samples, out)
+        imputed = sequences.impute(loaded.model, samples, seed, particles)
+    imputed.save(out)
+    ERROR.print(f"wrote {out}: {samples} fillings of {imputed.missing.sum()} missing entries of {sequences.panel.name}")
+    _note_omitted(samples, out)
 
 
-def _say_left_out(samples: int, out: Path, figure: Path | None = None) -> None:
+def _note_omitted(samples: int, out: Path, figure: Path | None = None) -> None:
     """Note the quantiles and intervals that need more draws."""
-    least = {} if out.suffix.lower() == ".npz" else {column_of(level): needed(level) for level in QUANTILES}
-    least |= {} if figure is None else {f"the interval of {100 * level:g} %": samples_needed(level) for level in BANDS}
-    if lacking := [f"{name} ({draws})" for name, draws in least.items() if draws > samples]:
-        note(f"left out, because they need more than {samples} draws (--samples): {', '.join(lacking)}")
+    n_needed = {} if out.suffix.lower() == ".npz" else {column_of(level): needed(level) for level in QUANTILES}
+    n_needed |= (
+        {} if figure is None else {f"the interval of {100 * level:g} %": samples_needed(level) for level in BANDS}
+    )
+    if omitted := [f"{name} ({draws})" for name, draws in n_needed.items() if draws > samples]:
+        note(f"left out, because they need more than {samples} draws (--samples): {', '.join(omitted)}")
 
 
 def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
-    """Print a summary of each table and a schema to correct; columns without a given role are guessed."""
+    """Print a summary of each table and a schema to edit; columns without a given role are guessed."""
     if out is not None and len(paths) > 1:
         raise UsageError(f"--out writes the schema of one table, got {len(paths)} tables; name one")
     for path in paths:
-        opened = PanelData.open(path, **told.given())
-        panel = opened.panel
+        data_set = PanelData.open(path, **told.given())
+        panel = data_set.panel
         table = Table(title=f"{path}: {panel!r}")
         for name in ("column", "role", "family", "unit", "known", "smallest", "mean", "largest"):
             table.add_column(name, justify="right" if name in ("known", "smallest", "mean", "largest") else "left")
-        own, steps = ColumnSummary.of(row_blocks(one.values for one in panel)), sum(map(len, panel))
-        for place, column in enumerate(panel.columns.columns):
-            known = f"{own.count[place] / steps:.1%}"
+        summary, steps = ColumnSummary.of(row_blocks(one.values for one in panel)), sum(map(len, panel))
+        for index, column in enumerate(panel.columns.columns):
+            share = f"{summary.count[index] / steps:.1%}"
             if column.classes:
-                shown = ["", ", ".join(column.classes[:4]) + (" …" if len(column.classes) > 4 else ""), ""]
+                cells = ["", ", ".join(column.classes[:4]) + (" …" if len(column.classes) > 4 else ""), ""]
             else:
-                numbers = (own.least[place], own.mean[place], own.largest[place])
-                shown = [f"{number:.4g}" if own.count[place] else "–" for number in numbers]
-            table.add_row(column.name, column.role, column.family, column.unit, known, *shown)
+                numbers = (summary.least[index], summary.mean[index], summary.largest[index])
+                cells = [f"{number:.4g}" if summary.count[index] else "–" for number in numbers]
+            table.add_row(column.name, column.role, column.family, column.unit, share, *cells)
         OUT.print(table)
         if panel.columns.id and not told.given().get("id") and schema_beside(path) == (None, None):
             OUT.print(
@@ -183,15 +187,15 @@ def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
                 markup=False,
                 soft_wrap=True,
             )
-        for said in opened.parts().values():
-            OUT.print(said, markup=False, soft_wrap=True)
-        text = written_schema(panel.columns, opened.schema.cut)
+        for description in data_set.parts().values():
+            OUT.print(description, markup=False, soft_wrap=True)
+        text = written_schema(panel.columns, data_set.schema.cut)
         if out is None:
             if schema_beside(path) == (None, None):
-                beside = Path(path).with_suffix(".toml")
-                OUT.print(f"schema to correct and keep as {beside} (--out {beside} writes it):\n", markup=False)
+                schema_path = Path(path).with_suffix(".toml")
+                OUT.print(f"schema to edit and save as {schema_path} (--out {schema_path} writes it):\n", markup=False)
             OUT.print(text, markup=False, highlight=False)
         else:
             with files.atomic_write(out) as file:
                 file.write(text.encode())
-            ERROR.print(f"wrote {out}: correct it, and `dvae fit METHOD --data {path} --out RUN` reads it")
+            ERROR.print(f"wrote {out}: edit it; `dvae fit METHOD --data {path} --out RUN` reads it")

@@ -13,9 +13,9 @@ from .windows import NAMED, PanelWindows
 
 
 def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> PanelWindows:
-    """Return one window for each sequence, whose future follows the last row with a target.
+    """Return one window for each sequence; its future follows the last row with a target.
 
-    Later rows contain covariates that are known in the future, with empty targets.
+    Later rows contain known covariates of the future and empty targets.
 
     Args:
         panel: the sequences.
@@ -23,7 +23,7 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
         horizon: steps of the future; by default those of the schema.
 
     Raises:
-        ValueError: if sequences are not cut, or no sequence is long enough with covariates for its future.
+        ValueError: if sequences are not cut into windows, or none is long enough and has the covariates of its future.
 
     Warns:
         UserWarning: if some sequences have no window; the message names them and the reason.
@@ -31,36 +31,39 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
     observed, steps = schema.cut.observed, horizon or schema.cut.horizon
     if observed is None or steps is None:
         raise ValueError("whole sequences have no horizon; fit with observed and horizon steps to forecast")
-    known = schema.columns.of("known")
+    known_columns = schema.columns.of("known")
     calendar, trained = panel.calendar, schema.calendar
     if calendar.kind == trained.kind:  # these sequences may be too short to infer a step
         calendar = replace(calendar, step=calendar.step or trained.step, gap=calendar.gap or trained.gap)
-    found, without = [], []  # with the complete past, for the last values of covariates
-    for one in panel:
-        present = panel.present(one)
-        if present < observed:
-            without.append(
-                f"sequence {one.name!r} has {present} steps up to its last target, and {observed} are to be observed"
+    sequences, reasons = [], []  # with the complete past, for the last values of covariates
+    for sequence in panel:
+        n_present = panel.present(sequence)
+        if n_present < observed:
+            reasons.append(
+                f"sequence {sequence.name!r} has {n_present} steps up to its last target; a forecast "
+                f"observes {observed}"
             )
             continue
-        future = one.values[present : present + steps]
-        missing = [c.name for c in known if np.isnan(future[:, schema.places[c.name]]).any() or len(future) < steps]
+        future = sequence.values[n_present : n_present + steps]
+        missing = [
+            c.name for c in known_columns if np.isnan(future[:, schema.places[c.name]]).any() or len(future) < steps
+        ]
         if missing:
-            without.append(
+            reasons.append(
                 f"a forecast of {steps} steps needs future values of {', '.join(missing)}, but sequence "
-                f"{one.name!r} has {len(future)} rows after its last target at row {present - 1}; append rows with "
-                f"{'these' if len(missing) > 1 else 'it'} to the table, and leave their targets empty"
+                f"{sequence.name!r} has {len(future)} rows after its last target at row {n_present - 1}; append rows "
+                f"with {'these' if len(missing) > 1 else 'it'} to the table, and leave their targets empty"
             )
             continue
         if len(future) < steps:
             future = np.concatenate([future, np.full((steps - len(future), future.shape[1]), np.nan)])
-        values = np.concatenate([one.values[:present], future])
-        found.append(Series(one.name, values, one.moments(0, len(values), calendar), one.group))
-    if not found:
-        raise ValueError(without[0])
-    if without:
-        more = f"; and {len(without) - NAMED} more" if len(without) > NAMED else ""
-        names = "; ".join(without[:NAMED])
-        warnings.warn(f"{len(without)} of {len(panel)} sequences have no forecast: {names}{more}", stacklevel=3)
+        values = np.concatenate([sequence.values[:n_present], future])
+        sequences.append(Series(sequence.name, values, sequence.moments(0, len(values), calendar), sequence.group))
+    if not sequences:
+        raise ValueError(reasons[0])
+    if reasons:
+        more = f"; and {len(reasons) - NAMED} more" if len(reasons) > NAMED else ""
+        names = "; ".join(reasons[:NAMED])
+        warnings.warn(f"{len(reasons)} of {len(panel)} sequences have no forecast: {names}{more}", stacklevel=3)
     cut = replace(schema.cut, horizon=steps, split="sequence")
-    return PanelWindows(replace(panel, series=found, calendar=calendar), replace(schema, cut=cut), "last")
+    return PanelWindows(replace(panel, series=sequences, calendar=calendar), replace(schema, cut=cut), "last")

@@ -66,13 +66,15 @@ class Calendar:
 
     def stepping(self, times: Iterable[np.ndarray | None]) -> Self:
         """Return the calendar with the most common calendar step of sequences of times, and their median gap."""
-        some = [own for own in times if own is not None and len(own) > 1]
-        some = some[:: len(some) // SERIES + 1]
-        if not some:
+        sampled = [sequence for sequence in times if sequence is not None and len(sequence) > 1]
+        sampled = sampled[:: len(sampled) // SERIES + 1]
+        if not sampled:
             return self
-        found = replace(self, gap=float(np.median(np.concatenate([np.diff(own) for own in some]))))
-        steps = Counter(_step(self._local(own)) for own in some if len(own) > 2) if self.kind == "dates" else None
-        return replace(found, step=steps.most_common(1)[0][0]) if steps else found
+        calendar = replace(self, gap=float(np.median(np.concatenate([np.diff(sequence) for sequence in sampled]))))
+        if self.kind != "dates":
+            return calendar
+        steps = Counter(_step(self._local(sequence)) for sequence in sampled if len(sequence) > 2)
+        return replace(calendar, step=steps.most_common(1)[0][0]) if steps else calendar
 
     def to_pandas(self, times: np.ndarray) -> Any:
         """Return times (N,) as pandas objects: dates in their zone, or durations; numbers are unchanged."""
@@ -80,10 +82,10 @@ class Calendar:
 
         if self.kind == "numbers":
             return times
-        whole = np.rint(times * 1e6).astype(np.int64)
+        microseconds = np.rint(times * 1e6).astype(np.int64)
         if self.kind == "durations":
-            return pd.TimedeltaIndex(whole.astype("timedelta64[us]"))
-        dates = pd.DatetimeIndex(whole.astype("datetime64[us]"))
+            return pd.TimedeltaIndex(microseconds.astype("timedelta64[us]"))
+        dates = pd.DatetimeIndex(microseconds.astype("datetime64[us]"))
         return dates if self.zone is None else dates.tz_localize("UTC").tz_convert(self.zone)
 
     def text(self, time: float) -> str:
@@ -103,14 +105,15 @@ class Calendar:
 
         if self.kind == "dates" and count:
             local = self._local(times)
-            own = _step(local)
-            steps = (self.step, own) if own in (None, "1D") else (own, self.step)  # business days are days too
+            inferred = _step(local)
+            is_daily = inferred in (None, "1D")  # business days are days too
+            steps = (self.step, inferred) if is_daily else (inferred, self.step)
             for step in filter(None, steps):
                 if (following := _following(local, step, count)) is not None:
                     return self._seconds(following)
             if len(local) > 1 and _is_daily(local):  # regardless of clock changes
                 gap = (local[1:] - local[:-1]).to_series().median()
-                return self._seconds(pd.DatetimeIndex([local[-1] + gap * place for place in range(1, count + 1)]))
+                return self._seconds(pd.DatetimeIndex([local[-1] + gap * number for number in range(1, count + 1)]))
             if self.zone in (None, "UTC") and _changes_clocks(times):
                 warnings.warn(
                     f"times such as {self.text(times[0])} and {self.text(times[-1])} seem to be days of a time zone "
@@ -196,8 +199,8 @@ def _following(local: Any, step: str, count: int) -> Any:
         if (local.day != np.minimum(days, local.days_in_month)).any():
             return None
         local = local - pd.to_timedelta(local.day - 1, unit="D")
-    places = pd.date_range(local[0], local[-1], freq=step).get_indexer(local)
-    if places[0] != 0 or (places < 0).any() or (len(local) > 1 and np.median(np.diff(places)) != 1):
+    indices = pd.date_range(local[0], local[-1], freq=step).get_indexer(local)
+    if indices[0] != 0 or (indices < 0).any() or (len(local) > 1 and np.median(np.diff(indices)) != 1):
         return None
     following = pd.date_range(local[-1], periods=count + 1, freq=step)[1:]
     return (

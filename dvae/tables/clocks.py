@@ -1,4 +1,4 @@
-"""Join the columns of a table that together are one time: a date and a clock, or year, month, day and hour."""
+"""Join columns of a table to one time: a date and a time of day, or year, month, day and hour."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ _MOST = {"year": 9999, "quarter": 4, "week": 53, "month": 12, "day": 366, "hour"
 
 def is_clock(values: Any) -> bool:
     """Return whether a column contains times of day, such as 13:05."""
-    known = values.dropna()
+    cells = values.dropna()
     if values.dtype.kind != "O":
         return False
-    return bool(len(known)) and all(CLOCK.fullmatch(str(each).strip()) for each in known.unique())
+    return bool(len(cells)) and all(CLOCK.fullmatch(str(cell).strip()) for cell in cells.unique())
 
 
 def unit_of(name: str, values: Any) -> str | None:
@@ -78,12 +78,12 @@ def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None)
     if isinstance(time, tuple):
         return join_times(frame, time)
     column = frame[time]
-    read = read_numbers(column, (), decimal, column.attrs.get("decimal"))
-    if is_number(column) or not read.is_numeric:
+    numbers = read_numbers(column, (), decimal, column.attrs.get("decimal"))
+    if is_number(column) or not numbers.is_numeric:
         return column
-    if read.ambiguous:
-        read.check(column, "")
-    return type(column)(read.values, column.index, name=time)
+    if numbers.ambiguous:
+        numbers.check(column, "")
+    return type(column)(numbers.values, column.index, name=time)
 
 
 def join_times(frame: Any, names: tuple[str, ...]) -> Any:
@@ -103,24 +103,27 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
 
     label, first = " ".join(names), read_numbers(frame[names[0]])
     if len(names) > 6:
-        raise ValueError(f"{label} are {len(names)} columns of one time; expected at most year, month, …, second")
-    when = compact(first.values) if first.is_numeric else dates(frame[names[0]])
-    if when is not None:
+        raise ValueError(
+            f"{label} are {len(names)} columns of one time; expected year, month, day, hour, minute, second"
+        )
+    timestamps = compact(first.values) if first.is_numeric else dates(frame[names[0]])
+    if timestamps is not None:
         if len(names) > 4:
             raise ValueError(
-                f"{label} are a date and {len(names) - 1} columns; expected a clock, or hour, minute, second"
+                f"{label} are a date and {len(names) - 1} columns; expected a time of day, or hour, minute, second"
             )
-        when = when.set_axis(frame.index)
+        timestamps = timestamps.set_axis(frame.index)
         for name, unit in zip(names[1:], ("hour", "minute", "second"), strict=False):
-            when = when + pd.to_timedelta(_part(frame[name], unit), unit="s")
-        return when.rename(label)
+            timestamps = timestamps + pd.to_timedelta(_part(frame[name], unit), unit="s")
+        return timestamps.rename(label)
     order = iter(unit for unit in UNITS if unit not in ("quarter", "week"))
     units = [unit_of(name, frame[name]) for name in names]
     if None in units or len(set(units)) < len(units):
         units = [next(order) for _ in names]
-    if gap := [fine for coarse, fine in pairwise(SECONDS) if fine in units and coarse not in units]:
+    if skipped := [fine for coarse, fine in pairwise(SECONDS) if fine in units and coarse not in units]:
         raise ValueError(
-            f"{label} have a {gap[0]} and no larger unit before it; name the columns from the year or day on"
+            f"{label} have a {skipped[0]} without the next larger unit; name a column for each unit, "
+            "from the year or day on"
         )
     parts = {str(unit): _part(frame[name], str(unit)) for unit, name in zip(units, names, strict=True)}
     seconds = sum(
@@ -156,24 +159,24 @@ def _part(column: Any, unit: str) -> Any:
         return column.dt.total_seconds().to_numpy(np.float64)
     if unit == "hour" and is_clock(column):
         fields = column.astype(str).str.strip().str.extract(f"^{CLOCK.pattern}$", flags=CLOCK.flags)
-        hour, minute, second = (fields[place].astype(np.float64).fillna(0).to_numpy() for place in range(3))
+        hour, minute, second = (fields[number].astype(np.float64).fillna(0).to_numpy() for number in range(3))
         half = fields[3].str.lower()
         hour = np.where(half.notna(), hour % 12 + np.where(half == "p", 12, 0), hour)
         return np.where(column.notna(), 3600 * hour + 60 * minute + second, np.nan)
     texts = column.astype(str).str.strip().str.lower()
     if unit == "month" and texts.str[:3].isin(MONTHS).all():
-        return texts.str[:3].map({name: place for place, name in enumerate(MONTHS, 1)}).to_numpy(np.float64)
+        return texts.str[:3].map({name: number for number, name in enumerate(MONTHS, 1)}).to_numpy(np.float64)
     if unit == "quarter" and texts.str.fullmatch(r"q[1-4]").all():
         return texts.str[1:].to_numpy(np.float64)
-    read = read_numbers(column)
-    read.check(column, f"or write {unit}s as whole numbers")
-    values = read.values
+    numbers = read_numbers(column)
+    numbers.check(column, f"or write {unit}s as whole numbers")
+    values = numbers.values
     least, most = {"year": 1000, "hour": 0, "minute": 0, "second": 0}.get(unit, 1), _MOST[unit]
     if unit == "hour" and values.max() > 99 and (values % 100 < 60).all():  # 1330 is 13:30
         values = np.floor(values / 100) + values % 100 / 60
-    wrong = ~((values >= least) & (values <= most) & ((values % 1 == 0) | (unit in ("hour", "second"))))
-    if wrong.any():
-        row = int(np.argmax(wrong))
+    invalid = ~((values >= least) & (values <= most) & ((values % 1 == 0) | (unit in ("hour", "second"))))
+    if invalid.any():
+        row = int(np.argmax(invalid))
         cell = str(column.iloc[row])[:40]
         raise ValueError(f"row {row} of column {column.name!r} is {cell}; expected {unit}s from {least} to {most}")
     return values * (SECONDS[unit] if least == 0 else 1)

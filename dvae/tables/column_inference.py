@@ -1,4 +1,4 @@
-"""Proposals: guesses of each column's type and role, as a schema that you can edit."""
+"""Guess each column's type and role, as a schema that you can edit."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ PART_OF_TIME = re.compile(r"\d{1,3}:\d\d([:.]\d+)*\s?([ap]\.?m\.?)?", re.IGNOREC
 QUANTITY = re.compile(r"([^\w\s.,+-]{0,3})\s?[-+−]?[.,]?\d[\d.,'’\s]*([^\d\s]\D{0,11})?")
 """A number, optionally with a unit before or after it."""
 NUMBERED = 5
-"""Minimum number of columns, named alike with a number, that suggest a table with one column per step."""
+"""Minimum number of numbered columns, such as x1 to x5, that suggest a table with one column per step."""
 DATED_NAME = re.compile(
     r"\d{4}([-/.]\d{1,2}){0,2}([T ]\d.*)?|\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{4}[-_ ]?[QM]\d{1,2}|"
     rf"({'|'.join(MONTHS)})[a-z]*[-/ .]?\d{{2,4}}",
@@ -102,43 +102,43 @@ class ColumnHints:
         levels, frame = [name for name, _ in index_levels(frame)], tabular(frame)
         if not len(frame):
             raise ValueError("the table has no rows")
-        known = list(frame.columns)
+        available = list(frame.columns)
         roles: dict[str, tuple[Role, str]] = {}
-        said: dict[Role, tuple[str, ...]]
-        said = {"target": self.columns, "known": self.covariates, "past": self.past, "static": self.static}
-        for role, own_words in said.items():
-            for word in own_words:
-                name = word if word in known else word.partition(":")[0]
+        entries_by_role: dict[Role, tuple[str, ...]]
+        entries_by_role = {"target": self.columns, "known": self.covariates, "past": self.past, "static": self.static}
+        for role, entries in entries_by_role.items():
+            for entry in entries:
+                name = entry if entry in available else entry.partition(":")[0]
                 if name in roles:
                     raise ValueError(f"column {name!r} is named twice")
-                roles[name] = (role, word[len(name) + 1 :])
+                roles[name] = (role, entry[len(name) + 1 :])
         times = (self.time,) if isinstance(self.time, str) else tuple(self.time or ())
-        aside = (*self.id, *times, *filter(None, (self.group, self.split)))
-        for name in (*roles, *aside):
-            if name not in known:
-                raise ValueError(f"no column {name!r}{nearest(name, known)}; there are {', '.join(known[:20])}")
+        key_columns = (*self.id, *times, *filter(None, (self.group, self.split)))
+        for name in (*roles, *key_columns):
+            if name not in available:
+                raise ValueError(f"no column {name!r}{nearest(name, available)}; there are {', '.join(available[:20])}")
         families = {name: words.partition(":")[0] for name, (_, words) in roles.items()}
-        found = _Inference(self, frame, levels, times, aside, families)
-        own = {name: column for name, column in found.columns.items() if name not in aside}
-        names = list(roles) if self.columns else [*(name for name in own if name not in roles), *roles]
+        inference = _Inference(self, frame, levels, times, key_columns, families)
+        guesses = {name: column for name, column in inference.columns.items() if name not in key_columns}
+        names = list(roles) if self.columns else [*(name for name in guesses if name not in roles), *roles]
         columns = []
         for name in names:
-            role, words = roles.get(name, (own[name].role, "")) if name in own else roles[name]
+            role, words = roles.get(name, (guesses[name].role, "")) if name in guesses else roles[name]
             family, _, unit = words.partition(":")
-            columns.append(_told(name, role, family, unit, frame[name], own.get(name), self.na_values))
+            columns.append(_given_column(name, role, family, unit, frame[name], guesses.get(name), self.na_values))
         if not any(column.role == "target" for column in columns):
             static = ", ".join(
                 column.name for column in columns if column.role == "static" and column.name not in roles
             )
-            reason = f"; constant in each sequence are {static}" if static else ""
-            given = ", ".join(names[:20]) or "none"
-            raise ValueError(f"no column is a target; given are {given}{reason}; name those to model (--columns)")
+            reason = f"; constant within each sequence: {static}" if static else ""
+            candidates = ", ".join(names[:20]) or "none"
+            raise ValueError(f"no column is a target among {candidates}{reason}; name the columns to model (--columns)")
         numbers = [column for column in columns if column.family != "category"]
-        marks = [mark for column in numbers for mark in found.numbers[column.name].marks]
+        marks = [mark for column in numbers for mark in inference.numbers[column.name].marks]
         schema = Columns(
             tuple(columns),
-            found.id,
-            found.time,
+            inference.id,
+            inference.time,
             self.group,
             self.split,
             self.zone,
@@ -146,20 +146,20 @@ class ColumnHints:
             self.decimal,
         )
         for column in numbers:
-            if own_marks := found.numbers[column.name].marks:
-                warnings.warn(f"column {column.name!r} {said_of_marks(own_marks)}", stacklevel=3)
+            if column_marks := inference.numbers[column.name].marks:
+                warnings.warn(f"column {column.name!r} {said_of_marks(column_marks)}", stacklevel=3)
         for name in (column.name for column in numbers if column.role == "target" and column.name in roles):
-            if found.is_constant(name):
+            if inference.is_constant(name):
                 warnings.warn(
                     f"column {name!r} is constant, {_first(frame[name])}, but was named as a target; its forecasts are "
-                    "trivial, and scores over all columns count it",
+                    "trivial, and scores over all columns include it",
                     stacklevel=3,
                 )
-        found.warn(schema, all_named=not self.columns)
+        inference.warn(schema, all_named=not self.columns)
         return schema
 
 
-def _told(
+def _given_column(
     name: str, role: Role, family: str, unit: str, values: Any, guess: Column | None, na_values: Collection[str]
 ) -> Column:
     """Return a column with a given role, and possibly a given family and unit."""
@@ -180,13 +180,12 @@ def infer_columns(frame: Any) -> Columns:
 
     - Time: the first column with dates or with the name of a time. A date and a clock, or year, month, day and hour,
       are joined if one column alone leaves several rows at the same time.
-    - Ids: repeated texts, and integers with the name of an id, if with them no two rows of a sequence have the same
-      time.
+    - Ids: repeated texts, and integers with the name of an id, if they distinguish rows with the same time.
     - Static: columns that are constant within each of several sequences.
     - Targets: all other columns. Integers from 0 are counts, two values are binary, few texts are a category, and
       numbers above 0 whose standard deviation exceeds half their mean are positive.
 
-    A warning names the remaining columns, such as constant ones, which are omitted.
+    The remaining columns, such as constant ones, are omitted, and a warning names them.
 
     Args:
         frame: table.
@@ -198,60 +197,62 @@ def infer_columns(frame: Any) -> Columns:
 
 
 class _Inference:
-    """The inferred id, time and column families of a frame, without those that are given.
+    """Inference of the id, time and column families of a frame that the user does not give.
 
     Args:
-        told: roles given by the user.
+        hints: roles given by the user.
         frame: table in the long form.
         levels: names of columns that are levels of its index.
         times: columns of the time, if given.
-        aside: columns with a given role other than data.
+        key_columns: columns of the given id, time, group and split.
         families: given columns with their family, "" if none is given.
     """
 
     def __init__(
         self,
-        told: ColumnHints,
+        hints: ColumnHints,
         frame: Any,
         levels: list[str],
         times: tuple[str, ...],
-        aside: tuple[str, ...],
+        key_columns: tuple[str, ...],
         families: Mapping[str, str],
     ):
         self.frame, self.index, self.levels = frame, levels, levels if len(levels) > 1 else []
-        self.na_values, hint = told.na_values, frame.attrs.get("decimal")
-        self.numbers = {name: read_numbers(frame[name], told.na_values, told.decimal, hint) for name in frame}
+        self.na_values, hint = hints.na_values, frame.attrs.get("decimal")
+        self.numbers = {name: read_numbers(frame[name], hints.na_values, hints.decimal, hint) for name in frame}
         numerals = {
-            name: read.values
-            for name, read in self.numbers.items()
-            if read.is_numeric and not is_number(frame[name]) and not self._holds_codes(name)
+            name: parsed.values
+            for name, parsed in self.numbers.items()
+            if parsed.is_numeric and not is_number(frame[name]) and not self._holds_codes(name)
         }
         self.plain = frame.assign(**numerals)
         """The frame with numeric texts converted to numbers."""
         self.undecided: dict[str, str] = {}
         """Columns that could be the time, but with ambiguous dates, and a description of their content."""
-        if not told.columns:
-            self._refuse_layout(aside)
-        free = [name for name in frame if name not in families and name not in aside and not self._numbers_rows(name)]
-        free += [name for name in self.levels if name not in free and name not in aside]
-        self.id: tuple[str, ...] = told.id
+        if not hints.columns:
+            self._refuse_layout(key_columns)
+        unassigned = [
+            name for name in frame if name not in families and name not in key_columns and not self._numbers_rows(name)
+        ]
+        unassigned += [name for name in self.levels if name not in unassigned and name not in key_columns]
+        self.id: tuple[str, ...] = hints.id
         self.time = times
-        self._find_id_and_time(free)
-        taken = {*aside, *self.id, *self.time, *self.undecided}
+        self._find_id_and_time(unassigned)
+        assigned = {*key_columns, *self.id, *self.time, *self.undecided}
         if not self.id:  # a panel of one sequence
-            named = (name for name in free if name not in taken and IDS.search(name.lower()))
-            self.id = tuple(name for name in named if frame[name].nunique(dropna=False) == 1)
-        taken = ({*taken, *self.id} | {*self.levels}) - {*families}
-        wanted = (name for name in frame if name in families or (name in free and not told.columns))
-        found = (self._column(name, families.get(name, "")) for name in wanted if name not in taken)
-        columns = {column.name: column for column in found if column is not None}
+            id_like = (name for name in unassigned if name not in assigned and IDS.search(name.lower()))
+            self.id = tuple(name for name in id_like if frame[name].nunique(dropna=False) == 1)
+        assigned = ({*assigned, *self.id} | {*self.levels}) - {*families}
+        candidates = (name for name in frame if name in families or (name in unassigned and not hints.columns))
+        guesses = (self._column(name, families.get(name, "")) for name in candidates if name not in assigned)
+        columns = {column.name: column for column in guesses if column is not None}
         if (
             columns
             and self.id
             and len(groups := self.plain.groupby(self._keys(self.id), observed=True, dropna=False)) > 1
         ):
             changing = groups[[*columns]].nunique().max() > 1
-            columns = {name: each if changing[name] else _static(each) for name, each in columns.items()}
+            columns = {name: guess if changing[name] else _static(guess) for name, guess in columns.items()}
         if not columns and not families:
             reasons = ", ".join(f"{name!r} ({self.reason(name)})" for name in [*frame][:20])
             single = "; separators are , ; tab and |, others are named by a first line such as sep=:"
@@ -265,77 +266,79 @@ class _Inference:
             return True
         return not TIMES.search(name.lower()) and bool(texts(values).str.fullmatch(r"0\d+").any())
 
-    def _find_id_and_time(self, free: list[str]) -> None:
+    def _find_id_and_time(self, unassigned: list[str]) -> None:
         """Choose the time with the fewest rows of a sequence at the same time; the first one among equals."""
-        found = []
-        for time in [self.time] if self.time else self._times(free):
+        candidates = []
+        for time in [self.time] if self.time else self._times(unassigned):
             try:
                 step = join_times(self.frame, time) if len(time) > 1 else self.plain[time[0]]
             except ValueError:
                 if self.time:
                     raise
                 continue
-            id, twice = self._find_id(free, time, step)
-            found.append((twice, id, time))
-            if not twice:
+            id, n_repeated = self._find_id(unassigned, time, step)
+            candidates.append((n_repeated, id, time))
+            if not n_repeated:
                 break
-        if found:
-            _, self.id, self.time = min(found, key=lambda each: each[0])
+        if candidates:
+            _, self.id, self.time = min(candidates, key=lambda candidate: candidate[0])
         elif self.undecided:  # ambiguous dates still distinguish rows
-            self.id, _ = self._find_id(free, (*self.undecided,), self.frame[next(iter(self.undecided))])
+            self.id, _ = self._find_id(unassigned, (*self.undecided,), self.frame[next(iter(self.undecided))])
         elif not self.id:
-            self.id = tuple(self.levels) or self._ids_in_runs(free)
+            self.id = tuple(self.levels) or self._ids_in_runs(unassigned)
 
-    def _times(self, free: list[str]) -> list[tuple[str, ...]]:
+    def _times(self, unassigned: list[str]) -> list[tuple[str, ...]]:
         """Return columns that may be the time, the most likely first."""
         frame = self.frame
-        clocks = [name for name in free if is_clock(frame[name])]
-        dated = [name for name in free if name not in clocks and (self._is_time(name) or self._is_compact(name))]
-        dated.sort(key=lambda name: name not in self.levels)
-        rest = [name for name in free if name not in self.undecided]
-        numbers = [name for name in rest if is_number(self.plain[name])]
-        if dated:
-            hours = {unit_of(name, frame[name]): name for name in reversed(rest) if name != dated[0]}
-            fine = clocks[:1] or [hours[unit] for unit in ("hour", "minute", "second") if unit in hours]
-            return [(dated[0],), *([(dated[0], *fine)] if fine else [])]
-        spans = [] if self.undecided else [name for name in (*self.levels, *rest) if is_duration(frame[name])]
+        clocks = [name for name in unassigned if is_clock(frame[name])]
+        date_columns = [
+            name for name in unassigned if name not in clocks and (self._is_time(name) or self._is_compact(name))
+        ]
+        date_columns.sort(key=lambda name: name not in self.levels)
+        remaining = [name for name in unassigned if name not in self.undecided]
+        numbers = [name for name in remaining if is_number(self.plain[name])]
+        if date_columns:
+            units = {unit_of(name, frame[name]): name for name in reversed(remaining) if name != date_columns[0]}
+            fine = clocks[:1] or [units[unit] for unit in ("hour", "minute", "second") if unit in units]
+            return [(date_columns[0],), *([(date_columns[0], *fine)] if fine else [])]
+        spans = [] if self.undecided else [name for name in (*self.levels, *remaining) if is_duration(frame[name])]
         levels = [name for name in self.levels if name in numbers]
-        named = [name for name in (*levels, *numbers) if TIMES.search(name.lower())]
-        parts = parts_of(frame, [name for name in rest if name not in clocks])
+        time_like = [name for name in (*levels, *numbers) if TIMES.search(name.lower())]
+        parts = parts_of(frame, [name for name in remaining if name not in clocks])
         joint = [parts] if len(parts) > 1 else []
-        return [*joint, *((name,) for name in dict.fromkeys((*spans, *named, *levels[-1:])))]
+        return [*joint, *((name,) for name in dict.fromkeys((*spans, *time_like, *levels[-1:])))]
 
-    def _find_id(self, free: list[str], time: tuple[str, ...], step: Any) -> tuple[tuple[str, ...], int]:
+    def _find_id(self, unassigned: list[str], time: tuple[str, ...], step: Any) -> tuple[tuple[str, ...], int]:
         """Return the columns that identify sequences, and the number of rows that repeat a time within a sequence."""
         steps = step.to_numpy()
         rows = self.frame.assign(**{" step": steps})
 
-        def twice(ids: Collection[str]) -> int:
+        def count_repeated(ids: Collection[str]) -> int:
             return int(rows.duplicated([*ids, " step"]).sum())
 
         if self.id:
-            return self.id, twice(self.id)
+            return self.id, count_repeated(self.id)
         others = [name for name in self.levels if name not in time]
         if others:
             if len(others) > 1 and others[-1].startswith("level_") and is_number(self.plain[others[-1]]):
-                others = others[:-1] if not twice(others[:-1]) else others
-            return tuple(others), twice(others)
-        left = [name for name in free if name not in time and name not in self.undecided]
-        if not twice(()):
-            return self._ids_in_runs(left), 0
-        named = [name for name in left if self._is_named_id(name) and is_number(self.plain[name])]
+                others = others[:-1] if not count_repeated(others[:-1]) else others
+            return tuple(others), count_repeated(others)
+        remaining = [name for name in unassigned if name not in time and name not in self.undecided]
+        if not count_repeated(()):
+            return self._ids_in_runs(remaining), 0
+        id_like = [name for name in remaining if self._is_named_id(name) and is_number(self.plain[name])]
         ids: list[str] = []
-        for name in (*named, *(name for name in left if self._may_be_id(name))):
-            if not (before := twice(ids)):
+        for name in (*id_like, *(name for name in remaining if self._may_be_id(name))):
+            if not (n_before := count_repeated(ids)):
                 break
-            if twice([*ids, name]) < before:
+            if count_repeated([*ids, name]) < n_before:
                 ids.append(name)
         for name in tuple(ids):  # drops ids that a later one makes redundant
             fewer = [other for other in ids if other != name]
-            ids = ids if twice(fewer) else fewer
+            ids = ids if count_repeated(fewer) else fewer
         if not all(map(self._is_named_id, ids)) and not self._in_runs(ids) and self._coverage(ids, steps) < COVERAGE:
-            return (), twice(())
-        return tuple(ids), twice(ids)
+            return (), count_repeated(())
+        return tuple(ids), count_repeated(ids)
 
     def _keys(self, ids: Collection[str]) -> list[Any]:
         """Return the original id columns, as keys for grouping."""
@@ -344,8 +347,8 @@ class _Inference:
     def _is_named_id(self, name: str) -> bool:
         """Return whether a column contains integers or texts and has the name of an id."""
         values = self.plain[name]
-        named = IDS.search(name.lower()) is not None or name in self.index
-        return named and (not is_number(values) or _is_whole(values))
+        is_named = IDS.search(name.lower()) is not None or name in self.index
+        return is_named and (not is_number(values) or _is_whole(values))
 
     def _may_be_id(self, name: str) -> bool:
         """Return whether a column contains repeated texts, or codes such as 007, and no parts of a time."""
@@ -353,7 +356,7 @@ class _Inference:
         different = values.dropna().unique()
         if is_number(self.plain[name]) or len(different) == len(values):
             return False
-        if all(PERIOD.fullmatch(str(each).strip()) for each in different):
+        if all(PERIOD.fullmatch(str(value).strip()) for value in different):
             return False
         return IDS.search(name.lower()) is not None or not (TIMES.search(name.lower()) or is_clock(values))
 
@@ -386,21 +389,21 @@ class _Inference:
             cells = self.frame[name]
             if 2 * (~np.isnan(self.numbers[name].values)).sum() >= cells.count():
                 return False
-            known = (cells.notna() & texts(cells).str.contains(DATE, na=False)).to_numpy(bool, copy=True)
-            if known.sum() < NEARLY_ALL * cells.count():
+            date_mask = (cells.notna() & texts(cells).str.contains(DATE, na=False)).to_numpy(bool, copy=True)
+            if date_mask.sum() < NEARLY_ALL * cells.count():
                 return False
             try:
-                dates(cells[known])
+                dates(cells[date_mask])
             except UnparsedDates as error:
-                known[known] = ~error.wrong
+                date_mask[date_mask] = ~error.wrong
             except AmbiguousDates:
                 raise
             except (TypeError, ValueError):
                 return False
-            if NEARLY_ALL * cells.count() <= known.sum() < cells.count():
-                row = int(np.argmax(cells.notna().to_numpy() & ~known))
+            if NEARLY_ALL * cells.count() <= date_mask.sum() < cells.count():
+                row = int(np.argmax(cells.notna().to_numpy() & ~date_mask))
                 raise ValueError(
-                    f"column {name!r}: {known.sum()} of {cells.count()} values are dates; row {row} is "
+                    f"column {name!r}: {date_mask.sum()} of {cells.count()} values are dates; row {row} is "
                     f"{brief(cells.iloc[row])}; correct it, or leave the row out"
                 )
         except AmbiguousDates as error:
@@ -423,37 +426,38 @@ class _Inference:
             return False
         return bool((np.diff(values.to_numpy(np.float64, na_value=np.nan)) == 1).all())
 
-    def _refuse_layout(self, aside: Collection[str]) -> None:
+    def _refuse_layout(self, key_columns: Collection[str]) -> None:
         """Raise an error for a table with dates as column names, or with several header rows."""
-        names = [name for name in self.frame if name not in aside]
-        dated = [name for name in names if DATED_NAME.fullmatch(name) and is_number(self.plain[name])]
-        if len(dated) > 2 and 2 * len(dated) >= len(names):
-            rest = [name for name in self.frame if name not in dated]
+        names = [name for name in self.frame if name not in key_columns]
+        date_columns = [name for name in names if DATED_NAME.fullmatch(name) and is_number(self.plain[name])]
+        if len(date_columns) > 2 and 2 * len(date_columns) >= len(names):
+            others = [name for name in self.frame if name not in date_columns]
             raise ValueError(
-                f"{len(dated)} columns are named by dates, {dated[0]!r} to {dated[-1]!r}, so each row is a sequence; "
-                f"write a row for each step, as frame.melt({rest}, var_name='time', value_name='value') does"
+                f"{len(date_columns)} columns are named by dates, {date_columns[0]!r} to {date_columns[-1]!r}, so each "
+                f"row is a sequence; write a row for each step, as frame.melt({others}, var_name='time', "
+                "value_name='value') does"
             )
-        firsts, odd = [len(self.frame)], False
-        for read in (self.numbers[name] for name in names):
-            if (known := ~np.isnan(read.values)).any():
-                firsts.append(int(np.argmax(known)))
-                odd |= bool(read.wrong[: firsts[-1]].any())
+        firsts, has_text = [len(self.frame)], False
+        for parsed in (self.numbers[name] for name in names):
+            if (valid := ~np.isnan(parsed.values)).any():
+                firsts.append(int(np.argmax(valid)))
+                has_text |= bool(parsed.wrong[: firsts[-1]].any())
         count, top = min(firsts), self.frame.iloc[: min(*firsts, MOST_HEADERS)][names].astype(object)
         if (
-            odd
+            has_text
             and 0 < count < MOST_HEADERS
             and not any(re.match(r"\s*\d", str(cell)) for cell in top.to_numpy().ravel())
         ):
-            said = [str(value) for value in self.frame.iloc[:count].to_numpy().ravel() if value == value]
+            headers = [str(value) for value in self.frame.iloc[:count].to_numpy().ravel() if value == value]
             raise ValueError(
-                f"above the numbers are {count + 1} rows of names, also {', '.join(map(brief, said[:6]))}; "
+                f"the table has {count + 1} header rows, with texts such as {', '.join(map(brief, headers[:6]))}; "
                 "write one row of names, such as 'power MW', or read the table with pandas.read_csv("
                 f"…, header={[*range(count + 1)]}) and join them"
             )
 
     def _column(self, name: str, family: str) -> Column | None:
         """Guess the family of a column; None if it cannot be a target, such as texts that are all different."""
-        read, values = self.numbers[name], self.plain[name]
+        parsed, values = self.numbers[name], self.plain[name]
         if values.dtype.kind == "c":
             raise ValueError(
                 f"column {name!r} holds complex numbers; give their real and imaginary parts as two columns"
@@ -461,23 +465,23 @@ class _Inference:
         if family:
             return None  # the family is given
         if not is_number(values):
-            known = self.frame[name].dropna()
-            count = int((~np.isnan(read.values)).sum())
-            if not self._holds_codes(name) and count and count >= NEARLY_ALL * (count + read.wrong.sum()):
-                read.check(values, "or declare the column as an id or a category, or leave it out (--columns)")
-            classes = _classes(known, self.na_values)
+            cells = self.frame[name].dropna()
+            count = int((~np.isnan(parsed.values)).sum())
+            if not self._holds_codes(name) and count and count >= NEARLY_ALL * (count + parsed.wrong.sum()):
+                parsed.check(values, "or declare the column as an id or a category, or leave it out (--columns)")
+            classes = _classes(cells, self.na_values)
             return Column(name, family="category", classes=classes) if 2 <= len(classes) <= CLASSES else None
-        if read.ambiguous:
-            read.check(self.frame[name], "")
-        numbers = read.values[~np.isnan(read.values)]
+        if parsed.ambiguous:
+            parsed.check(self.frame[name], "")
+        numbers = parsed.values[~np.isnan(parsed.values)]
         if not len(numbers) or self.is_constant(name):
             return None
         if set(np.unique(numbers)) == {0.0, 1.0}:
             return Column(name, family="binary")
         if not (np.abs(numbers) < LARGEST).all():
             return Column(name)  # reading raises an error
-        whole = (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2
-        if whole and numbers.std() > RESOLVED * numbers.mean():
+        is_count = (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2
+        if is_count and numbers.std() > RESOLVED * numbers.mean():
             return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
         if (numbers.astype(np.float32) > 0).all() and numbers.std() > 0.5 * numbers.mean():
             return Column(name, family="positive")
@@ -485,38 +489,40 @@ class _Inference:
 
     def is_constant(self, name: str) -> bool:
         """Return whether all values except missing ones are equal, in at least two rows."""
-        read, known = self.numbers[name], self.frame[name].dropna()
-        values = known if read.wrong.any() or self._holds_codes(name) else read.values[~np.isnan(read.values)]
+        parsed, cells = self.numbers[name], self.frame[name].dropna()
+        values = cells if parsed.wrong.any() or self._holds_codes(name) else parsed.values[~np.isnan(parsed.values)]
         return len(values) > 1 and len(set(values)) == 1
 
     def reason(self, name: str) -> str:
         """Return why a column is not proposed."""
-        read, values = self.numbers[name], self.frame[name].dropna()
+        parsed, values = self.numbers[name], self.frame[name].dropna()
         if name in self.undecided:
             return f"perhaps the time: {self.undecided[name]}"
         if name in (*self.time, *self.id):
             return "the time" if name in self.time else "an id"
         if self._numbers_rows(name):
-            return "the numbers of the rows, without a name" if name == "Unnamed: 0" else "the numbers of the rows"
+            return "row numbers without a name" if name == "Unnamed: 0" else "row numbers"
         if name in self.levels:
             return "a level of the index that does not distinguish sequences"
-        if not read.wrong.any() and np.isnan(read.values).all():
+        if not parsed.wrong.any() and np.isnan(parsed.values).all():
             return "empty: all its values are missing"
         if self.is_constant(name):
             return f"constant: {_first(values)}"
-        odd = self.frame[name][read.wrong] if read.wrong.any() else values
+        unparsed = self.frame[name][parsed.wrong] if parsed.wrong.any() else values
         if values.astype(str).str.strip().str.fullmatch(PART_OF_TIME).all():
-            return f"perhaps a time, such as {_first(odd)}; write it with its date, or as a duration such as 02:30:00"
-        sign = f"; remove {unit!r}" if (unit := _unit(str(odd.iloc[0]))) else ""
-        return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(odd)}{sign}"
+            return (
+                f"perhaps a time, such as {_first(unparsed)}; write it with its date, or as a duration such as 02:30:00"
+            )
+        sign = f"; remove {unit!r}" if (unit := _unit(str(unparsed.iloc[0]))) else ""
+        return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(unparsed)}{sign}"
 
     def warn(self, columns: Columns, all_named: bool) -> None:
         """Warn of columns of the frame that the schema omits."""
-        lacking = () if columns.time else self.undecided
-        aside = [name for name in self.frame if name not in columns.needed and (all_named or name in lacking)]
-        said = [f"{name!r} ({self.reason(name)})" for name in aside]
-        if said:
-            warnings.warn(f"columns left out of the proposed schema: {', '.join(said)}", stacklevel=4)
+        ambiguous = () if columns.time else self.undecided
+        omitted = [name for name in self.frame if name not in columns.needed and (all_named or name in ambiguous)]
+        descriptions = [f"{name!r} ({self.reason(name)})" for name in omitted]
+        if descriptions:
+            warnings.warn(f"columns left out of the proposed schema: {', '.join(descriptions)}", stacklevel=4)
         for column in columns.columns:
             self._warn_of_classes(column.name)
         if all_named and not columns.time and not self.undecided:
@@ -527,7 +533,7 @@ class _Inference:
         if name not in self.columns or self._holds_codes(name):
             return
         classes = self.columns[name].classes
-        units = [unit for each in classes if (unit := _unit(each)) is not None]
+        units = [unit for label in classes if (unit := _unit(label)) is not None]
         if "" in units or len(units) > len(classes) / 2:
             signs = "".join(f", remove {unit!r}" for unit in dict.fromkeys(filter(None, units)))
             warnings.warn(
@@ -540,14 +546,14 @@ class _Inference:
     def _warn_of_steps_in_columns(self, columns: Columns) -> None:
         """Warn of a table without a time whose rows may be sequences with one column per step."""
         stems = Counter(re.sub(r"\d+$", "", name) for name in columns.names if re.search(r"\d$", name))
-        stem, count = max(stems.items(), key=lambda each: each[1], default=("", 0))
+        stem, count = max(stems.items(), key=lambda item: item[1], default=("", 0))
         labels = [name for name in self.frame if self._labels_rows(name)]
         if count >= NUMBERED and (count > len(self.frame) or labels):
             numbered = [name for name in columns.names if re.fullmatch(re.escape(stem) + r"\d+", name)]
-            rest = [name for name in self.frame if name not in numbered]
+            others = [name for name in self.frame if name not in numbered]
             warnings.warn(
                 f"no column is a time, and {count} columns, {numbered[0]!r} to {numbered[-1]!r}, are numbered; if each "
-                f"row is a sequence, write a row for each step, as frame.melt({rest}, var_name='time', "
+                f"row is a sequence, write a row for each step, as frame.melt({others}, var_name='time', "
                 "value_name='value') does",
                 stacklevel=5,
             )
@@ -572,8 +578,8 @@ def _static(column: Column) -> Column:
 
 def _unit(cell: str) -> str | None:
     """Return the unit of a number in text, "" if it has none, or None for other texts."""
-    found = QUANTITY.fullmatch(cell.strip())
-    return None if found is None else (found[1] + (found[2] or "")).strip()
+    match = QUANTITY.fullmatch(cell.strip())
+    return None if match is None else (match[1] + (match[2] or "")).strip()
 
 
 def _is_whole(values: Any) -> bool:
@@ -584,19 +590,19 @@ def is_date(values: Any) -> bool:
     """Return whether a column contains dates, or texts of them.
 
     Raises:
-        Undecided: if dates are ambiguous.
+        AmbiguousDates: if dates are ambiguous.
     """
     import pandas as pd
 
     if pd.api.types.is_datetime64_any_dtype(values) or isinstance(values.dtype, pd.PeriodDtype):
         return True
-    known = values.dropna()
-    if is_number(values) or not len(known):
+    cells = values.dropna()
+    if is_number(values) or not len(cells):
         return False
-    some = known.iloc[:: max(len(known) // 50, 1)].astype(str)
-    if not some.str.contains(DATE).all():
+    sample = cells.iloc[:: max(len(cells) // 50, 1)].astype(str)
+    if not sample.str.contains(DATE).all():
         return False
-    for part in (some, known):
+    for part in (sample, cells):
         try:
             return bool(dates(part).notna().all())
         except AmbiguousDates as error:  # other cells may resolve it

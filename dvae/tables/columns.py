@@ -74,16 +74,16 @@ class Column:
 
     def __post_init__(self) -> None:
         check(self)
-        known = FAMILIES if self.role == "target" else ("real", "category")
-        if self.family not in known:
+        families = FAMILIES if self.role == "target" else ("real", "category")
+        if self.family not in families:
             raise ValueError(
-                f"column {self.name!r} has family {self.family!r}{nearest(self.family, known)}; a {self.role} has one "
-                f"of {', '.join(known)}"
+                f"column {self.name!r} has family {self.family!r}{nearest(self.family, families)}; a {self.role} has "
+                f"one of {', '.join(families)}"
             )
         if (self.family == "category") != bool(self.classes):
             raise ValueError(
-                f"column {self.name!r} has family {self.family!r} and {len(self.classes)} classes; a category, "
-                'and no other family, has classes = ["…", "…"]'
+                f"column {self.name!r} has family {self.family!r} and {len(self.classes)} classes; a category "
+                'needs classes = ["…", "…"], and no other family has them'
             )
         if len(set(self.classes)) < len(self.classes) or len(self.classes) == 1 or len(self.classes) > MOST:
             raise ValueError(
@@ -99,7 +99,7 @@ class Column:
     @property
     def coordinates(self) -> list[str]:
         """Names of its coordinates; a category has one for each class."""
-        return [f"{self.name}={each}" for each in self.classes] or [self.name]
+        return [f"{self.name}={label}" for label in self.classes] or [self.name]
 
 
 @dataclass(frozen=True)
@@ -143,9 +143,9 @@ class Columns:
         if len(names) > MOST:
             raise ValueError(f"{len(names)} columns; at most {MOST} are read")
         if not self.targets:
-            raise ValueError(f"no column is a target; given are {', '.join(self.names[:20]) or 'none'}")
-        if twice := [name for name, count in Counter(names).items() if count > 1]:
-            raise ValueError(f"column {twice[0]!r} has two roles; every column must have one")
+            raise ValueError(f"no column is a target among {', '.join(self.names[:20]) or 'none'}")
+        if repeated := [name for name, count in Counter(names).items() if count > 1]:
+            raise ValueError(f"column {repeated[0]!r} has two roles; every column must have one")
         if self.zone is not None:
             check_zone(self.zone)
             if self.time is None:
@@ -175,20 +175,22 @@ class Columns:
         """Names of all columns that a table must have."""
         return [*self.id, *self.times, *filter(None, (self.group, self.split)), *self.names]
 
-    def but(self, name: str, **told: Any) -> Self:
+    def but(self, name: str, **changes: Any) -> Self:
         """Return the schema with one column changed, to correct a proposal.
 
         Args:
             name: name of the column.
-            **told: fields to change, such as family="count"; a new category also needs its classes.
+            **changes: fields to change, such as family="count"; a new category also needs its classes.
 
         Raises:
             ValueError: if the column does not exist or the fields do not fit together.
         """
-        own = self._known(name)
-        if told.get("family", "category") != "category":
-            told = {"classes": (), "other": "", **told}
-        return replace(self, columns=tuple(replace(each, **told) if each == own else each for each in self.columns))
+        column = self._column(name)
+        if changes.get("family", "category") != "category":
+            changes = {"classes": (), "other": "", **changes}
+        return replace(
+            self, columns=tuple(replace(other, **changes) if other == column else other for other in self.columns)
+        )
 
     def without(self, *names: str) -> Self:
         """Return the schema without some columns.
@@ -196,10 +198,10 @@ class Columns:
         Raises:
             ValueError: if a column does not exist or no target remains.
         """
-        aside = [self._known(name) for name in names]
-        return replace(self, columns=tuple(each for each in self.columns if each not in aside))
+        omitted = [self._column(name) for name in names]
+        return replace(self, columns=tuple(column for column in self.columns if column not in omitted))
 
-    def _known(self, name: str) -> Column:
+    def _column(self, name: str) -> Column:
         """Return a column by name."""
         if name not in self.names:
             raise ValueError(f"no column {name!r}{nearest(name, self.names)}; there are {', '.join(self.names[:20])}")
@@ -208,16 +210,16 @@ class Columns:
     def config(self) -> dict[str, Any]:
         """Return the schema as JSON types, for `from_config`."""
         time = list(self.time) if isinstance(self.time, tuple) else self.time
-        found: dict[str, Any] = {"id": list(self.id), "time": time, "group": self.group, "split": self.split}
+        entries: dict[str, Any] = {"id": list(self.id), "time": time, "group": self.group, "split": self.split}
         # fingerprints of windows hash these entries: default values stay out
-        found |= {name: value for name in ("zone", "decimal") if (value := getattr(self, name))}
-        found |= {"na_values": list(self.na_values)} if self.na_values else {}
+        entries |= {name: value for name in ("zone", "decimal") if (value := getattr(self, name))}
+        entries |= {"na_values": list(self.na_values)} if self.na_values else {}
         columns = {}
         for column in self.columns:
-            own = {entry.name: getattr(column, entry.name) for entry in fields(Column) if entry.name != "name"}
-            own |= {"other": column.other} if own.pop("other") else {}
-            columns[column.name] = {**own, "classes": list(column.classes)}
-        return {**found, "columns": columns}
+            values = {entry.name: getattr(column, entry.name) for entry in fields(Column) if entry.name != "name"}
+            values |= {"other": column.other} if values.pop("other") else {}
+            columns[column.name] = {**values, "classes": list(column.classes)}
+        return {**entries, "columns": columns}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -226,33 +228,33 @@ class Columns:
         Raises:
             ValueError: if an entry is unknown; the message names the nearest known one.
         """
-        rest = {**config}
-        columns = rest.pop("columns", {})
+        entries = {**config}
+        columns = entries.pop("columns", {})
         if not isinstance(columns, Mapping):
             raise ValueError(f"columns is {brief(columns)}; expected a table for each column, such as [columns.riders]")
-        found = []
-        for name, told in columns.items():
-            if not isinstance(told, Mapping):
-                raise ValueError(f"column {name!r} is {brief(told)}; expected a table, [columns.{name}]")
-            _refuse_others(told, (entry.name for entry in fields(Column)[1:]), f"column {name!r}")
-            found.append(Column(name, **tuples(told)))
-        return cls(tuple(found), **layout(rest))
+        schema_columns = []
+        for name, description in columns.items():
+            if not isinstance(description, Mapping):
+                raise ValueError(f"column {name!r} is {brief(description)}; expected a table, [columns.{name}]")
+            _refuse_others(description, (entry.name for entry in fields(Column)[1:]), f"column {name!r}")
+            schema_columns.append(Column(name, **tuples(description)))
+        return cls(tuple(schema_columns), **layout(entries))
 
     def to_toml(self) -> str:
         """Return the schema as an editable TOML file."""
         lines = [
-            f"{name} = {_quoted(value) if isinstance(value, str) else _listed(value)}"
+            f"{name} = {_quote(value) if isinstance(value, str) else _quote_all(value)}"
             for name in ("id", "time", "zone", "group", "split", "na_values", "decimal")
             if (value := getattr(self, name))
         ]
         for column in self.columns:
             bare = re.fullmatch(r"[A-Za-z0-9_-]+", column.name)
-            lines += ["", f"[columns.{column.name if bare else _quoted(column.name)}]"]
+            lines += ["", f"[columns.{column.name if bare else _quote(column.name)}]"]
             lines += [f'role = "{column.role}"'] if column.role != "target" else []
             lines += [f'family = "{column.family}"']
-            lines += [f"unit = {_quoted(column.unit)}"] if column.unit else []
-            lines += [f"classes = {_listed(column.classes)}"] if column.classes else []
-            lines += [f"other = {_quoted(column.other)}"] if column.other else []
+            lines += [f"unit = {_quote(column.unit)}"] if column.unit else []
+            lines += [f"classes = {_quote_all(column.classes)}"] if column.classes else []
+            lines += [f"other = {_quote(column.other)}"] if column.other else []
         return "\n".join(lines).strip() + "\n"
 
     @classmethod
@@ -276,45 +278,46 @@ def parsed(text: str) -> dict[str, Any]:
             raise RecursionError
         return tomllib.loads(text)
     except RecursionError:
-        raise ValueError("it has nested tables, deeper than any schema") from None
+        raise ValueError("its tables are nested too deeply") from None
 
 
 def layout(told: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a schema about the whole table, with their types checked.
+    """Check and return the entries of a schema that describe the whole table.
 
     Raises:
         ValueError: if an entry is unknown or has another type.
     """
-    _refuse_others(told, (each.name for each in fields(Columns)), "the schema")
-    found: dict[str, Any] = {}
+    _refuse_others(told, (item.name for item in fields(Columns)), "the schema")
+    entries: dict[str, Any] = {}
     for name, value in told.items():
         many = isinstance(value, list | tuple)
-        listed = tuple(value) if many else (value,)
+        items = tuple(value) if many else (value,)
         if (name in ("id", "time", "na_values") and many) or name in ("id", "na_values"):
-            if not all(isinstance(each, str) for each in listed):
-                what = 'texts, such as ["?"]' if name == "na_values" else "names of columns"
-                raise ValueError(f"{name} is {brief(value)}; expected {what}")
-            found[name] = listed
+            if not all(isinstance(item, str) for item in items):
+                expected = 'texts, such as ["?"]' if name == "na_values" else "names of columns"
+                raise ValueError(f"{name} is {brief(value)}; expected {expected}")
+            entries[name] = items
         elif isinstance(value, str | None):
-            found[name] = value
+            entries[name] = value
         else:
-            what = {"zone": "a time zone", "decimal": '"." or ","'}.get(name, "the name of a column")
-            raise ValueError(f"{name} is {brief(value)}; expected {what}")
-    return found
+            expected = {"zone": "a time zone", "decimal": '"." or ","'}.get(name, "the name of a column")
+            raise ValueError(f"{name} is {brief(value)}; expected {expected}")
+    return entries
 
 
-def _refuse_others(given: Mapping[str, Any], known: Iterable[str], who: str) -> None:
-    names: Sequence[str] = list(known)
-    for name in given:
+def _refuse_others(entries: Mapping[str, Any], allowed: Iterable[str], owner: str) -> None:
+    names: Sequence[str] = list(allowed)
+    for name in entries:
         if name not in names:
-            raise ValueError(f"{who} has an entry {name!r}{nearest(name, names)}; known are {', '.join(names)}")
+            raise ValueError(f"{owner} has an entry {name!r}{nearest(name, names)}; known entries: {', '.join(names)}")
 
 
-def _listed(words: Iterable[str]) -> str:
-    return f"[{', '.join(map(_quoted, words))}]"
+def _quote_all(words: Iterable[str]) -> str:
+    return f"[{', '.join(map(_quote, words))}]"
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     """Return text as a TOML string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(each if each >= " " and each != "\x7f" else f"\\u{ord(each):04x}" for each in escaped) + '"'
+    characters = (each if each >= " " and each != "\x7f" else f"\\u{ord(each):04x}" for each in escaped)
+    return '"' + "".join(characters) + '"'

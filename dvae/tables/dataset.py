@@ -59,7 +59,7 @@ class PanelData:
         path: str | os.PathLike[str],
         columns: Columns | Sequence[str] = (),
         cut: Cut | None = None,
-        **told: Any,
+        **options: Any,
     ) -> Self:
         """Read a file, with the schema file next to it if there is one.
 
@@ -67,9 +67,8 @@ class PanelData:
             path: path of a CSV, Parquet, npz or npy file, or of a folder of npy files; or the name of a data set of
                 `dvae.tables.domains`.
             columns: a schema, or the targets as in `ColumnHints`; replaces the schema file.
-            cut: how to split and cut sequences; by default from the schema file, otherwise a choice that suits the
-                data.
-            **told: further fields of `ColumnHints` and of `Cut`.
+            cut: how to split and cut sequences; by default from the schema file, or else `default_cut`.
+            **options: further fields of `ColumnHints` and of `Cut`.
 
         Raises:
             FileNotFoundError: if the file does not exist.
@@ -78,13 +77,13 @@ class PanelData:
         """
         require(Cut | None, cut=cut)
         name = os.fspath(path)
-        how = {field.name: told.pop(field.name) for field in fields(Cut) if field.name in told}
-        beside, beside_cut = schema_beside(name)
+        cut_options = {field.name: options.pop(field.name) for field in fields(Cut) if field.name in options}
+        file_columns, file_cut = schema_beside(name)
         if not isinstance(columns, Columns):
-            words = ColumnHints(tuple(columns), **told)
-            columns = beside if words == ColumnHints() and beside is not None else words  # type: ignore[assignment]
+            hints = ColumnHints(tuple(columns), **options)
+            columns = file_columns if hints == ColumnHints() and file_columns is not None else hints  # type: ignore[assignment]
         panel = read_panel(name, columns)  # type: ignore[arg-type]
-        cut = replace(cut or beside_cut or default_cut(panel), **how)
+        cut = replace(cut or file_cut or default_cut(panel), **cut_options)
         return cls(name, panel, PanelSchema.from_data(panel, cut))
 
     @classmethod
@@ -120,25 +119,25 @@ class PanelData:
 
     def parts(self) -> dict[str, str]:
         """Describe the windows of each split and the omitted ones, or state why a split is empty."""
-        found = {}
+        descriptions = {}
         for split in SPLITS:
             try:
                 windows = self.windows(split)
             except ValueError as error:
-                found[split] = str(error)
+                descriptions[split] = str(error)
             else:
-                less = f"; left out are {windows.left_out}" if windows.left_out else ""
-                found[split] = f"{len(windows)} {split} windows of {self.protocol.name}{less}"
-        return found
+                omitted = f"; left out are {windows.left_out}" if windows.left_out else ""
+                descriptions[split] = f"{len(windows)} {split} windows of {self.protocol.name}{omitted}"
+        return descriptions
 
     def ahead(self, horizon: int | None = None) -> PanelWindows:
-        """Return windows whose future follows the end of each sequence, as in `dvae.tables.ahead`.
+        """Return one window for each sequence; its future follows the last target, as in `dvae.tables.ahead`.
 
         Args:
             horizon: steps of the future; by default those of the schema.
 
         Raises:
-            ValueError: if sequences are not cut, are too short, or have no covariates for the future.
+            ValueError: if sequences are not cut into windows, are too short, or have no covariates of the future.
         """
         return ahead(self.panel, self.schema, horizon)
 
@@ -183,7 +182,7 @@ def default_cut(panel: Panel) -> Cut:
 
     The horizon is a tenth of the median length, at most 24 steps, and three times as many steps are observed.
     """
-    lengths = sorted(len(one) for one in panel.series)
-    few = len(panel) < 10 and not any(one.split for one in panel.series)
+    lengths = sorted(len(sequence) for sequence in panel.series)
+    is_small = len(panel) < 10 and not any(sequence.split for sequence in panel.series)
     horizon = max(min(lengths[len(lengths) // 2] // 10, 24), 1)
-    return Cut(3 * horizon, horizon, split="time" if few else "sequence")
+    return Cut(3 * horizon, horizon, split="time" if is_small else "sequence")

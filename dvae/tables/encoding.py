@@ -38,9 +38,9 @@ from .protocol import Cut
 COVARIATES, STATICS, GAPS = "c", "s", "d"
 """Names of context in batches."""
 EVEN = 1.3
-"""Steps are evenly spaced up to this ratio of longest gap to median, and of median to shortest gap; months are."""
+"""Maximum ratio of longest gap to median, and of median to shortest gap, of evenly spaced steps; months are even."""
 LEAST = 1e-7
-"""Standard deviation of logarithms below which values are a constant with rounding errors."""
+"""Standard deviation of logarithms below which values count as constant up to rounding errors."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
 LOGARITHMIC = ("positive", "log-normal", "power")
 """Families whose logarithms networks read."""
@@ -49,14 +49,14 @@ SCALED = (*LOGARITHMIC, *COUNTS)
 
 @dataclass(frozen=True)
 class PanelSchema(Schema):
-    """The schema of a panel; the module describes the encoding.
+    """Schema of a panel; the module docstring describes the encoding.
 
     Args:
         columns: schema of the table.
         cut: how sequences are split and cut.
         means, scales: means and scales of the standardised columns, over the training data.
-        logarithms: for columns read as logarithms, the smallest value, and mean and deviation of the logarithms.
-        lacking: names of columns with an indicator: those with missing training values, or known only up to the
+        logarithms: smallest value, and mean and standard deviation of the logarithms, of columns read as logarithms.
+        with_missing: names of columns with an indicator: those with missing training values, or known only up to the
             present.
         step: median time between steps; 0 if steps are evenly spaced.
         calendar: kind, time zone and calendar step of the times.
@@ -76,22 +76,26 @@ class PanelSchema(Schema):
     calendar: Calendar = NUMBERS
 
     def __post_init__(self) -> None:
-        found = {"x": len(self.coordinates)}
+        sizes = {"x": len(self.coordinates)}
         for name, roles in ((COVARIATES, ("known", "past")), (STATICS, ("static",))):
             covariates = self.columns.of(*roles)
             if covariates:
-                lacking = sum(column.name in self.with_missing for column in covariates)
-                found[name] = sum(len(column.coordinates) for column in covariates) + lacking
+                n_indicators = sum(column.name in self.with_missing for column in covariates)
+                sizes[name] = sum(len(column.coordinates) for column in covariates) + n_indicators
         if self.step:
-            found[GAPS] = 1
-        for name, value in (("sizes", found), ("length", self.cut.length), ("observed", self.cut.observed)):
+            sizes[GAPS] = 1
+        for name, value in (("sizes", sizes), ("length", self.cut.length), ("observed", self.cut.observed)):
             object.__setattr__(self, name, value)  # derived from the other fields
         super().__post_init__()
         covariates = self.columns.of("known", "past", "static")
-        if lost := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
-            raise ValueError(f"no mean and scale of {', '.join(sorted(lost))}; models need both to standardise values")
-        if lost := {c.name for c in self.columns.of("past")} - {*self.with_missing}:
-            raise ValueError(f"no indicator of {', '.join(sorted(lost))}, whose values end with the present")
+        if missing := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
+            raise ValueError(
+                f"no mean and scale of {', '.join(sorted(missing))}; models need both to standardise values"
+            )
+        if missing := {c.name for c in self.columns.of("past")} - {*self.with_missing}:
+            raise ValueError(
+                f"no indicator of {', '.join(sorted(missing))}; covariates known up to the present need one"
+            )
 
     @classmethod
     def from_data(cls, panel: Panel, cut: Cut) -> Self:
@@ -104,13 +108,13 @@ class PanelSchema(Schema):
                 f"{panel.name} has no training window of {cut.name}: its sequences have "
                 f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
             )
-        training = [one.values[part] for one, part in parts]
-        known, steps = ColumnSummary.of(row_blocks(training)), sum(map(len, training))
-        means, scales, logarithms, lacking = {}, {}, {}, []
-        for place, column in enumerate(panel.columns.columns):
-            if not known.count[place]:
+        training = [sequence.values[part] for sequence, part in parts]
+        summary, steps = ColumnSummary.of(row_blocks(training)), sum(map(len, training))
+        means, scales, logarithms, with_missing = {}, {}, {}, []
+        for index, column in enumerate(panel.columns.columns):
+            if not summary.count[index]:
                 raise ValueError(f"column {column.name!r} has no value in the training part of {panel.name}")
-            mean, scale = float(known.mean[place]), float(np.sqrt(known.variance[place]))
+            mean, scale = float(summary.mean[index]), float(np.sqrt(summary.variance[index]))
             varies = scale > ROUNDING * abs(mean)
             if column.role == "target" and varies and scale < SMALLEST:
                 raise ValueError(f"the standard deviation of column {column.name!r} is {scale:g}; {TOO_SMALL}")
@@ -124,25 +128,32 @@ class PanelSchema(Schema):
                 )
             if column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, mean or 1.0
-                if column.family in LOGARITHMIC and known.largest[place] > 0:
-                    logarithms[column.name] = _logarithms([values[:, place, None] for values in training])
+                if column.family in LOGARITHMIC and summary.largest[index] > 0:
+                    logarithms[column.name] = _logarithms([values[:, index, None] for values in training])
             if column.family == "binary":
                 means[column.name] = mean
-            if column.role == "past" or known.count[place] < steps:
-                lacking.append(column.name)
-        named = [(one.name, values) for (one, _), values in zip(parts, training, strict=True)]
-        _warn_of_levels(panel.columns, means, named)
+            if column.role == "past" or summary.count[index] < steps:
+                with_missing.append(column.name)
+        training_values = [(sequence.name, values) for (sequence, _), values in zip(parts, training, strict=True)]
+        _warn_of_levels(panel.columns, means, training_values)
         shares = np.array([means[c.name] for c in panel.columns.targets if c.family == "binary"])
         spread = float(np.sqrt((shares * (1 - shares)).mean())) if len(shares) else 0.0
-        scales |= {c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"}  # some are rare
+        scales |= {
+            c.name: spread or 1.0 for c in panel.columns.targets if c.family == "binary"
+        }  # one scale, as some events are rare
         gaps = np.concatenate(
-            [np.diff(one.times[part]) if one.times is not None else np.empty(0) for one, part in parts]
+            [np.diff(sequence.times[part]) if sequence.times is not None else np.empty(0) for sequence, part in parts]
         )
-        middle = float(np.median(gaps)) if len(gaps) else 0.0
-        step = middle if len(gaps) and (gaps.max() > EVEN * middle or middle > EVEN * gaps.min()) else 0.0
+        median = float(np.median(gaps)) if len(gaps) else 0.0
+        step = median if len(gaps) and (gaps.max() > EVEN * median or median > EVEN * gaps.min()) else 0.0
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
         return cls(
-            columns=panel.columns, cut=cut, **units, with_missing=tuple(lacking), step=step, calendar=panel.calendar
+            columns=panel.columns,
+            cut=cut,
+            **units,
+            with_missing=tuple(with_missing),
+            step=step,
+            calendar=panel.calendar,
         )
 
     @property
@@ -166,16 +177,16 @@ class PanelSchema(Schema):
     def emission(self) -> DistributionSpec:
         """Distribution of the targets: a single one if all have the same family, else a product."""
         parts: dict[tuple[str, str], list[int]] = {}
-        place = 0
+        start = 0
         for column in self.columns.targets:
-            places = list(range(place, place + len(column.coordinates)))
-            place += len(places)
-            own = column.name if column.family == "category" else ""  # each category is a separate event
-            parts.setdefault((column.family, own), []).extend(places)
+            indices = list(range(start, start + len(column.coordinates)))
+            start += len(indices)
+            event = column.name if column.family == "category" else ""  # each category is a separate event
+            parts.setdefault((column.family, event), []).extend(indices)
         if len(parts) == 1:
             ((family, _),) = parts
             return FAMILIES[family]
-        return Product(tuple((tuple(places), FAMILIES[family]) for (family, _), places in parts.items()))
+        return Product(tuple((tuple(indices), FAMILIES[family]) for (family, _), indices in parts.items()))
 
     @property
     @override
@@ -195,25 +206,25 @@ class PanelSchema(Schema):
     def together(self) -> Sequence[int]:
         """Index of the column of each coordinate; all 0 if a step is observed or missing as a whole."""
         targets = enumerate(self.columns.targets)
-        return [0 if is_whole(self.columns) else place for place, column in targets for _ in column.coordinates]
+        return [0 if is_whole(self.columns) else index for index, column in targets for _ in column.coordinates]
 
     @property
     @override
     def units(self) -> Mapping[str, Sequence[Coordinate]]:
         """Units of x; missing values are replaced by the mean, or by the mean logarithm where logarithms are read."""
-        found = []
+        coordinates = []
         for column in self.columns.targets:
             mean, scale = self.means.get(column.name, 0.0), self.scales.get(column.name, 1.0)
-            read = self.logarithms.get(column.name, ())
-            typical = float(np.exp(read[1])) if read else scale if column.family in SCALED else mean
-            own = Coordinate(mean, scale, typical, *read)
-            found += [own] * len(column.coordinates)
-        return {"x": found}
+            logarithm = self.logarithms.get(column.name, ())
+            typical = float(np.exp(logarithm[1])) if logarithm else scale if column.family in SCALED else mean
+            coordinate = Coordinate(mean, scale, typical, *logarithm)
+            coordinates += [coordinate] * len(column.coordinates)
+        return {"x": coordinates}
 
     @cached_property
     def places(self) -> dict[str, int]:
         """Index of each column in `Series.values`."""
-        return {name: place for place, name in enumerate(self.columns.names)}
+        return {name: index for index, name in enumerate(self.columns.names)}
 
     def targets(self, one: Series) -> np.ndarray:
         """Return x (T, D) of a sequence, NaN where missing."""
@@ -222,14 +233,14 @@ class PanelSchema(Schema):
     def encoded(self, values: np.ndarray) -> np.ndarray:
         """Return x (..., D) from values (..., C) of the columns, NaN where missing."""
         columns = self.columns.targets
-        places = [self.places[column.name] for column in columns]
+        indices = [self.places[column.name] for column in columns]
         if all(column.family != "category" for column in columns):
-            return values if places == [*range(values.shape[-1])] else values[..., places]
-        return np.concatenate([_encoded(values[..., n], column) for n, column in zip(places, columns, strict=True)], -1)
+            return values if indices == [*range(values.shape[-1])] else values[..., indices]
+        return np.concatenate([_encode(values[..., n], column) for n, column in zip(indices, columns, strict=True)], -1)
 
     def context(self, one: Series) -> np.ndarray:
         """Return c (T, C) of a sequence, with future values of all covariates."""
-        return self._filled(one.values, self.columns.of("known", "past"))
+        return self._fill(one.values, self.columns.of("known", "past"))
 
     def static(self, one: Series) -> np.ndarray:
         """Return s (S,) of a sequence.
@@ -239,24 +250,24 @@ class PanelSchema(Schema):
         """
         columns, values = self.columns.of("static"), one.values[:1].copy()
         for column in columns:
-            place = self.places[column.name]
-            known = one.values[:, place][~np.isnan(one.values[:, place])]
-            if len(known) and (known != known[0]).any():
+            index = self.places[column.name]
+            observed = one.values[:, index][~np.isnan(one.values[:, index])]
+            if len(observed) and (observed != observed[0]).any():
                 raise ValueError(
                     f"column {column.name!r} is static, but changes within sequence {one.name!r}; make it known or past"
                 )
-            values[0, place] = known[0] if len(known) else np.nan
-        (found,) = self._filled(values, columns)
-        return np.asarray(found)
+            values[0, index] = observed[0] if len(observed) else np.nan
+        (row,) = self._fill(values, columns)
+        return np.asarray(row)
 
     def unforeseen(self, parts: Sequence[np.ndarray]) -> list[str]:
         """Return covariates that have missing values in parts (T, C), but not in the training data."""
-        found = []
+        names = []
         for column in self.columns.of("known", "static"):
-            gone = (np.isnan(part[:, self.places[column.name]]) for part in parts)
-            lacks = any(each.all() if column.role == "static" else each.any() for each in gone)
-            found += [column.name] if lacks and column.name not in self.with_missing else []
-        return found
+            absent = (np.isnan(part[:, self.places[column.name]]) for part in parts)
+            is_missing = any(mask.all() if column.role == "static" else mask.any() for mask in absent)
+            names += [column.name] if is_missing and column.name not in self.with_missing else []
+        return names
 
     def gaps(self, one: Series) -> np.ndarray:
         """Return d (T, 1) of a sequence, 1 at its first step."""
@@ -264,68 +275,68 @@ class PanelSchema(Schema):
             return np.ones((len(one), 1))
         return np.concatenate([[1.0], np.diff(one.times) / self.step])[:, None]
 
-    def _filled(self, values: np.ndarray, columns: Sequence[Column]) -> np.ndarray:
+    def _fill(self, values: np.ndarray, columns: Sequence[Column]) -> np.ndarray:
         """Return covariates standardised and without missing values, each followed by its indicator, if any."""
         parts = []
         for column in columns:
-            own = values[:, self.places[column.name]]
-            known = ~np.isnan(own)
-            last = np.maximum.accumulate(np.where(known, np.arange(len(own)), -1))
-            filled = np.where(last >= 0, own[last], np.nan)
+            cells = values[:, self.places[column.name]]
+            observed = ~np.isnan(cells)
+            last = np.maximum.accumulate(np.where(observed, np.arange(len(cells)), -1))
+            carried = np.where(last >= 0, cells[last], np.nan)
             if column.family == "category":
-                part = _encoded(filled, column)
+                part = _encode(carried, column)
                 parts.append(np.nan_to_num(part))
             else:
                 mean, scale = self.means[column.name], self.scales[column.name]
-                parts.append(((np.where(last >= 0, filled, mean) - mean) / scale)[:, None])
+                parts.append(((np.where(last >= 0, carried, mean) - mean) / scale)[:, None])
             if column.name in self.with_missing:
-                parts.append(known[:, None].astype(float))
+                parts.append(observed[:, None].astype(float))
         return np.concatenate(parts, 1)
 
     @cached_property
     def ending(self) -> tuple[list[int], list[int]]:
-        """Coordinates of c that are known up to the present, and of their indicators."""
-        held: list[int] = []
-        indicators, place = [], 0
+        """Indices in c of the covariates that are known up to the present, and of their indicators."""
+        coordinates: list[int] = []
+        indicators, start = [], 0
         for column in self.columns.of("known", "past"):
             width = len(column.coordinates)
             if column.role == "past":
-                held += range(place, place + width)
-                indicators.append(place + width)
-            place += width + (column.name in self.with_missing)
-        return held, indicators
+                coordinates += range(start, start + width)
+                indicators.append(start + width)
+            start += width + (column.name in self.with_missing)
+        return coordinates, indicators
 
     @override
     def config(self) -> dict[str, Any]:
         """Return the schema as JSON types."""
-        own: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
-        own |= {"with_missing": list(self.with_missing), "step": self.step, "calendar": asdict(self.calendar)}
-        return {"columns": self.columns.config(), "cut": asdict(self.cut), **own}
+        entries: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
+        entries |= {"with_missing": list(self.with_missing), "step": self.step, "calendar": asdict(self.calendar)}
+        return {"columns": self.columns.config(), "cut": asdict(self.cut), **entries}
 
     @classmethod
     @override
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Return the schema that `config` described."""
-        own = tuples(config)
-        own |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
-        own["logarithms"] = tuples(config["logarithms"])
-        own["calendar"] = Calendar(**config["calendar"])
-        return cls(**own)
+        """Return the schema from its `config`."""
+        options = tuples(config)
+        options |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
+        options["logarithms"] = tuples(config["logarithms"])
+        options["calendar"] = Calendar(**config["calendar"])
+        return cls(**options)
 
 
 def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """Return the smallest positive value of parts (n, 1), and mean and deviation of logarithms clipped to it."""
     floor = ColumnSummary.of(np.where(block > 0, block, np.nan) for block in row_blocks(parts)).least.item()
-    read = ColumnSummary.of(np.log(block.astype(np.float64).clip(floor)) for block in row_blocks(parts))
-    spread = float(np.sqrt(read.variance.item()))
-    return floor, read.mean.item(), spread if spread > LEAST else 1.0
+    summary = ColumnSummary.of(np.log(block.astype(np.float64).clip(floor)) for block in row_blocks(parts))
+    spread = float(np.sqrt(summary.variance.item()))
+    return floor, summary.mean.item(), spread if spread > LEAST else 1.0
 
 
 def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Warn if float32 does not resolve how a column varies in sequences, after the mean of all is subtracted."""
+    """Warn if float32 does not resolve how a column varies within a sequence, after the overall mean is subtracted."""
     center = np.array([means.get(name, 0.0) for name in columns.names])
-    lost = np.array([is_imprecise(ColumnSummary.of(blocks(values)), center) for _, values in training])
-    for column, mean, sequences in zip(columns.columns, center, lost.T, strict=True):
+    imprecise = np.array([is_imprecise(ColumnSummary.of(blocks(values)), center) for _, values in training])
+    for column, mean, sequences in zip(columns.columns, center, imprecise.T, strict=True):
         if sequences.any() and column.family not in ("binary", "category"):
             warnings.warn(
                 f"column {column.name!r} varies by less than float32 resolves at its distance from {mean:.9g} in "
@@ -335,13 +346,13 @@ def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequ
             )
 
 
-def _encoded(values: np.ndarray, column: Column) -> np.ndarray:
+def _encode(values: np.ndarray, column: Column) -> np.ndarray:
     """Return a column (...) as coordinates (..., n), NaN where missing."""
     if column.family != "category":
         return np.asarray(values[..., None])
-    found = np.asarray(values[..., None] == np.arange(len(column.classes)), float)
-    found[np.isnan(values)] = np.nan
-    return found
+    one_hot = np.asarray(values[..., None] == np.arange(len(column.classes)), float)
+    one_hot[np.isnan(values)] = np.nan
+    return one_hot
 
 
 def is_whole(columns: Columns) -> bool:

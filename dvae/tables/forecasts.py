@@ -27,7 +27,7 @@ BANDS = {0.95: 0.15, 0.8: 0.3, 0.5: 0.5}
 """Opacity of the prediction bands in figures, by level."""
 FORMATS = (".csv", ".parquet", ".npz")
 FEW = 12
-"""Maximum number of columns with a score each."""
+"""Maximum number of columns that are also scored separately."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class PanelForecasts:
 
         count, horizon, size = self.draws.shape[1:]
         window, step, place = (index.ravel() for index in np.indices((count, horizon, size)))
-        found = _rows(self.keys, window, step)
+        entries = _rows(self.keys, window, step)
         if self.times is not None:
-            found["time"] = self.calendar.to_pandas(self.times[:, -horizon:].reshape(-1).repeat(size))
-        found["ahead"] = step + 1
-        found |= _columns(self.columns, place) | _quantiles(self.draws.reshape(len(self.draws), -1))
-        return pd.DataFrame({**found, "truth": self.truth.ravel()})
+            entries["time"] = self.calendar.to_pandas(self.times[:, -horizon:].reshape(-1).repeat(size))
+        entries["ahead"] = step + 1
+        entries |= _columns(self.columns, place) | _quantiles(self.draws.reshape(len(self.draws), -1))
+        return pd.DataFrame({**entries, "truth": self.truth.ravel()})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as CSV or Parquet, or all arrays as npz, by the extension of the path.
@@ -93,48 +93,48 @@ class PanelForecasts:
         for name in columns or ():
             if name not in names:
                 raise ValueError(f"no column {name!r}{nearest(name, names)}; there are {', '.join(names[:20])}")
-        chosen = list(columns or names)[:most]
-        across = min(2, len(chosen))
-        down = -(-len(chosen) // across)
-        figure = new_figure(5 * across, 1.9 * down + 0.4)
-        panels = figure.subplots(down, across, squeeze=False, sharex=True).ravel()
-        for axis, name in zip(panels, chosen, strict=False):
+        selected = list(columns or names)[:most]
+        n_columns = min(2, len(selected))
+        n_rows = -(-len(selected) // n_columns)
+        figure = new_figure(5 * n_columns, 1.9 * n_rows + 0.4)
+        panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True).ravel()
+        for axis, name in zip(panels, selected, strict=False):
             self.fan(axis, window, name)
             unit = self.columns[name]
             axis.set_title(name + (f" ({unit})" if unit else ""), fontsize=9, parse_math=False)
             axis.tick_params(labelsize=7)
-        for axis in panels[len(chosen) :]:
+        for axis in panels[len(selected) :]:
             axis.set_axis_off()
-        for axis in panels[max(len(chosen) - across, 0) : len(chosen)]:  # the lowest panel of each column
+        for axis in panels[max(len(selected) - n_columns, 0) : len(selected)]:  # the lowest panel of each column
             axis.tick_params(labelbottom=True)
-        known = [axis.get_legend_handles_labels() for axis in panels[: len(chosen)]]
-        handles, labels = max(known, key=lambda entry: len(entry[1]))
+        legends = [axis.get_legend_handles_labels() for axis in panels[: len(selected)]]
+        handles, labels = max(legends, key=lambda entry: len(entry[1]))
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
         figure.suptitle(f"{self.keys[window][0]} from step {self.keys[window][1]}", fontsize=9, parse_math=False)
         return figure
 
     def fan(self, axis: Axes, window: int, column: str) -> None:
         """Plot one coordinate of a window on given axes, as `plot` does."""
-        place = list(self.columns).index(column)
+        index = list(self.columns).index(column)
         observed, horizon = self.past.shape[1], self.draws.shape[2]
         steps: Any = np.arange(observed + horizon) if self.times is None else self.times[window]
-        if dated := self.times is not None and self.calendar.kind == "dates":
+        if is_dated := self.times is not None and self.calendar.kind == "dates":
             steps = self.calendar.to_pandas(steps)
-        before, after, draws = steps[:observed], steps[observed:], self.draws[:, window, :, place]
-        if np.isin(self.draws[..., place], (0, 1)).all():  # binary: a share instead of bands
-            axis.plot(after, draws.mean(0), "C0", linewidth=1.2)
+        past_steps, future_steps, draws = steps[:observed], steps[observed:], self.draws[:, window, :, index]
+        if np.isin(self.draws[..., index], (0, 1)).all():  # binary: a share instead of bands
+            axis.plot(future_steps, draws.mean(0), "C0", linewidth=1.2)
             axis.set_ylabel("share", fontsize=8)
             axis.set_ylim(-0.05, 1.05)
         else:
-            for level, shade in BANDS.items():
+            for level, opacity in BANDS.items():
                 if samples_needed(level) > len(draws):
                     continue
                 low, high = _quantile(draws, [(1 - level) / 2, (1 + level) / 2])
-                axis.fill_between(after, low, high, color="C0", alpha=shade, linewidth=0, label=f"{level:.0%}")
-            axis.plot(after, np.median(draws, 0), "C0", linewidth=1.2, label="median")
-        axis.plot(before, self.past[window, :, place], color="0.3", linewidth=1, marker=".", markersize=3)
-        axis.plot(after, self.truth[window, :, place], "k.", markersize=4, label="truth")
-        if dated:
+                axis.fill_between(future_steps, low, high, color="C0", alpha=opacity, linewidth=0, label=f"{level:.0%}")
+            axis.plot(future_steps, np.median(draws, 0), "C0", linewidth=1.2, label="median")
+        axis.plot(past_steps, self.past[window, :, index], color="0.3", linewidth=1, marker=".", markersize=3)
+        axis.plot(future_steps, self.truth[window, :, index], "k.", markersize=4, label="truth")
+        if is_dated:
             from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
             axis.xaxis.set_major_locator(locator := AutoDateLocator(tz=steps.tz, maxticks=6))
@@ -149,7 +149,7 @@ class PanelImputed:
 
     Args:
         draws: (K, N, T, D) of the coordinates; observed values are equal in all draws.
-        lacking: (N, T, D), True where a coordinate is missing.
+        missing: (N, T, D), True where a coordinate is missing.
         columns: coordinate to its unit.
         keys: (sequence, first step) of each window.
         times: (N, T) of the steps, as in `Calendar`; None for step numbers.
@@ -167,11 +167,11 @@ class PanelImputed:
         """Return a pandas frame with a row for each missing entry: mean, and quantiles as in `PanelForecasts.table`."""
         import pandas as pd
 
-        window, step, place = np.nonzero(self.missing)
-        found = _rows(self.keys, window, step)
+        window, step, index = np.nonzero(self.missing)
+        entries = _rows(self.keys, window, step)
         if self.times is not None:
-            found["time"] = self.calendar.to_pandas(self.times[window, step])
-        return pd.DataFrame(found | _columns(self.columns, place) | _quantiles(self.draws[:, window, step, place]))
+            entries["time"] = self.calendar.to_pandas(self.times[window, step])
+        return pd.DataFrame(entries | _columns(self.columns, index) | _quantiles(self.draws[:, window, step, index]))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as CSV or Parquet, or all arrays as npz, by the extension of the path.
@@ -196,10 +196,10 @@ def _rows(keys: Sequence[tuple[str, int]], window: np.ndarray, step: np.ndarray)
     return {"sequence": np.array(names, object)[window], "step": np.array(first)[window] + step}
 
 
-def _columns(columns: Mapping[str, str], place: np.ndarray) -> dict[str, np.ndarray]:
+def _columns(columns: Mapping[str, str], index: np.ndarray) -> dict[str, np.ndarray]:
     """Return table columns with the name and unit of each coordinate."""
-    names, units = (np.array(list(each), object) for each in (columns, columns.values()))
-    return {"column": names[place], "unit": units[place]}
+    names, units = (np.array(list(entries), object) for entries in (columns, columns.values()))
+    return {"column": names[index], "unit": units[index]}
 
 
 def column_of(quantile: float) -> str:
@@ -210,8 +210,8 @@ def column_of(quantile: float) -> str:
 def _quantiles(draws: np.ndarray) -> dict[str, np.ndarray]:
     """Return the mean of draws (K, N), and the quantiles that K draws support."""
     levels = [level for level in QUANTILES if needed(level) <= len(draws)]
-    named = dict(zip(map(column_of, levels), _quantile(draws, levels), strict=True))
-    return {"mean": draws.mean(0, dtype=np.float64), **named}
+    quantiles = dict(zip(map(column_of, levels), _quantile(draws, levels), strict=True))
+    return {"mean": draws.mean(0, dtype=np.float64), **quantiles}
 
 
 def _quantile(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
@@ -220,31 +220,33 @@ def _quantile(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
     With these ranks, intervals contain exchangeable values at their nominal level, as in `metrics.coverage`. NumPy's
     default ranks (k - 1) / (K - 1) span only the range of the draws, and its intervals are too narrow.
     """
-    found: np.ndarray = np.quantile(draws, levels, axis=0, method="weibull")
-    return found
+    quantiles: np.ndarray = np.quantile(draws, levels, axis=0, method="weibull")
+    return quantiles
 
 
-def _save(found: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **arrays: np.ndarray) -> None:
-    """Write a table, or arrays with the sequences, steps and columns that they belong to."""
+def _save(result: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **arrays: np.ndarray) -> None:
+    """Write the table of a result, or arrays with the names of their sequences, steps and columns."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         raise ValueError(f"{path} must end in one of {', '.join(FORMATS)}")
     with files.atomic_write(path) as file:
         if suffix == ".csv":
-            table = found.table()
-            if "time" in table and found.calendar.kind == "numbers":
+            table = result.table()
+            if "time" in table and result.calendar.kind == "numbers":
                 table["time"] = table["time"].map("{:.15g}".format)
             table.to_csv(file, index=False)
         elif suffix == ".parquet":
             try:
-                found.table().to_parquet(file)
+                result.table().to_parquet(file)
             except ImportError as error:
                 raise ValueError(f"{path} needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
         else:
-            names, first = zip(*found.keys, strict=True)
-            beside: dict[str, Any] = {"sequence": names, "step": first, "columns": list(found.columns)}
-            beside |= {} if found.times is None else {"times": found.times}
-            np.savez_compressed(file, allow_pickle=False, **arrays, **{n: np.array(own) for n, own in beside.items()})
+            names, first = zip(*result.keys, strict=True)
+            labels: dict[str, Any] = {"sequence": names, "step": first, "columns": list(result.columns)}
+            labels |= {} if result.times is None else {"times": result.times}
+            np.savez_compressed(
+                file, allow_pickle=False, **arrays, **{n: np.array(values) for n, values in labels.items()}
+            )
 
 
 def panel_scores(windows: HeldOutWindows) -> list[Measure]:
@@ -253,5 +255,5 @@ def panel_scores(windows: HeldOutWindows) -> list[Measure]:
     The command line prints these scores: `dvae.evaluate(model, windows, scores=dvae.tables.panel_scores)`.
     """
     columns = columns_of(windows)
-    found = [*calibrated(windows), *(by_column(CRPS, columns) if 1 < len(columns) <= FEW else [])]
-    return [replace(measure, headline=True) for measure in found]
+    measures = [*calibrated(windows), *(by_column(CRPS, columns) if 1 < len(columns) <= FEW else [])]
+    return [replace(measure, headline=True) for measure in measures]

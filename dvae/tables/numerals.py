@@ -1,4 +1,4 @@
-"""Parse a column of a table as float64 numbers, and report every other cell."""
+"""Parse a column of a table as float64 numbers, and report the cells that are not numbers."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ class Numbers:
         if not self.wrong.any():
             return
         row = int(np.argmax(self.wrong))
-        count, known = int(self.wrong.sum()), int((self.wrong | ~np.isnan(self.values)).sum())
+        n_wrong, n_values = int(self.wrong.sum()), int((self.wrong | ~np.isnan(self.values)).sum())
         cell = brief(column.iloc[row])
-        share = f"{known - count} of {known} values are numbers; " if known > count else ""
+        share = f"{n_values - n_wrong} of {n_values} values are numbers; " if n_values > n_wrong else ""
         raise ValueError(
             f"column {column.name!r}: {share}row {row} is {cell}, which is not a number; correct it, list it in "
             f"na_values (--na-values) if it marks a missing value, {how}"
@@ -108,21 +108,21 @@ def read_numbers(
     except TypeError:  # cells that are lists
         return Numbers(nothing, column.notna().to_numpy(), {})
     cells = [cell.strip() if isinstance(cell, str) else cell for cell in cells]
-    absent = np.array([isinstance(cell, str) and (cell.lower() in NA or cell in na_values) for cell in cells], bool)
-    marked = np.array([isinstance(cell, str) and cell.lower() in MARKS for cell in cells], bool) & ~absent
-    others = [cell for cell, skip in zip(cells, absent | marked, strict=True) if not skip]
-    own, ambiguous = _numbers(others, decimal, hint)
-    found = np.full(len(cells), np.nan)
-    found[~(absent | marked)] = own
-    wrong = np.isnan(found) & ~absent
-    if not np.isnan(own).all():
-        wrong &= ~marked  # a mark is text in a column without numbers
-    found[np.isin(found, sentinels)] = np.nan
-    said = {}
-    for place in np.flatnonzero(marked & ~wrong):
-        rows = np.flatnonzero(codes == place)
-        said[str(cells[place])] = (int(rows[0]), len(rows))
-    return Numbers(np.append(found, np.nan)[codes], np.append(wrong, False)[codes], said, ambiguous)
+    is_missing = np.array([isinstance(cell, str) and (cell.lower() in NA or cell in na_values) for cell in cells], bool)
+    is_mark = np.array([isinstance(cell, str) and cell.lower() in MARKS for cell in cells], bool) & ~is_missing
+    others = [cell for cell, skip in zip(cells, is_missing | is_mark, strict=True) if not skip]
+    numbers, ambiguous = _numbers(others, decimal, hint)
+    cell_values = np.full(len(cells), np.nan)
+    cell_values[~(is_missing | is_mark)] = numbers
+    wrong = np.isnan(cell_values) & ~is_missing
+    if not np.isnan(numbers).all():
+        wrong &= ~is_mark  # a mark is text in a column without numbers
+    cell_values[np.isin(cell_values, sentinels)] = np.nan
+    marks = {}
+    for code in np.flatnonzero(is_mark & ~wrong):
+        rows = np.flatnonzero(codes == code)
+        marks[str(cells[code])] = (int(rows[0]), len(rows))
+    return Numbers(np.append(cell_values, np.nan)[codes], np.append(wrong, False)[codes], marks, ambiguous)
 
 
 def decimal_sign(frame: Any) -> str:
@@ -130,13 +130,13 @@ def decimal_sign(frame: Any) -> str:
 
     A column determines it if only one of the signs can parse all its numbers.
     """
-    shown, rows = set(), max(20, 50_000 // max(frame.shape[1], 1))
+    signs, rows = set(), max(20, 50_000 // max(frame.shape[1], 1))
     for name in frame:
-        some = frame[name].iloc[:rows].dropna().drop_duplicates()
-        dot, comma = (read_numbers(some, decimal=sign).is_numeric for sign in ".,")
-        if dot != comma and not some.str.match(r"\s*0\d").any():  # 01.2024 is a month
-            shown.add("." if dot else ",")
-    return shown.pop() if len(shown) == 1 else ""
+        cells = frame[name].iloc[:rows].dropna().drop_duplicates()
+        dot, comma = (read_numbers(cells, decimal=sign).is_numeric for sign in ".,")
+        if dot != comma and not cells.str.match(r"\s*0\d").any():  # 01.2024 is a month
+            signs.add("." if dot else ",")
+    return signs.pop() if len(signs) == 1 else ""
 
 
 def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[np.ndarray, str | None]:
@@ -146,11 +146,11 @@ def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[n
         return np.array([word.lower() == "true" for word in words], float), None
     commas = any("," in word for word in words)
     if decimal is not None or (hint is None and not commas):
-        return _parsed(cells, decimal or "."), None
-    dot, comma = _parsed(cells, "."), _parsed(cells, ",")
+        return _parse(cells, decimal or "."), None
+    dot, comma = _parse(cells, "."), _parse(cells, ",")
     differ = ~np.isnan(dot) & (dot != comma)
-    if (lost := int(np.isnan(dot).sum() - np.isnan(comma).sum())) or not differ.any():
-        return (comma if lost > 0 else dot), None
+    if (excess := int(np.isnan(dot).sum() - np.isnan(comma).sum())) or not differ.any():
+        return (comma if excess > 0 else dot), None
     sign = "," if commas else "."
     if not commas or not any("." in word for word in words):
         if hint == "." and sign == ",":
@@ -165,7 +165,7 @@ def _has_large_whole(values: np.ndarray) -> bool:
     return bool(((np.abs(values) >= 100) & (values == np.trunc(values))).any())
 
 
-def _parsed(cells: list[Any], decimal: str) -> np.ndarray:
+def _parse(cells: list[Any], decimal: str) -> np.ndarray:
     """Parse each cell as float64, exactly as Python does; NaN if it is not a number."""
     return np.array([_number(cell, decimal) for cell in cells], np.float64)
 
@@ -188,8 +188,8 @@ def _number(cell: Any, decimal: str) -> float:
     text = cell.replace("−", "-")
     match = _TEXTS[decimal].fullmatch(text)
     if match and (match[2] or match[4]):
-        whole = re.sub(r"\D", "", match[2])
-        return float(f"{match[1]}{whole or 0}.{match[4] or 0}{match[5]}")
+        digits = re.sub(r"\D", "", match[2])
+        return float(f"{match[1]}{digits or 0}.{match[4] or 0}{match[5]}")
     return float(text) if text.lower().lstrip("+-") in ("inf", "infinity") else float("nan")
 
 

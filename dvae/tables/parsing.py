@@ -57,9 +57,7 @@ class UnparsedDates(ValueError):
     def __init__(self, cells: Any, wrong: np.ndarray):
         self.wrong = wrong
         row = int(np.argmax(wrong))
-        super().__init__(
-            f"{brief(cells.iloc[row])} in row {row} among them; write dates as {WANTED}, durations as 02:30:00"
-        )
+        super().__init__(f"{brief(cells.iloc[row])} in row {row}; write dates as {WANTED}, durations as 02:30:00")
 
 
 class AmbiguousDates(ValueError):
@@ -85,18 +83,18 @@ def tabular(data: Any) -> Any:
     frame = frame.set_axis([str(name) for name in frame.columns], axis=1)
     columns, levels = [*frame.columns], []
     for name, level in index_levels(data):
-        kept = columns.count(name) == 1 and level.equals(pd.Index(frame[name]))  # from set_index(drop=False)
-        if not kept:
+        is_column = columns.count(name) == 1 and level.equals(pd.Index(frame[name]))  # from set_index(drop=False)
+        if not is_column:
             levels.append((name, level))
     names = [*(name for name, _ in levels), *columns]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        beside = " or an index with the name of a column" if twice in dict(levels) else ""
-        raise ValueError(f"the table has two columns {twice!r}{beside}; rename one")
+        repeated = next(name for name in names if names.count(name) > 1)
+        hint = " or an index with the name of a column" if repeated in dict(levels) else ""
+        raise ValueError(f"the table has two columns {repeated!r}{hint}; rename one")
     if levels:
         frame = frame.reset_index(drop=True)
-    for place, (name, level) in enumerate(levels):
-        frame.insert(place, name, level)
+    for index, (name, level) in enumerate(levels):
+        frame.insert(index, name, level)
     return frame
 
 
@@ -104,19 +102,19 @@ def index_levels(data: Any) -> list[tuple[str, Any]]:
     """Return names and values of index levels that become columns: several levels, or one with a name or dates."""
     import pandas as pd
 
-    found = []
-    for place in range(data.index.nlevels):
-        level = data.index.get_level_values(place)
+    levels = []
+    for number in range(data.index.nlevels):
+        level = data.index.get_level_values(number)
         dated = isinstance(level, pd.DatetimeIndex | pd.PeriodIndex | pd.TimedeltaIndex)
         if level.name is not None or dated or data.index.nlevels > 1:
-            unnamed = "time" if dated and "time" not in map(str, getattr(data, "columns", ())) else f"level_{place}"
-            found.append((unnamed if level.name is None else str(level.name), level))
-    return found
+            unnamed = "time" if dated and "time" not in map(str, getattr(data, "columns", ())) else f"level_{number}"
+            levels.append((unnamed if level.name is None else str(level.name), level))
+    return levels
 
 
 def texts(column: Any) -> Any:
     """Return the values as text, with missing ones missing; integers look alike with and without missing values."""
-    if column.dtype.kind == "f" and (known := column.dropna()).abs().lt(2**53).all() and (known % 1 == 0).all():
+    if column.dtype.kind == "f" and (numbers := column.dropna()).abs().lt(2**53).all() and (numbers % 1 == 0).all():
         column = column.astype("Int64")
     return column.astype(str).where(column.notna())
 
@@ -128,7 +126,7 @@ def dates(column: Any) -> Any:
     Dates with several offsets from UTC are converted to UTC.
 
     Raises:
-        Undecided: if nothing determines the order of day, month and year, or only some dates have an offset from UTC.
+        AmbiguousDates: if the order of day, month and year is not determined, or only some dates have an offset.
         TypeError, ValueError: if the column contains other values, or dates in several formats.
     """
     import pandas as pd
@@ -137,34 +135,34 @@ def dates(column: Any) -> Any:
         return column.dt.to_timestamp()
     if pd.api.types.is_datetime64_any_dtype(column):
         return column
-    codes, held = pd.factorize(column)  # sequences share their dates
+    codes, unique = pd.factorize(column)  # sequences share their dates
     try:
-        said = pd.Series(held, dtype=object)
-        when = pd.to_datetime(said, utc=True, format="ISO8601")
+        strings = pd.Series(unique, dtype=object)
+        parsed = pd.to_datetime(strings, utc=True, format="ISO8601")
     except (TypeError, ValueError):
         cells = column.astype(str).str.strip().where(column.notna())
-        codes, held = pd.factorize(cells)
-        said = _as_iso(pd.Series(held, dtype=object))
-        when = pd.to_datetime(said, utc=True, format="ISO8601", errors="coerce")
-        if (wrong := when.isna()).any():
+        codes, unique = pd.factorize(cells)
+        strings = _as_iso(pd.Series(unique, dtype=object))
+        parsed = pd.to_datetime(strings, utc=True, format="ISO8601", errors="coerce")
+        if (wrong := parsed.isna()).any():
             raise UnparsedDates(cells, np.append(wrong, False)[codes]) from None
-    offsets = _offsets(said)
-    known = offsets.dropna().unique()
-    if len(known) and (naive := offsets.isna()).any():
+    offsets = _offsets(strings)
+    zones = offsets.dropna().unique()
+    if len(zones) and (naive := offsets.isna()).any():
         raise AmbiguousDates(
-            f"some dates have an offset from UTC, and others, such as {brief(str(held[naive.argmax()]))}, have none; "
+            f"some dates have an offset from UTC, and others, such as {brief(str(unique[naive.argmax()]))}, have none; "
             "write it for all, or for none"
         )
-    if not len(known):
-        when = when.dt.tz_localize(None)
-    elif len(known) == 1 and known[0] != "Z":
-        when = when.dt.tz_convert(pd.Timestamp(said[0]).tz)
-    return when.reindex(codes).set_axis(column.index)
+    if not len(zones):
+        parsed = parsed.dt.tz_localize(None)
+    elif len(zones) == 1 and zones[0] != "Z":
+        parsed = parsed.dt.tz_convert(pd.Timestamp(strings[0]).tz)
+    return parsed.reindex(codes).set_axis(column.index)
 
 
-def _offsets(said: Any) -> Any:
+def _offsets(strings: Any) -> Any:
     """Return offsets from UTC in dates as text, missing where a date has none."""
-    return said.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
+    return strings.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
 
 
 def compact(numbers: np.ndarray) -> Any:
@@ -172,35 +170,41 @@ def compact(numbers: np.ndarray) -> Any:
     import pandas as pd
 
     least, most = (numbers.min(), numbers.max()) if len(numbers) and (numbers % 1 == 0).all() else (0, 0)
-    for digits, written in ((8, "%Y%m%d"), (6, "%Y%m")):
+    for digits, pattern in ((8, "%Y%m%d"), (6, "%Y%m")):
         if least // 10 ** (digits - 4) >= 1800 and most // 10 ** (digits - 4) <= 2200:
-            when = pd.to_datetime(pd.Series(numbers.astype(int).astype(str)), format=written, errors="coerce")
-            return None if when.isna().any() else when
+            parsed = pd.to_datetime(pd.Series(numbers.astype(int).astype(str)), format=pattern, errors="coerce")
+            return None if parsed.isna().any() else parsed
     return None
 
 
 def is_duration(column: Any) -> bool:
     """Return whether a column contains durations, or text such as "1 days 02:00:00" or "02:00:00"."""
-    known = column.dropna()
+    cells = column.dropna()
     return column.dtype.kind == "m" or bool(
-        len(known) and not is_number(column) and known.astype(str).str.strip().str.fullmatch(_DURATION).all()
+        len(cells) and not is_number(column) and cells.astype(str).str.strip().str.fullmatch(_DURATION).all()
     )
 
 
-def _as_iso(said: Any) -> Any:
+def _as_iso(strings: Any) -> Any:
     """Convert texts to ISO 8601 if the first is a date in another format; otherwise return them unchanged."""
     import pandas as pd
 
-    fitting = (way for first in said[:1] if len(first) <= LONGEST for way in WRITTEN if way.fullmatch(first))
-    way = next(fitting, None)
-    if way is None:
-        return said
-    parts = said.str.slice(0, LONGEST + 1).str.extract(f"^{way.pattern}$", flags=way.flags)
+    fitting = (
+        date_format
+        for first in strings[:1]
+        if len(first) <= LONGEST
+        for date_format in WRITTEN
+        if date_format.fullmatch(first)
+    )
+    date_format = next(fitting, None)
+    if date_format is None:
+        return strings
+    parts = strings.str.slice(0, LONGEST + 1).str.extract(f"^{date_format.pattern}$", flags=date_format.flags)
     parts = parts[parts.year.notna()]
     if "first" in parts:
-        parts = parts.rename(columns=_order(parts, said[0]))
+        parts = parts.rename(columns=_order(parts, strings[0]))
     if "word" in parts:
-        parts["month"] = parts.word.str.lower().map({name: str(place) for place, name in enumerate(MONTHS, 1)})
+        parts["month"] = parts.word.str.lower().map({name: str(number) for number, name in enumerate(MONTHS, 1)})
         century = parts.year.lt("69").map({True: "20", False: "19"})  # the POSIX rule
         parts["year"] = parts.year.where(parts.year.str.len() != 2, century + parts.year)
     if "quarter" in parts:
@@ -210,12 +214,12 @@ def _as_iso(said: Any) -> Any:
         parts[["year", "month", "day"]] = weeks.astype(str).str.extract(r"(\d+)-(\d+)-(\d+)").fillna("0").to_numpy()
     if "day" not in parts:
         parts["day"] = "1"
-    late = parts.half.str.lower().map({"a": 0, "p": 12})
+    offset = parts.half.str.lower().map({"a": 0, "p": 12})
     hour = parts.hour.fillna("0").astype(int)
-    hour = (hour % 12 + late).where(late.notna(), hour).astype(int).astype(str)
+    hour = (hour % 12 + offset).where(offset.notna(), hour).astype(int).astype(str)
     date = parts.year + "-" + parts.month + "-" + parts.day
     zone = parts.zone.str.upper().replace({"UTC": "Z", "GMT": "Z"}).fillna("")
-    return (date + "T" + hour + parts.rest.fillna(":00") + zone).reindex(said.index).fillna("")  # no date
+    return (date + "T" + hour + parts.rest.fillna(":00") + zone).reindex(strings.index).fillna("")  # no date
 
 
 def _order(parts: Any, example: str) -> dict[str, str]:
@@ -248,42 +252,42 @@ def times(
     import pandas as pd
 
     if is_number(column):
-        found, calendar = column.to_numpy(np.float64, na_value=np.nan), NUMBERS
-        known = np.isfinite(found)
-        if known.all() and (when := compact(found)) is not None:
-            return times(when.rename(column.name), zone, sequences)
+        values, calendar = column.to_numpy(np.float64, na_value=np.nan), NUMBERS
+        valid = np.isfinite(values)
+        if valid.all() and (parsed := compact(values)) is not None:
+            return times(parsed.rename(column.name), zone, sequences)
     elif is_duration(column):
         spans = pd.to_timedelta(column if column.dtype.kind == "m" else column.astype(str).where(column.notna()))
-        found, known, calendar = seconds(pd.TimedeltaIndex(spans)), spans.notna().to_numpy(), Calendar("durations")
+        values, valid, calendar = seconds(pd.TimedeltaIndex(spans)), spans.notna().to_numpy(), Calendar("durations")
     else:
         try:
-            when = dates(column)
+            parsed = dates(column)
         except AmbiguousDates as error:
-            raise ValueError(f"column {column.name!r} holds {error}") from error
+            raise ValueError(f"column {column.name!r}: {error}") from error
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"the times of column {column.name!r} are neither numbers, dates nor durations: {str(error)[:200]}"
             ) from error
-        known = when.notna().to_numpy()
-        moments = pd.DatetimeIndex(when)
+        valid = parsed.notna().to_numpy()
+        moments = pd.DatetimeIndex(parsed)
         if zone is not None:
-            moments = moments.tz_convert(zone) if moments.tz else _localized(moments, zone, sequences, column)
-        found = seconds(moments)
+            moments = moments.tz_convert(zone) if moments.tz else _localize(moments, zone, sequences, column)
+        values = seconds(moments)
         calendar = Calendar("dates", None if moments.tz is None else str(moments.tz))
     if zone is not None and calendar.kind != "dates":
         raise ValueError(f"zone is {zone!r}, and column {column.name!r} holds {calendar.kind}; leave the zone out")
-    if not known.all():
-        raise ValueError(f"row {int(np.argmin(known))} of column {column.name!r} has no time")
-    return np.asarray(found), calendar
+    if not valid.all():
+        raise ValueError(f"row {int(np.argmin(valid))} of column {column.name!r} has no time")
+    return np.asarray(values), calendar
 
 
-def _localized(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, column: Any) -> Any:
+def _localize(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, column: Any) -> Any:
     """Return local times as moments in a zone.
 
     Raises:
         ValueError: if a time is skipped by a clock change, or occurs twice and its sequence does not resolve it.
     """
-    shown_twice = local.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward").isna() & local.notna()
+    is_repeated = local.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward").isna() & local.notna()
     moments = local.tz_localize(zone, ambiguous=np.ones(len(local), bool), nonexistent="NaT")
     if (skipped := moments.isna() & local.notna()).any():
         row = int(skipped.argmax())
@@ -293,14 +297,14 @@ def _localized(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, co
         )
     moments = moments.to_series().reset_index(drop=True)
     for rows in [np.arange(len(local))] if sequences is None else sequences:
-        if shown_twice[rows].any():
+        if is_repeated[rows].any():
             try:
                 moments.iloc[rows] = local[rows].tz_localize(zone, ambiguous="infer")
             except ValueError:
-                row = rows[shown_twice[rows].argmax()]
+                row = rows[is_repeated[rows].argmax()]
                 raise ValueError(
-                    f"row {row} of column {column.name!r} is {local[row]}, an hour that the clocks of {zone} show "
-                    "twice, and its sequence does not have it twice in order; write its offset from UTC, as in "
+                    f"row {row} of column {column.name!r} is {local[row]}, which the clocks of {zone} show twice, "
+                    "but its sequence does not contain both times in order; write its offset from UTC, as in "
                     f"{moments.iloc[row].isoformat()}, or leave the zone out"
                 ) from None
     return type(local)(moments)
@@ -319,33 +323,32 @@ def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: s
         ValueError: if values are invalid for the column.
     """
     if told.family == "category":
-        places = {each: place for place, each in enumerate(told.classes)}
-        said = texts(column)
-        said = said.mask(said.isin([each for each in na_values if each not in places]))
-        unknown = said.notna() & ~said.isin(list(places))
+        indices = {label: index for index, label in enumerate(told.classes)}
+        labels = texts(column)
+        labels = labels.mask(labels.isin([label for label in na_values if label not in indices]))
+        unknown = labels.notna() & ~labels.isin(list(indices))
         if told.other:
-            said = said.mask(unknown, told.other)
+            labels = labels.mask(unknown, told.other)
         elif unknown.any():
-            value = said[unknown].iloc[0]
+            value = labels[unknown].iloc[0]
             raise ValueError(
-                f"column {told.name!r} has {brief(value)}{nearest(value, places)}, which is not one of its classes: "
-                f"{', '.join(told.classes[:10])}; a class can replace all others: other = {told.classes[-1]!r}"
+                f"column {told.name!r} has {brief(value)}{nearest(value, indices)}, which is not one of its classes: "
+                f"{', '.join(told.classes[:10])}; to read all other values as one, set other = {told.classes[-1]!r}"
             )
-        return said.map(places).to_numpy(np.float64)  # type: ignore[no-any-return]
+        return labels.map(indices).to_numpy(np.float64)  # type: ignore[no-any-return]
     if column.dtype.kind in "mMc":
         raise ValueError(
-            f"column {told.name!r} holds {column.dtype}, which are not numbers; leave it out, or give it the family "
-            "'category'"
+            f"column {told.name!r} has type {column.dtype}, not numbers; leave it out, or give it the family 'category'"
         )
-    read = read_numbers(column, na_values, decimal, column.attrs.get("decimal"))
-    read.check(column, "or give the column the family 'category'")
-    if read.marks:
-        warnings.warn(f"column {told.name!r} {said_of_marks(read.marks)}", stacklevel=2)
-    return read.values
+    numbers = read_numbers(column, na_values, decimal, column.attrs.get("decimal"))
+    numbers.check(column, "or give the column the family 'category'")
+    if numbers.marks:
+        warnings.warn(f"column {told.name!r} {said_of_marks(numbers.marks)}", stacklevel=2)
+    return numbers.values
 
 
 def said_of_marks(marks: Mapping[str, tuple[int, int]]) -> str:
     """Describe the cells of a column of numbers that are read as missing."""
     cells = ", ".join(f"{brief(mark)} (row {row}, {count} in all)" for mark, (row, count) in marks.items())
-    listed = ", ".join(f'"{mark}"' for mark in marks)
-    return f"holds {cells} among numbers, read as missing; na_values = [{listed}] says so without this warning"
+    quoted = ", ".join(f'"{mark}"' for mark in marks)
+    return f"holds {cells} among numbers, read as missing; set na_values = [{quoted}] to omit this warning"

@@ -46,9 +46,7 @@ class Cut:
         if (self.observed is None) != (self.horizon is None):
             raise ValueError(f"observed is {self.observed} and horizon {self.horizon}; give both, or neither")
         if self.split == "time" and self.observed is None:
-            raise ValueError(
-                "sequences are divided by time into windows; give the number of observed steps, and a horizon"
-            )
+            raise ValueError('split="time" needs windows; give the number of observed steps, and a horizon')
         if self.season is not None and self.season > (self.observed or 0):
             raise ValueError(
                 f"season is {self.season} and observed {self.observed}; a period must be within the observed steps"
@@ -73,27 +71,27 @@ class Cut:
         includes all sequences regardless of their split. "last" is the end of each sequence, including rows without
         targets.
         """
-        found = []
-        for place, low, high in self.spans(panel, split):
+        windows = []
+        for index, low, high in self.spans(panel, split):
             if self.length is None:
-                found += [(place, 0, 0)] if high else []
+                windows += [(index, 0, 0)] if high else []
             elif high - low >= self.length:
-                found.append((place, high - self.length if split == "last" else low, high - self.length))
-        return found
+                windows.append((index, high - self.length if split == "last" else low, high - self.length))
+        return windows
 
     def spans(self, panel: Panel, split: str) -> list[tuple[int, int, int]]:
         """Return (sequence, first step, end) of the steps of a split, even if they are too short for a window."""
-        found = []
+        spans = []
         everywhere = split in ("all", "last")
         parts = None if self.split == "time" or everywhere else self._parts(panel)
-        for place, one in enumerate(panel.series):
-            low, high = 0, len(one) if split == "last" else panel.present(one)
-            if parts is not None and parts[place] not in split.split("+"):
+        for index, sequence in enumerate(panel.series):
+            low, high = 0, len(sequence) if split == "last" else panel.present(sequence)
+            if parts is not None and parts[index] not in split.split("+"):
                 continue
             if parts is None and not everywhere:
                 low, high = self._between(high, split)
-            found.append((place, low, high))
-        return found
+            spans.append((index, low, high))
+        return spans
 
     def _between(self, total: int, split: str) -> tuple[int, int]:
         """Return first step and end of a split by time, for a sequence of this length."""
@@ -106,20 +104,20 @@ class Cut:
 
     def _parts(self, panel: Panel) -> list[str]:
         """Return the split of every sequence."""
-        units = [one.group if self.split == "group" else one.name for one in panel.series]
-        said = {unit: one.split for unit, one in zip(units, panel.series, strict=True) if one.split}
-        if said and len({one.split == "" for one in panel.series}) > 1:
-            silent = next(one.name for one in panel.series if not one.split)
+        units = [sequence.group if self.split == "group" else sequence.name for sequence in panel.series]
+        splits = {unit: sequence.split for unit, sequence in zip(units, panel.series, strict=True) if sequence.split}
+        if splits and len({sequence.split == "" for sequence in panel.series}) > 1:
+            unassigned = next(sequence.name for sequence in panel.series if not sequence.split)
             raise ValueError(
-                f"some sequences of {panel.name} state their split ({', '.join(sorted(set(said.values())))}), but "
-                f"others, such as {silent!r}, do not; give it for all, or for none"
+                f"some sequences of {panel.name} state their split ({', '.join(sorted(set(splits.values())))}), but "
+                f"others, such as {unassigned!r}, do not; give it for all, or for none"
             )
-        if said:
-            return [one.split for one in panel.series]
+        if splits:
+            return [sequence.split for sequence in panel.series]
         if self.split == "group" and not any(units):
             raise ValueError(
-                f'split="group" holds out groups, but no column of {panel.name} gives the group of a sequence; '
-                'name one, such as group="region" of its columns, or --group region'
+                f'split="group" needs groups, but no column of {panel.name} has the role group; name one, such as '
+                'group="region", or --group region'
             )
         names = sorted(dict.fromkeys(units), key=lambda name: hashlib.sha256(f"{self.seed} {name}".encode()).digest())
         test, validation = (int(np.ceil(share * len(names))) for share in (self.test, self.validation))
@@ -130,5 +128,5 @@ class Cut:
                 'divide them by time: split="time", with observed and horizon'
             )
         parts = ["test"] * test + ["validation"] * validation + ["train"] * len(names)
-        places = dict(zip(names, parts, strict=False))
-        return [places[unit] for unit in units]
+        part_of = dict(zip(names, parts, strict=False))
+        return [part_of[unit] for unit in units]

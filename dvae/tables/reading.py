@@ -64,65 +64,65 @@ def read_frame(path: str | os.PathLike[str]) -> Any:
         FileNotFoundError: if the file does not exist.
         ValueError: if the file is not a table, or exceeds a limit.
     """
-    place = Path(path)
-    suffix = place.suffix.lower()
+    file = Path(path)
+    suffix = file.suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"{place} is not a table; tables end in {', '.join(SUFFIXES)}")
-    content = files.read(place, LARGEST, links=True)
+        raise ValueError(f"{file} is not a table; tables end in {', '.join(SUFFIXES)}")
+    content = files.read(file, LARGEST, links=True)
     if suffix == ".npz":
-        return _of_arrays(place, content)
+        return _read_npz(file, content)
     try:
-        return _parquet(content) if suffix == ".parquet" else _separated(content, SEPARATORS[suffix])
+        return _read_parquet(content) if suffix == ".parquet" else _read_text(content, SEPARATORS[suffix])
     except ImportError as error:
-        raise ValueError(f"{place} is Parquet, which needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
+        raise ValueError(f"{file} is Parquet, which needs pyarrow: pip install 'pyro-dvae[parquet]'") from error
     except Exception as error:  # parsers raise many types
-        raise ValueError(f"{place} cannot be read as {suffix[1:].upper()}: {str(error)[:300]}") from error
+        raise ValueError(f"{file} cannot be read as {suffix[1:].upper()}: {str(error)[:300]}") from error
 
 
-def _separated(content: bytes, separators: str) -> Any:
+def _read_text(content: bytes, separators: str) -> Any:
     """Read a CSV as a frame of text, to be parsed once roles are known; rows longer than the header raise an error."""
     import pandas as pd
 
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         content = content.decode("utf-16").encode()
-    whole = content = content.removeprefix(codecs.BOM_UTF8)
+    full_content = content = content.removeprefix(codecs.BOM_UTF8)
     if declared := DECLARED.match(content):  # as spreadsheets write it
         separators, content = declared[1].decode(), content[declared.end() :]
     head = content[:LARGEST_HEADER].decode("utf-8", "replace")
-    separator = max(separators, key=lambda each: len(_header(head, each)))
+    separator = max(separators, key=lambda candidate: len(_header(head, candidate)))
     if max(map(len, _rows(head, separator)), default=0) > MOST:
         raise ValueError(f"it has more than {MOST} columns")
     if b"\0" in content:
         raise ValueError("it has null bytes, which are not text")
-    read = partial(pd.read_csv, sep=separator, index_col=False, dtype=str, keep_default_na=False, na_values=[""])
+    read_csv = partial(pd.read_csv, sep=separator, index_col=False, dtype=str, keep_default_na=False, na_values=[""])
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
-            frame = read(BytesIO(content), skiprows=_comments(content))
+            frame = read_csv(BytesIO(content), skiprows=_comments(content))
         except (pd.errors.ParserWarning, pd.errors.ParserError) as error:
-            raise ValueError(_longer_row(whole, separator) or str(error).strip()) from error
+            raise ValueError(_longer_row(full_content, separator) or str(error).strip()) from error
         except UnicodeDecodeError as error:
             try:
                 content.decode()
-            except UnicodeDecodeError as where:
-                line = content.count(b"\n", 0, where.start) + 1
+            except UnicodeDecodeError as position:
+                line = content.count(b"\n", 0, position.start) + 1
                 raise ValueError(
                     f"line {line} is not UTF-8, but perhaps Latin-1; save it as UTF-8, as a spreadsheet can, or "
                     "`iconv -f latin1 -t utf-8`"
                 ) from error
             raise
     header = _header(head, separator)
-    if twice := [name for name in dict.fromkeys(header) if name and header.count(name) > 1]:
+    if repeated := [name for name in dict.fromkeys(header) if name and header.count(name) > 1]:
         renamed = [name for name in frame.columns if name not in header and not name.startswith("Unnamed: ")]
         warnings.warn(
-            f"the header has several columns named {', '.join(twice)}; the further ones are read as "
+            f"the header has several columns named {', '.join(repeated)}; the further ones are read as "
             f"{', '.join(renamed)}",
             stacklevel=5,
         )
     if separator != ",":
         frame.attrs["decimal"] = decimal_sign(frame)
     if len(frame) and frame.iloc[:, -1].isna().any():
-        _warn_of_shorter_rows(whole, separator)
+        _warn_of_shorter_rows(full_content, separator)
     return _without_empty_end(frame, content)
 
 
@@ -172,8 +172,8 @@ def _without_empty_end(frame: Any, content: bytes) -> Any:
             "empty lines between the values of a single column are skipped; write NaN where a value is missing",
             stacklevel=5,
         )
-    held = np.flatnonzero(frame.notna().any(axis=1))
-    end = int(held[-1]) + 1 if len(held) else 0
+    nonempty = np.flatnonzero(frame.notna().any(axis=1))
+    end = int(nonempty[-1]) + 1 if len(nonempty) else 0
     if end and end < len(frame):
         warnings.warn(f"{len(frame) - end} empty rows at the end are left out", stacklevel=5)
         frame = frame.iloc[:end]
@@ -197,34 +197,34 @@ def _comments(content: bytes) -> int:
     return sum(1 for _ in takewhile(lambda line: line.lstrip().startswith(b"#"), lines))
 
 
-def _parquet(content: bytes) -> Any:
+def _read_parquet(content: bytes) -> Any:
     """Return a Parquet file as a frame, with its flat columns and, if named, the index that pandas stored."""
     import pyarrow
     from pyarrow import compute, parquet
 
-    kinds = pyarrow.types
-    held = parquet.ParquetFile(BytesIO(content))
-    rows, columns = held.metadata.num_rows, held.metadata.num_columns
+    types = pyarrow.types
+    file = parquet.ParquetFile(BytesIO(content))
+    rows, columns = file.metadata.num_rows, file.metadata.num_columns
     if columns > MOST:
         raise ValueError(f"it has {columns} columns; at most {MOST} are read")
-    sizes = [held.metadata.row_group(n).total_byte_size for n in range(held.metadata.num_row_groups)]
+    sizes = [file.metadata.row_group(n).total_byte_size for n in range(file.metadata.num_row_groups)]
     _refuse_large(max(sum(sizes), 8 * rows * columns))  # repeated values are compressed
-    flat = [each for each in held.schema_arrow if not kinds.is_nested(each.type)]
-    if nested := [each.name for each in held.schema_arrow if kinds.is_nested(each.type)]:
+    flat = [field for field in file.schema_arrow if not types.is_nested(field.type)]
+    if nested := [field.name for field in file.schema_arrow if types.is_nested(field.type)]:
         warnings.warn(f"columns of lists or records are left out: {', '.join(nested)}", stacklevel=2)
-    words = [each.name for each in flat if kinds.is_string(each.type) or kinds.is_large_string(each.type)]
-    names = [each.name for each in flat if not re.fullmatch(r"__index_level_\d+__", each.name)]
-    table = parquet.ParquetFile(BytesIO(content), read_dictionary=words).read(names, use_threads=False)
+    text_columns = [field.name for field in flat if types.is_string(field.type) or types.is_large_string(field.type)]
+    names = [field.name for field in flat if not re.fullmatch(r"__index_level_\d+__", field.name)]
+    table = parquet.ParquetFile(BytesIO(content), read_dictionary=text_columns).read(names, use_threads=False)
     table.validate(full=True)  # checks that texts are valid
-    for place, each in enumerate(table.schema):
-        column = table.column(place)
-        if kinds.is_dictionary(each.type) and kinds.is_string(each.type.value_type):
-            lengths = (compute.take(compute.binary_length(own.dictionary), own.indices) for own in column.chunks)
-            _refuse_large(sum(compute.sum(own).as_py() or 0 for own in lengths))
-        if each.name in words:
-            table = table.set_column(place, each.name, column.cast(each.type.value_type))
-        elif kinds.is_decimal(each.type):
-            table = table.set_column(place, each.name, column.cast(pyarrow.float64()))
+    for index, field in enumerate(table.schema):
+        column = table.column(index)
+        if types.is_dictionary(field.type) and types.is_string(field.type.value_type):
+            lengths = (compute.take(compute.binary_length(chunk.dictionary), chunk.indices) for chunk in column.chunks)
+            _refuse_large(sum(compute.sum(chunk).as_py() or 0 for chunk in lengths))
+        if field.name in text_columns:
+            table = table.set_column(index, field.name, column.cast(field.type.value_type))
+        elif types.is_decimal(field.type):
+            table = table.set_column(index, field.name, column.cast(pyarrow.float64()))
     return table.to_pandas(ignore_metadata=True)
 
 
@@ -233,26 +233,26 @@ def _refuse_large(size: int) -> None:
         raise ValueError(f"it holds {size} bytes; at most {LARGEST} are read")
 
 
-def _of_arrays(place: Path, content: bytes) -> Any:
+def _read_npz(path: Path, content: bytes) -> Any:
     """Return an npz as a frame."""
     import pandas as pd
 
-    arrays = _arrays(place, content)
+    arrays = _arrays(path, content)
     name = "x" if "x" in arrays else next(iter(arrays))
     values = arrays[name]
     if values.ndim not in (2, 3) or values.dtype.kind not in "fiub" or not values.size:
         raise ValueError(
-            f"{name!r} of {place} is {values.dtype} {values.shape}; expected numbers (sequences, steps, columns)"
+            f"{name!r} of {path} is {values.dtype} {values.shape}; expected numbers (sequences, steps, columns)"
         )
     values = values if values.ndim == 3 else values[None]
     if values.shape[2] > MOST:
-        raise ValueError(f"{name!r} of {place} has {values.shape[2]} columns; at most {MOST} are read")
-    most = values.shape[1]
-    lengths = arrays.get("lengths", np.full(len(values), most))
-    whole = lengths.shape == (len(values),) and lengths.dtype.kind in "iu"
-    if not whole or not ((lengths >= 1) & (lengths <= most)).all():
-        raise ValueError(f"'lengths' of {place} are {lengths.shape}; expected whole numbers (N,) from 1 to {most}")
-    valid = np.arange(most) < lengths[:, None]
+        raise ValueError(f"{name!r} of {path} has {values.shape[2]} columns; at most {MOST} are read")
+    longest = values.shape[1]
+    lengths = arrays.get("lengths", np.full(len(values), longest))
+    is_integer = lengths.shape == (len(values),) and lengths.dtype.kind in "iu"
+    if not is_integer or not ((lengths >= 1) & (lengths <= longest)).all():
+        raise ValueError(f"'lengths' of {path} are {lengths.shape}; expected whole numbers (N,) from 1 to {longest}")
+    valid = np.arange(longest) < lengths[:, None]
     frame = pd.DataFrame(values[valid].astype(np.float64), columns=[f"x{n}" for n in range(values.shape[2])])
     sequence, step = np.nonzero(valid)
     return frame.assign(sequence=sequence, step=step)
@@ -273,10 +273,10 @@ def read_panel(path: str | os.PathLike[str], columns: Columns | ColumnHints | No
     if is_domain(name):
         panel = domain(name)
         if columns not in (None, ColumnHints(), panel.columns):
-            raise ValueError(f"{name} has columns of its own: {', '.join(panel.columns.names[:10])}, …")
+            raise ValueError(f"{name} has fixed columns, {', '.join(panel.columns.names[:10])}, …; give no others")
         return panel
     if is_of_arrays(path):
-        return _of_mapped(Path(path), columns)
+        return _read_mapped(Path(path), columns)
     return Panel.of(read_frame(path), columns, Path(path).stem)
 
 
@@ -285,42 +285,42 @@ def is_of_arrays(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() == ".npy" or Path(path).is_dir()
 
 
-def _of_mapped(place: Path, columns: Columns | ColumnHints | None) -> Panel:
+def _read_mapped(path: Path, columns: Columns | ColumnHints | None) -> Panel:
     """Return the sequences of npy files with shape (steps, columns) or (sequences, steps, columns).
 
     Sequences of a folder have the names of their files. The file train.npy and files in the subfolder train belong to
     that split; other splits work alike.
     """
-    found = [("", place.stem, place)]
-    if place.is_dir():
-        tables = (file for file in _files(place) if file.suffix.lower() in (".npy", *SUFFIXES))
+    entries = [("", path.stem, path)]
+    if path.is_dir():
+        tables = (file for file in _files(path) if file.suffix.lower() in (".npy", *SUFFIXES))
         files_in = sorted(islice(tables, MOST_FILES + 1))
         if others := [file for file in files_in if file.suffix.lower() != ".npy"]:
             raise ValueError(
-                f"{place} holds {others[0].relative_to(place)} in addition to npy files; a folder must have npy files "
-                "only, so write it as one, or move it elsewhere"
+                f"{path} holds {others[0].relative_to(path)} in addition to npy files; a folder must have npy files "
+                "only, so convert it to npy, or move it elsewhere"
             )
         if not 0 < len(files_in) <= MOST_FILES:
-            many = f"more than {MOST_FILES:,}" if files_in else "none"
-            raise ValueError(f"{place} must have npy files, from 1 to {MOST_FILES:,}; it has {many}")
-        names = [file.relative_to(place).with_suffix("").as_posix() for file in files_in]
+            count = f"more than {MOST_FILES:,}" if files_in else "none"
+            raise ValueError(f"{path} must have npy files, from 1 to {MOST_FILES:,}; it has {count}")
+        names = [file.relative_to(path).with_suffix("").as_posix() for file in files_in]
         splits = (name.partition("/")[0] for name in names)
-        found = list(zip((split if split in SPLITS else "" for split in splits), names, files_in, strict=True))
+        entries = list(zip((split if split in SPLITS else "" for split in splits), names, files_in, strict=True))
     series = []
-    for split, name, file in found:
-        values = mapped(file, links=file is place)
+    for split, name, file in entries:
+        values = mapped(file, links=file is path)
         if values.ndim not in (2, 3) or values.shape[-1] > MOST:
             raise ValueError(
                 f"{file} has shape {values.shape}; expected (steps, columns), or (sequences, steps, columns), of at "
                 f"most {MOST} columns{'; a single one is (steps, 1)' if values.ndim == 1 else ''}"
             )
-        parts = [(name, values)] if values.ndim == 2 else [(f"{name}/{n}", each) for n, each in enumerate(values)]
-        series += [Series(own, each, split=split) for own, each in parts]
-    return Panel(series, plain_columns(columns, series[0].values.shape[1]), place.stem)
+        parts = [(name, values)] if values.ndim == 2 else [(f"{name}/{n}", array) for n, array in enumerate(values)]
+        series += [Series(label, array, split=split) for label, array in parts]
+    return Panel(series, plain_columns(columns, series[0].values.shape[1]), path.stem)
 
 
-def _files(place: Path) -> Iterator[Path]:
-    return (Path(folder, name) for folder, _, names in os.walk(place) for name in names)
+def _files(root: Path) -> Iterator[Path]:
+    return (Path(folder, name) for folder, _, names in os.walk(root) for name in names)
 
 
 def is_domain(name: str) -> bool:
@@ -328,7 +328,7 @@ def is_domain(name: str) -> bool:
     return name in DOMAINS and not Path(name).exists()
 
 
-def _arrays(place: Path, content: bytes) -> dict[str, np.ndarray]:
+def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(BytesIO(content)) as archive:
             if (size := sum(entry.file_size for entry in archive.infolist())) > LARGEST:
@@ -337,24 +337,24 @@ def _arrays(place: Path, content: bytes) -> dict[str, np.ndarray]:
             for entry in entries if len(entries) == 1 else {"x.npy", "lengths.npy"}.intersection(entries):
                 with archive.open(entry) as member:
                     _check_header(entry, member)
-        with np.load(BytesIO(content), allow_pickle=False) as loaded:
-            found = {name: loaded[name] for name in loaded.files if name in ("x", "lengths") or len(loaded.files) == 1}
+        with np.load(BytesIO(content), allow_pickle=False) as npz:
+            arrays = {name: npz[name] for name in npz.files if name in ("x", "lengths") or len(npz.files) == 1}
     except Exception as error:
-        raise ValueError(f"{place} cannot be read as npz: {str(error)[:300]}") from error
-    if not set(found) - {"lengths"}:
+        raise ValueError(f"{path} cannot be read as npz: {str(error)[:300]}") from error
+    if not set(arrays) - {"lengths"}:
         raise ValueError(
-            f"{place} holds {', '.join(loaded.files[:20]) or 'nothing'}; expected an array 'x', or one alone"
+            f"{path} holds {', '.join(npz.files[:20]) or 'nothing'}; expected an array 'x', or a single array"
         )
-    return found
+    return arrays
 
 
 def _check_header(name: str, member: Any) -> None:
     """Check the size of an array before memory is allocated."""
-    reads = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(member)
-    if version not in reads:
+    if version not in readers:
         raise ValueError(f"{name} is not an array of numbers")
-    shape, _, _ = reads[version](member)
+    shape, _, _ = readers[version](member)
     if 8 * math.prod(shape) > LARGEST:
         raise ValueError(f"{name} is {shape}; at most {LARGEST // 8} numbers are read")
 
@@ -365,38 +365,42 @@ def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | ColumnHints |
     Raises:
         ValueError: if the schema is invalid; the message names its file.
     """
-    place = Path(path)
-    inside = [place / "schema.toml"] if place.is_dir() else []
-    for file in (*inside, place.with_suffix(".toml"), place.parent / "schema.toml"):
+    table = Path(path)
+    inside = [table / "schema.toml"] if table.is_dir() else []
+    for file in (*inside, table.with_suffix(".toml"), table.parent / "schema.toml"):
         if file.is_file():
             try:
                 return read_schema(files.read(file, LARGEST_SCHEMA, links=True).decode())
             except (UnicodeDecodeError, ValueError, TypeError) as error:
-                raise ValueError(f"{file} is not the schema of a table: {error}") from error
+                raise ValueError(f"{file} is not a valid schema of a table: {error}") from error
     return None, None
 
 
 def read_schema(text: str) -> tuple[Columns | ColumnHints | None, Cut | None]:
     """Return columns (`ColumnHints` if the schema does not list them all) and cut; None for a missing part."""
-    told = parsed(text)
-    cut = told.pop("cut", None)
+    entries = parsed(text)
+    cut = entries.pop("cut", None)
     if cut is not None:
         if not isinstance(cut, dict):
             raise ValueError("cut must be a table: [cut]")
-        known = [field.name for field in fields(Cut)]
+        allowed = [field.name for field in fields(Cut)]
         for name in cut:
-            if name not in known:
-                raise ValueError(f"[cut] has an entry {name!r}{nearest(name, known)}; known are {', '.join(known)}")
-    columns = Columns.from_config(told) if "columns" in told else ColumnHints(**layout(told)) if told else None
+            if name not in allowed:
+                raise ValueError(
+                    f"[cut] has an entry {name!r}{nearest(name, allowed)}; known entries: {', '.join(allowed)}"
+                )
+    columns = (
+        Columns.from_config(entries) if "columns" in entries else ColumnHints(**layout(entries)) if entries else None
+    )
     return columns, None if cut is None else Cut(**cut)
 
 
 def written_schema(columns: Columns, cut: Cut) -> str:
     """Return a schema as an editable TOML file."""
-    told = {name: value for name, value in asdict(cut).items() if value != getattr(Cut, name)}
+    entries = {name: value for name, value in asdict(cut).items() if value != getattr(Cut, name)}
     lines = [
         "[cut]",
-        f'split = "{told.pop("split", cut.split)}"',
-        *(f"{name} = {value}" for name, value in told.items()),
+        f'split = "{entries.pop("split", cut.split)}"',
+        *(f"{name} = {value}" for name, value in entries.items()),
     ]
     return columns.to_toml() + "\n" + "\n".join(lines) + "\n"

@@ -62,45 +62,50 @@ class PanelWindows:
         self.panel, self.schema, self.split = panel, schema, split
         self._ranges = schema.cut.starts(panel, split)
         if schema.columns.group:  # windows of a group are drawn together
-            self._ranges.sort(key=lambda each: panel.series[each[0]].group)
+            self._ranges.sort(key=lambda entry: panel.series[entry[0]].group)
         shortest = schema.cut.length or 1
-        cut_from = schema.cut.spans(panel, split)
+        spans = schema.cut.spans(panel, split)
         self.skipped = {
-            panel.series[place].name: max(high - low, 0) for place, low, high in cut_from if high - low < shortest
+            panel.series[index].name: max(high - low, 0) for index, low, high in spans if high - low < shortest
         }
-        steps = [panel.present(one) for one in panel]
-        none = (
-            f"{panel.name} has no {split} window of {schema.cut.name}; up to their last targets its {len(panel)} "
-            f"sequences have {min(steps)} to {max(steps)} steps"
-            f"{f', and {split} has a share of 0 of them' if getattr(schema.cut, split, 1) == 0 else ''}"
+        steps = [panel.present(sequence) for sequence in panel]
+        message = (
+            f"{panel.name} has no {split} window of {schema.cut.name}; its {len(panel)} sequences have {min(steps)} to "
+            f"{max(steps)} steps up to their last targets"
+            f"{f', and the share of {split} is 0' if getattr(schema.cut, split, 1) == 0 else ''}"
         )
         if not self._ranges:
-            raise ValueError(none)
-        some = [panel.series[place] for place, _, _ in self._ranges]
-        rows = torch.tensor([len(one) for one in some])
-        self._first = rows.cumsum(0) - rows
-        self._lengths = torch.tensor([panel.present(one) for one in some])
+            raise ValueError(message)
+        sequences = [panel.series[index] for index, _, _ in self._ranges]
+        lengths = torch.tensor([len(sequence) for sequence in sequences])
+        self._first = lengths.cumsum(0) - lengths
+        self._lengths = torch.tensor([panel.present(sequence) for sequence in sequences])
         self._low, self._last = torch.tensor([ends for _, *ends in self._ranges]).unbind(1)
-        self._values = [one.values for one in some]
+        self._values = [sequence.values for sequence in sequences]
         last = self._lengths if schema.cut.length is None else self._last + schema.cut.length
-        parts = [one.values[low:end] for one, low, end in zip(some, self._low.tolist(), last.tolist(), strict=True)]
-        gapped = (part for one, part in zip(some, parts, strict=True) if one.name not in panel.complete)
-        self._missing = any(np.isnan(schema.encoded(block)).any() for block in row_blocks(gapped))
+        parts = [
+            sequence.values[low:end]
+            for sequence, low, end in zip(sequences, self._low.tolist(), last.tolist(), strict=True)
+        ]
+        incomplete = (
+            part for sequence, part in zip(sequences, parts, strict=True) if sequence.name not in panel.complete
+        )
+        self._missing = any(np.isnan(schema.encoded(block)).any() for block in row_blocks(incomplete))
         if unforeseen := schema.unforeseen(parts):
             warnings.warn(
                 f"the {split} part of {panel.name} has missing values in {', '.join(unforeseen)}, where training data "
-                "have none; the last value before, or the mean, replaces them, and models receive no indicator",
+                "have none; they are replaced by the previous value or the mean, and models receive no indicator",
                 stacklevel=2,
             )
         self._context = {}
         for name, make in ((COVARIATES, schema.context), (GAPS, schema.gaps)):
             if name in schema.sizes:
-                self._context[name] = [make(one).astype(np.float32) for one in some]
+                self._context[name] = [make(sequence).astype(np.float32) for sequence in sequences]
         self._static = None
         if STATICS in schema.sizes:
-            self._static = torch.from_numpy(np.stack([schema.static(one) for one in some])).float()
+            self._static = torch.from_numpy(np.stack([schema.static(sequence) for sequence in sequences])).float()
         if self._missing and not len(self):
-            raise ValueError(f"{none}, and left out are {self.left_out}")
+            raise ValueError(f"{message}; left out are {self.left_out}")
         self._weights = (self._last - self._low + 1).double().cumsum(0)
 
     @property
@@ -113,21 +118,21 @@ class PanelWindows:
         """Description of omitted sequences and windows; empty if none are omitted."""
         parts = [self.too_short] if self.skipped else []
         if self.n_unobserved:
-            parts.append(f"{self.n_unobserved} windows, in whose past or future no target was observed")
+            parts.append(f"{self.n_unobserved} windows without an observed target in their past or future")
         return " and ".join(parts)
 
     @property
     def too_short(self) -> str:
         """Names and lengths of the sequences that are too short for a window; empty if none are."""
-        named = [f"{name}: {steps}" for name, steps in islice(self.skipped.items(), NAMED)]
+        examples = [f"{name}: {steps}" for name, steps in islice(self.skipped.items(), NAMED)]
         more = f" and {len(self.skipped) - NAMED} more" if len(self.skipped) > NAMED else ""
-        said = f"{len(self.skipped)} sequences, which have fewer than {self.length} steps there"
-        return f"{said} ({', '.join(named)}{more})" if named else ""
+        text = f"{len(self.skipped)} sequences with fewer than {self.length} steps in this split"
+        return f"{text} ({', '.join(examples)}{more})" if examples else ""
 
     @property
     def n_unobserved(self) -> int:
-        """Number of windows that are not listed, since no target was observed in their past or future."""
-        return int(self._counts.sum()) - len(self._listed()[0])
+        """Number of windows that are not listed because no target was observed in their past or future."""
+        return int(self._counts.sum()) - len(self._list_windows()[0])
 
     @property
     def protocol(self) -> Cut:
@@ -146,18 +151,18 @@ class PanelWindows:
         return list(self._keys())
 
     def _keys(self) -> Iterator[tuple[str, str, int]]:
-        names = [self.panel.series[place].name for place, _, _ in self._ranges]
-        for some in zip(*(part.split(4096) for part in self._windows), strict=True):
+        names = [self.panel.series[index].name for index, _, _ in self._ranges]
+        for chunk in zip(*(part.split(4096) for part in self._windows), strict=True):
             yield from (
-                (self.split, names[place], start) for place, start in zip(*map(Tensor.tolist, some), strict=True)
+                (self.split, names[index], start) for index, start in zip(*map(Tensor.tolist, chunk), strict=True)
             )
 
     @property
     def clusters(self) -> list[tuple[str, str, int]]:
-        """Keys by group instead of sequence, if the data have groups, whose sequences are not independent evidence."""
+        """Keys by group instead of sequence if the data have groups, since sequences of a group are dependent."""
         if not self.schema.columns.group:
             return self.keys
-        groups = [self.panel.series[self._ranges[place][0]].group for place in self._windows[0].tolist()]
+        groups = [self.panel.series[self._ranges[index][0]].group for index in self._windows[0].tolist()]
         return [(split, group, start) for (split, _, start), group in zip(self.keys, groups, strict=True)]
 
     @property
@@ -165,19 +170,21 @@ class PanelWindows:
         """Columns with their units, means and scales, stored with results."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}
         coordinates = self.schema.units["x"]
-        said: dict[str, Any] = {
+        entries: dict[str, Any] = {
             "columns": columns,
             "means": [coordinate.mean for coordinate in coordinates],
             "scales": [coordinate.scale for coordinate in coordinates],
             "called": ["group" if self.schema.columns.group else "sequence", "step"],
         }
-        said |= {} if self.protocol.season is None else {"season": self.protocol.season}
-        return {**said, "title": [self.panel.name, self.split]}
+        entries |= {} if self.protocol.season is None else {"season": self.protocol.season}
+        return {**entries, "title": [self.panel.name, self.split]}
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 of the data, their cut, and the split."""
-        schema = {name: own for name, own in self.schema.config().items() if name != "calendar"}  # does not affect x
+        schema = {
+            name: value for name, value in self.schema.config().items() if name != "calendar"
+        }  # does not affect x
         digest = hashlib.sha256(f"{self.panel.fingerprint()}({schema!r}, {self.split!r}, ".encode())
         hash_list(digest, self._keys())
         digest.update(b")")
@@ -189,35 +196,35 @@ class PanelWindows:
         In a panel with groups, a batch has few groups, with several windows each.
         """
         if self.schema.columns.group:
-            return self._cut(*self._of_groups(batch_size, generator))
+            return self._cut(*self._sample_groups(batch_size, generator))
         if self.length is None:
-            chosen = torch.randperm(len(self._ranges), generator=generator)[:batch_size]
-            return self._cut(chosen, torch.zeros_like(chosen))
-        which, where = torch.rand(2, batch_size, dtype=torch.float64, generator=generator)
-        found = torch.searchsorted(self._weights, which * self._weights[-1], right=True)
-        low, last = self._low[found], self._last[found]
-        return self._cut(found, low + (where * (last - low + 1)).long())
+            selected = torch.randperm(len(self._ranges), generator=generator)[:batch_size]
+            return self._cut(selected, torch.zeros_like(selected))
+        u_range, u_start = torch.rand(2, batch_size, dtype=torch.float64, generator=generator)
+        indices = torch.searchsorted(self._weights, u_range * self._weights[-1], right=True)
+        low, last = self._low[indices], self._last[indices]
+        return self._cut(indices, low + (u_start * (last - low + 1)).long())
 
-    def _of_groups(self, batch_size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _sample_groups(self, batch_size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return range and first step of windows of some groups, drawn in proportion to their number of windows."""
-        names = [self.panel.series[place].group for place, _, _ in self._ranges]
-        below = torch.cat([self._weights.new_zeros(1), self._weights])
+        names = [self.panel.series[index].group for index, _, _ in self._ranges]
+        cumulative = torch.cat([self._weights.new_zeros(1), self._weights])
         first = torch.tensor([n for n, name in enumerate(names) if n == 0 or names[n - 1] != name])
-        start, end = below[first], below[torch.cat([first[1:], torch.tensor([len(names)])])]
-        which, among, where = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
-        drawn = torch.searchsorted(end, which[: -(-batch_size // GROUPED)] * below[-1], right=True)
-        group = drawn.repeat_interleave(GROUPED)[:batch_size]
-        chosen = start[group] + among * (end - start)[group]
-        found = torch.searchsorted(self._weights, chosen, right=True)
-        low, last = self._low[found], self._last[found]
-        return found, low + (where * (last - low + 1)).long()
+        start, end = cumulative[first], cumulative[torch.cat([first[1:], torch.tensor([len(names)])])]
+        u_group, u_window, u_start = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
+        sampled = torch.searchsorted(end, u_group[: -(-batch_size // GROUPED)] * cumulative[-1], right=True)
+        group = sampled.repeat_interleave(GROUPED)[:batch_size]
+        positions = start[group] + u_window * (end - start)[group]
+        indices = torch.searchsorted(self._weights, positions, right=True)
+        low, last = self._low[indices], self._last[indices]
+        return indices, low + (u_start * (last - low + 1)).long()
 
     def some(self, places: Sequence[int]) -> Self:
         """Return some of the listed windows."""
-        found = copy(self)
-        which, starts = self._windows
-        found._windows = which[list(places)], starts[list(places)]
-        return found
+        subset = copy(self)
+        ranges, starts = self._windows
+        subset._windows = ranges[list(places)], starts[list(places)]
+        return subset
 
     def all(self) -> Batch:
         """Return the listed windows, in the order of `keys`."""
@@ -231,7 +238,7 @@ class PanelWindows:
         if self.length is None or self.schema.columns.group:
             return Sequences(self.all()).batches(batch_size)
         parts = (part.split(batch_size) for part in self._windows)
-        return (self._cut(which, starts) for which, starts in zip(*parts, strict=True))
+        return (self._cut(ranges, starts) for ranges, starts in zip(*parts, strict=True))
 
     def forecast(self, model: DynamicalVAE, samples: int = 100, seed: int = 0) -> PanelForecasts:
         """Draw futures of the listed windows, given their observed steps and known covariates.
@@ -252,15 +259,15 @@ class PanelWindows:
         if self.skipped:
             warnings.warn(f"forecasts leave out {self.too_short}", stacklevel=2)
         batch = self.all()
-        past, known = batch.past(observed), batch.mask_to_nan().numpy()
+        past, targets = batch.past(observed), batch.mask_to_nan().numpy()
         with seeded_evaluation(model, seed):
             parts = [
                 model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
                 for part in Sequences(past).batches(AT_ONCE)
             ]
         keys = [(name, start + observed) for _, name, start in self.keys]
-        beside = known[:, :observed], known[:, observed:], columns_of(self), keys
-        return PanelForecasts(np.concatenate(parts, 1, dtype=np.float64), *beside, *self.times(observed + horizon))
+        fields = targets[:, :observed], targets[:, observed:], columns_of(self), keys
+        return PanelForecasts(np.concatenate(parts, 1, dtype=np.float64), *fields, *self.times(observed + horizon))
 
     def impute(self, model: DynamicalVAE, samples: int = 100, seed: int = 0, particles: int = 1) -> PanelImputed:
         """Draw the missing targets of the listed windows.
@@ -278,7 +285,7 @@ class PanelWindows:
         require(Count, samples=samples, particles=particles)
         batch = self.all()
         if (mask := batch.mask()) is None:
-            raise ValueError(f"nothing is missing in {self.panel.name}")
+            raise ValueError(f"no target is missing in {self.panel.name}")
         with seeded_evaluation(model, seed):
             parts = [
                 model.impute(on_device_of(model, part), samples, draw=True, particles=particles)["x"].cpu().numpy()
@@ -286,10 +293,10 @@ class PanelWindows:
             ]
         count, steps = batch["x"].shape[:2]
         lengths = torch.full((count,), steps) if batch.lengths is None else batch.lengths
-        lacking = ~mask.numpy() & (np.arange(steps) < lengths[:, None].numpy())[..., None]
+        missing = ~mask.numpy() & (np.arange(steps) < lengths[:, None].numpy())[..., None]
         keys = [(name, start) for _, name, start in self.keys]
         draws = np.concatenate(parts, 1, dtype=np.float64)
-        return PanelImputed(draws, lacking, columns_of(self), keys, *self.times(steps))
+        return PanelImputed(draws, missing, columns_of(self), keys, *self.times(steps))
 
     def times(self, steps: int) -> tuple[np.ndarray | None, Calendar]:
         """Return times (N, steps) from the start of each listed window, None without times, and their calendar.
@@ -297,19 +304,19 @@ class PanelWindows:
         After the end of a sequence they continue as `Calendar.after` describes.
         """
         calendar = self.panel.calendar
-        places, starts = map(Tensor.tolist, self._windows)
-        listed = [self.panel.series[self._ranges[place][0]] for place in places]
-        found = [one.moments(start, steps, calendar) for one, start in zip(listed, starts, strict=True)]
-        known = [own for own in found if own is not None]
-        return (np.stack(known), calendar) if len(known) == len(found) else (None, calendar)
+        indices, starts = map(Tensor.tolist, self._windows)
+        sequences = [self.panel.series[self._ranges[index][0]] for index in indices]
+        moments = [sequence.moments(start, steps, calendar) for sequence, start in zip(sequences, starts, strict=True)]
+        available = [values for values in moments if values is not None]
+        return (np.stack(available), calendar) if len(available) == len(moments) else (None, calendar)
 
     @property
     def _stride(self) -> int:
         """Steps between listed windows: as the protocol defines for test windows, else half a horizon."""
-        how = self.schema.cut
-        if how.horizon is None:
+        cut = self.schema.cut
+        if cut.horizon is None:
             return 1
-        return how.stride or how.horizon if self.split == "test" else max(how.horizon // 2, 1)
+        return cut.stride or cut.horizon if self.split == "test" else max(cut.horizon // 2, 1)
 
     @property
     def _counts(self) -> Tensor:
@@ -319,65 +326,71 @@ class PanelWindows:
     @cached_property
     def _windows(self) -> tuple[Tensor, Tensor]:
         """Range and first step of the listed windows; all of them, or `some`."""
-        return self._listed()
+        return self._list_windows()
 
-    def _listed(self) -> tuple[Tensor, Tensor]:
+    def _list_windows(self) -> tuple[Tensor, Tensor]:
         counts = self._counts
-        which = torch.arange(len(counts)).repeat_interleave(counts)
-        place = torch.arange(len(which)) - (counts.cumsum(0) - counts)[which]
-        starts = self._low[which] + self._stride * place
+        ranges = torch.arange(len(counts)).repeat_interleave(counts)
+        number = torch.arange(len(ranges)) - (counts.cumsum(0) - counts)[ranges]
+        starts = self._low[ranges] + self._stride * number
         if not self._missing or self.length is None or self.split in ("all", "last"):
-            return which, starts
-        seen = (~np.isnan(self.schema.encoded(block)) for block in row_blocks(self._values))
-        some = np.concatenate([each.all(1) if is_whole(self.schema.columns) else each.any(1) for each in seen])
-        known = torch.cat([torch.zeros(1).long(), torch.from_numpy(some).cumsum(0)])
-        first = self._first[which] + starts
-        start, now, end = known[first], known[first + (self.schema.cut.observed or 0)], known[first + self.length]
-        told = (now > start) & (end > now)  # with an observed target in past and future
-        return which[told], starts[told]
+            return ranges, starts
+        observed = (~np.isnan(self.schema.encoded(block)) for block in row_blocks(self._values))
+        is_observed = np.concatenate(
+            [mask.all(1) if is_whole(self.schema.columns) else mask.any(1) for mask in observed]
+        )
+        totals = torch.cat([torch.zeros(1).long(), torch.from_numpy(is_observed).cumsum(0)])
+        first = self._first[ranges] + starts
+        n_start, n_present, n_end = (
+            totals[first],
+            totals[first + (self.schema.cut.observed or 0)],
+            totals[first + self.length],
+        )
+        valid = (n_present > n_start) & (n_end > n_present)  # with an observed target in past and future
+        return ranges[valid], starts[valid]
 
-    def _cut(self, which: Tensor, starts: Tensor) -> Batch:
+    def _cut(self, ranges: Tensor, starts: Tensor) -> Batch:
         """Return the windows that start at these steps of their ranges."""
-        lengths = self._lengths[which] if self.length is None else self.length
-        x = torch.from_numpy(self.schema.encoded(cut_windows(self._values, which, starts, lengths).numpy())).double()
+        lengths = self._lengths[ranges] if self.length is None else self.length
+        x = torch.from_numpy(self.schema.encoded(cut_windows(self._values, ranges, starts, lengths).numpy())).double()
         batch = Batch(x=x)
         if isinstance(lengths, Tensor) and (lengths != lengths[0]).any():
             batch["lengths"] = lengths
         if self._missing:
-            seen = x.isfinite()
+            finite = x.isfinite()
             batch["mask"] = (
-                seen.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if is_whole(self.schema.columns) else seen
+                finite.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if is_whole(self.schema.columns) else finite
             )
             x.nan_to_num_(0.0)
         for name, values in self._context.items():
-            batch[name] = cut_windows(values, which, starts, lengths)
+            batch[name] = cut_windows(values, ranges, starts, lengths)
         if COVARIATES in batch and (observed := self.schema.cut.observed) is not None:
             batch[COVARIATES] = carry_forward(batch[COVARIATES], observed, self.schema)
         if self.schema.columns.group:
-            batch["group"] = torch.tensor(self._grouped(which.tolist(), starts.tolist()))
+            batch["group"] = torch.tensor(self._group_ids(ranges.tolist(), starts.tolist()))
         if self._static is not None:
-            batch[STATICS] = self._static[which]
+            batch[STATICS] = self._static[ranges]
         return batch
 
-    def _grouped(self, which: list[int], starts: list[int]) -> list[int]:
+    def _group_ids(self, ranges: list[int], starts: list[int]) -> list[int]:
         """Return the group of each window.
 
         Outside training, only windows with the same present share a group. Otherwise one window could reveal the future
         of another.
         """
-        observed, found, known = self.schema.cut.observed, [], dict[Any, int]()
-        for place, start in zip(which, starts, strict=True):
-            one = self.panel.series[self._ranges[place][0]]
+        observed, group_ids, numbers = self.schema.cut.observed, [], dict[Any, int]()
+        for index, start in zip(ranges, starts, strict=True):
+            sequence = self.panel.series[self._ranges[index][0]]
             present: Any = None
             if observed is not None and self.split != "train":
                 last = start + observed - 1
-                present = last if one.times is None else one.times[last]
-            found.append(known.setdefault((one.group, present), len(known)))
-        return found
+                present = last if sequence.times is None else sequence.times[last]
+            group_ids.append(numbers.setdefault((sequence.group, present), len(numbers)))
+        return group_ids
 
 
 def carry_forward(context: Tensor, observed: int, schema: PanelSchema) -> Tensor:
-    """Return covariates (B, T, C) as known at the present: those of role "past" repeat their last value."""
+    """Replace future values of "past" covariates (B, T, C) by their last observed value, and their indicators by 0."""
     values, indicators = schema.ending
     if values:
         context[:, observed:, values] = context[:, observed - 1 : observed, values]

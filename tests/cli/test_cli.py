@@ -86,10 +86,10 @@ def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
         ("evaluate RUN --samples 0", "--samples is 0; it must be at least 1"),
         ("evaluate RUN --bound-particles -1", "--bound-particles is -1; it must be at least 0"),
         ("evaluate RUN --out .", "--out . is a directory; name a file"),
-        ("evaluate RUN --figure scores.xyz", "--figure scores.xyz: the end of the name is the format, one of"),
+        ("evaluate RUN --figure scores.xyz", "--figure scores.xyz: the suffix selects the format, one of"),
         ("evaluate", "at least one run"),
         ("evaluate RUN RUN", "named twice"),
-        ("show srnn --out graph", "--out graph: the end of the name is the format"),
+        ("show srnn --out graph", "--out graph: the suffix selects the format"),
     ],
 )
 def test_what_makes_no_sense_exits_with_2_first(capsys, tmp_path, monkeypatch, people, fitted, arguments, message):
@@ -349,7 +349,7 @@ def test_what_torchrun_starts_again_goes_on_with_its_run(people, tmp_path, capsy
     assert main(arguments) == 0
     assert "contains a run; continuing it" in capsys.readouterr().err
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
-    assert "already holds a run" in failure(capsys, *arguments)
+    assert "already contains a run" in failure(capsys, *arguments)
     assert "start it without torchrun" in failure(capsys, "sweep", "vae", "--out", str(tmp_path / "runs"))
 
 

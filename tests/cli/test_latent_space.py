@@ -192,8 +192,8 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("fit motion-latent --protocol cmu8 --out new", "--protocol is about motion, and motion-latent is fitted on"),
-        ("fit vae --cut clips --out new", "--cut is about segments of motion, and vae is fitted on motion"),
+        ("fit motion-latent --protocol cmu8 --out new", "--protocol is for motion, and motion-latent is fitted on"),
+        ("fit vae --cut clips --out new", "--cut is for segments of motion, and vae is fitted on motion"),
         ("fit motion-latent --cut clip --out new", "did you mean 'clips'"),
         (
             "sweep motion-latent vae --out new",

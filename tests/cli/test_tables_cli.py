@@ -87,7 +87,7 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     assert "test windows of 6 + 2 steps" in printed
     schema = tmp_path / "riders.toml"
     assert main(["data", "info", str(path), "--out", str(schema)]) == 0
-    assert "correct it" in capsys.readouterr().err
+    assert "edit it" in capsys.readouterr().err
     assert main(["data", "info", str(path), "--columns", "temp", "--time", "day", "--na-values", "-999", "?"]) == 0
     told = capsys.readouterr().out
     assert 'na_values = ["-999", "?"]' in told
@@ -99,7 +99,7 @@ def test_info_proposes_a_schema_that_is_then_read(table, capsys, tmp_path):
     assert "overdispersed" in capsys.readouterr().out
     schema.write_text(schema.read_text().replace('family = "overdispersed"', 'unt = "people"'))
     assert (
-        "riders.toml is not the schema of a table: column 'riders' has an entry 'unt' (did you mean 'unit'?)"
+        "riders.toml is not a valid schema of a table: column 'riders' has an entry 'unt' (did you mean 'unit'?)"
         in failure(capsys, "data", "info", path)
     )
     assert "--out writes the schema of one table" in failure(
@@ -119,7 +119,7 @@ def test_what_is_proposed_of_dates_units_and_row_numbers_is_said(tmp_path, capfd
     assert "note: each value of shop is read as a separate sequence" in out
     assert "write them as 2024-12-31" in error
     assert "remove '€')" in error
-    assert "'Unnamed: 0' (the numbers of the rows" in error
+    assert "'Unnamed: 0' (row numbers" in error
     assert "Exception ignored" not in error
 
 
@@ -273,12 +273,12 @@ def test_runs_are_compared_criticised_resumed_and_swept(tabled, table, tmp_path,
     [
         (["--columns", "ridrs"], "no column 'ridrs' (did you mean 'riders'?)"),
         (["--columns", "riders:cout"], "family 'cout' (did you mean 'count'?)"),
-        (["--columns", "temp:count"], "the family 'count' is of whole numbers from 0"),
+        (["--columns", "temp:count"], "the family 'count' requires whole numbers from 0"),
         (["--observed", "500", "--horizon", "3"], "no training window of 500 + 3 steps"),
         (["--test", "1.5"], "test is 1.5"),
-        (["--split", "group"], "no column of riders gives the group of a sequence; name one"),
-        (["--skip-bad"], "--skip-bad is about motion, and vae is fitted on a table"),
-        (["--protocol", "cmu8"], "--protocol is about motion, and vae is fitted on a table"),
+        (["--split", "group"], "no column of riders has the role group; name one"),
+        (["--skip-bad"], "--skip-bad is for motion, and vae is fitted on a table"),
+        (["--protocol", "cmu8"], "--protocol is for motion, and vae is fitted on a table"),
     ],
 )
 def test_what_does_not_fit_the_table_is_a_wrong_argument(table, tmp_path, capsys, arguments, said):
@@ -289,10 +289,10 @@ def test_what_does_not_fit_the_table_is_a_wrong_argument(table, tmp_path, capsys
 def test_options_of_tables_are_not_those_of_motion(people, tabled, tmp_path, capsys):
     out = ["--out", tmp_path / "run"]
     segments = failure(capsys, "fit", "motion-latent", *out, "--data", people, "--columns", "a", code=2)
-    assert "--columns is about a table, and motion-latent is fitted on segments of motion" in segments
+    assert "--columns is for a table, and motion-latent is fitted on segments of motion" in segments
     for option in ("--observed", "--test"):
         said = failure(capsys, "fit", "vae", *out, option, "0", code=2)
-        assert f"{option} is about tables; name one with --data" in said
+        assert f"{option} is for tables; name one with --data" in said
     assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
         assert "is for motion" in failure(capsys, "evaluate", tabled / "vae", *option, code=2)

@@ -405,7 +405,7 @@ def test_a_folder_of_arrays_is_a_table_with_their_splits(tmp_path):
     assert not is_table(str(folder))
     (folder / "test" / "c.csv").write_text("1,2")
     with pytest.raises(
-        ValueError, match=r"walks holds test.c.csv in addition to npy files; .* write it as one, or move it"
+        ValueError, match=r"walks holds test.c.csv in addition to npy files; .* convert it to npy, or move it"
     ):
         PanelData.open(folder)
     (tmp_path / "none").mkdir()

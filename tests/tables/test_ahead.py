@@ -92,7 +92,7 @@ def test_sequences_without_a_forecast_are_named_and_the_others_are_forecast():
         ahead(panel, PanelSchema.from_data(panel, Cut()))
     schema = PanelSchema.from_data(panel, CUT)
     panel.series[1].values[3:, 0] = NAN
-    message = "sequence 's1' has 3 steps up to its last target, and 4 are to be observed"
+    message = "sequence 's1' has 3 steps up to its last target; a forecast observes 4"
     with pytest.warns(UserWarning, match=f"1 of 4 sequences have no forecast: {message}"):
         windows = ahead(panel, schema)
     assert [name for _, name, _ in windows.keys] == ["s0", "s2", "s3"]

@@ -122,7 +122,7 @@ def test_dates_whose_day_and_month_cannot_be_told_apart_are_said_to_be(format, f
     assert "date" not in found.names
     with pytest.warns(UserWarning, match="perhaps the time"):
         ColumnHints(columns=("sold",)).of(frame)
-    with pytest.raises(ValueError, match=r"column 'date' holds dates such as '01.01.(20)?24'"):
+    with pytest.raises(ValueError, match=r"column 'date': dates such as '01.01.(20)?24'"):
         Panel.of(frame, ColumnHints(time="date"))
     with pytest.raises(ValueError, match=r"dates such as '01.01.(20)?24'"):
         Panel.wide(frame.pivot(index="date", columns="shop", values="sold"))
@@ -146,7 +146,7 @@ def test_periods_are_the_time(freq):
 def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
     frame = panel(station=np.repeat(["a", "b", "c"], 7))
     written = frame.reset_index(names="Unnamed: 0")
-    with pytest.warns(UserWarning, match=r"'Unnamed: 0' \(the numbers of the rows, without a name\)"):
+    with pytest.warns(UserWarning, match=r"'Unnamed: 0' \(row numbers without a name\)"):
         assert infer_columns(written) == infer_columns(frame)
     measured = written.assign(**{"Unnamed: 0": frame.riders})
     assert "Unnamed: 0" in infer_columns(measured).names
@@ -254,7 +254,7 @@ def test_columns_that_are_one_time_are_joined(how, shops):
     if shops > 1:
         parts = pd.concat([parts.assign(shop="b"), parts.assign(shop="a")]).sort_index(kind="stable").drop(columns="No")
     else:
-        with pytest.warns(UserWarning, match=r"'No' \(the numbers of the rows\)"):
+        with pytest.warns(UserWarning, match=r"'No' \(row numbers\)"):
             infer_columns(parts)
     found = infer_columns(parts.drop(columns="No", errors="ignore"))
     assert len(found.times) > 1
@@ -291,7 +291,7 @@ def test_parts_that_are_no_time_are_named():
     for parts, said in [
         (("year", "month", "day"), "row 1 of year month day is not a date: 2023-02 has no day 29"),
         (("year", "month", "hour"), "row 0 of column 'hour' is 0; expected days from 1"),
-        (("year", "month", "minute"), "year month minute have a minute and no larger unit before it"),
+        (("year", "month", "minute"), "year month minute have a minute without the next larger unit"),
         (("year", "y"), "row 0 of column 'y' is 0.5; expected months from 1 to 12"),
     ]:
         with pytest.raises(ValueError, match=said):
@@ -503,11 +503,11 @@ LAYOUTS = {
     "years as names": ("shop,1990,1991,1992\na,1,2,3\nb,4,5,6\n", "3 columns are named by dates"),
     "two rows of names": (
         "day,power,volt\n,MW,V\n2024-01-01,1,2\n2024-01-02,2,3\n",
-        "2 rows of names, also 'MW', 'V'",
+        "2 header rows, with texts such as 'MW', 'V'",
     ),
     "three rows of names": (
         "Price,Close,Low\nTicker,AA,BB\nDate,,\n2024-01-01,1,2\n2024-01-02,2,3\n",
-        "3 rows of names",
+        "3 header rows",
     ),
     "a total": (
         "day,y\n2024-01-01,1\n2024-01-02,2\n2024-01-03,3\n2024-01-04,4\nTotal,10\n",
@@ -520,7 +520,7 @@ LAYOUTS = {
     "halves of days": ("day,half,y\n2024-01-01,AM,1\n2024-01-01,PM,2\n2024-01-02,AM,3\n", "two rows at day"),
     "constants": (
         "station,t,y\na,1,2.5\na,2,2.5\nb,1,3.5\nb,2,3.5\n",
-        "no column is a target; given are y; constant in each sequence are y",
+        "no column is a target among y; constant within each sequence: y",
     ),
 }
 

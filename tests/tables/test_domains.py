@@ -50,7 +50,7 @@ def test_a_package_that_is_not_there_is_named_and_how_to_get_it(monkeypatch, cap
 def test_a_name_that_is_none_is_answered_with_the_nearest():
     with pytest.raises(ValueError, match=r"no domain 'choral'.*chorales.*known: chorales, speech"):
         domains.domain("choral")
-    with pytest.raises(ValueError, match="motion has files of its own"):
+    with pytest.raises(ValueError, match="motion is not a domain"):
         domains.domain("motion")
 
 

@@ -304,5 +304,5 @@ def test_padding_and_what_is_complete_are_not_filled(model, data):
     assert not found.missing[0, 10:].any()
     assert found.missing[0, :10].any()
     full = PanelData.of(np.random.default_rng(0).normal(size=(6, 12, 1)), ["y"], Cut(5, 3))
-    with pytest.raises(ValueError, match="nothing is missing in panel"):
+    with pytest.raises(ValueError, match="no target is missing in panel"):
         full.whole().impute(model)

@@ -226,7 +226,7 @@ def test_windows_of_whose_future_nothing_is_known_are_not_listed():
     one.values[start + 5 : start + 9, :2] = NAN
     windows = PanelWindows(panel, schema, "test")
     assert windows.keys == before[:2] + before[3:]
-    assert windows.left_out == "1 windows, in whose past or future no target was observed"
+    assert windows.left_out == "1 windows without an observed target in their past or future"
     one.values[start + 4 : start + 9, :2] = NAN  # the past of the next one, which begins at + 4
     windows = PanelWindows(panel, schema, "test")
     assert windows.keys == before[:2] + before[4:]
@@ -243,7 +243,7 @@ def test_sequences_that_are_too_short_are_listed():
     steps = {one.name: round(0.7 * data.panel.present(one)) for one in data.panel}
     short = [name for name, count in steps.items() if count < 7]
     assert [*data.windows("train").skipped] == short
-    said = f"{len(short)} sequences, which have fewer than 7 steps there"
+    said = f"{len(short)} sequences with fewer than 7 steps in this split"
     assert data.windows("train").left_out == f"{said} ({', '.join(f'{name}: {steps[name]}' for name in short)})"
     with pytest.warns(UserWarning, match=rf"training leaves out {said}"):
         fit = dvae.fit(dvae.method("autoregressive", width=4), data, steps=1, batch_size=2, progress=False)
@@ -278,7 +278,7 @@ def test_whole_sequences_end_with_their_last_target():
         (lambda data: PanelData.of(data.panel, cut={"observed": 3}), "cut is {'observed': 3}; it must be of type Cut"),
         (lambda data: data.windows("tests"), r"unknown split 'tests' \(did you mean 'test'\?\)"),
         (lambda data: data.ahead().forecast("run"), "the model is 'run'; expected a fitted model"),
-        (lambda data: data.recut(validation=0).windows("validation"), "no validation .* its 1 .* has a share of 0"),
+        (lambda data: data.recut(validation=0).windows("validation"), "its 1 .* the share of validation is 0"),
         (
             lambda data: data.with_data(Panel([Series("s", np.ones((9, 1)))], Columns((Column("b"),)))),
             "with the columns b, which differ",

@@ -122,7 +122,7 @@ HOSTILE = {
     "one field": ("a.csv", "a,b\n1," + "x" * 10**7, "field larger"),
     "no zip": ("a.npz", b"abc", "not a zip file"),
     "no array": ("a.npz", npz(), "holds nothing"),
-    "other arrays": ("a.npz", npz(a=np.zeros(2), b=np.zeros(2)), "holds a, b; expected an array 'x', or one alone"),
+    "other arrays": ("a.npz", npz(a=np.zeros(2), b=np.zeros(2)), "expected an array 'x', or a single array"),
     "pickle": ("a.npz", npz(x=np.array([{}], object)), "allow_pickle"),
     "texts": ("a.npz", npz(x=np.array([["a"]])), "expected numbers"),
     "no rows": ("a.npz", npz(x=np.zeros((0, 3))), "expected numbers"),
@@ -184,7 +184,7 @@ def test_the_schema_beside_a_file_is_the_one_of_its_name_or_of_its_folder(tmp_pa
     assert told.panel.columns.id == ("station",)
     for content in ("[columns.temp", "famly = 3", b"\xff", "[cut]\nobserved = 'a'\nhorizon = 2"):
         put(tmp_path / "riders.toml", content)
-        with pytest.raises(ValueError, match=r"riders.toml is not the schema of a table: "):
+        with pytest.raises(ValueError, match=r"riders.toml is not a valid schema of a table: "):
             schema_beside(path)
     put(tmp_path / "riders.toml", "#" * (10**6 + 1))
     with pytest.raises(ValueError, match=r"riders.toml has 1000001 bytes"):
@@ -213,5 +213,5 @@ def test_a_domain_is_read_by_its_name(tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "domain", lambda name: Panel.of(frame, ["a"], name))
     assert read_panel("own").name == "own"
     assert PanelData.open("own").location == "own"  # in any working directory
-    with pytest.raises(ValueError, match="own has columns of its own: a"):
+    with pytest.raises(ValueError, match="own has fixed columns, a"):
         read_panel("own", Columns((Column("b"),)))

@@ -1,4 +1,4 @@
-"""Domains: real data sets by name, each read from a package that others publish; none of the data is distributed here.
+"""Domains: real data sets by name, read from packages of third parties; this library distributes none of the data.
 
 | name | source | content |
 |---|---|---|
@@ -30,7 +30,7 @@ class Domain:
 
     Args:
         place: "module:function" that loads it.
-        said: description in one sentence.
+        description: one sentence.
     """
 
     place: str
@@ -62,16 +62,16 @@ def domain(name: str, **options: Any) -> Panel:
 
     Args:
         name: one of `DOMAINS`.
-        options: options of the function that loads it.
+        **options: options of the function that loads it.
 
     Raises:
         ValueError: if the name is unknown.
         ImportError: if the package with the data is not installed; the message gives the command.
     """
     if name == "motion":
-        raise ValueError("motion has files of its own: dvae.motion.read_motion, or dvae.motion.simulate")
+        raise ValueError("motion is not a domain; use dvae.motion.read_motion or dvae.motion.simulate")
     if name not in DOMAINS:
         raise ValueError(f"no domain {name!r}{nearest(name, DOMAINS)}; known: {', '.join(DOMAINS)}")
     module, _, function = DOMAINS[name].place.partition(":")
-    found: Panel = getattr(import_module(module), function)(**options)
-    return found
+    panel: Panel = getattr(import_module(module), function)(**options)
+    return panel

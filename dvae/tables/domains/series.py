@@ -41,7 +41,7 @@ def japanese_vowels() -> Panel:
     Raises:
         ImportError: if aeon is not installed.
     """
-    return _archived("JapaneseVowels", [f"cepstrum {number}" for number in range(1, 13)])
+    return _load_archive("JapaneseVowels", [f"cepstrum {number}" for number in range(1, 13)])
 
 
 def basic_motions() -> Panel:
@@ -54,7 +54,9 @@ def basic_motions() -> Panel:
     Raises:
         ImportError: if aeon is not installed.
     """
-    return _archived("BasicMotions", [f"{what} {axis}" for what in ("accelerometer", "gyroscope") for axis in "xyz"])
+    return _load_archive(
+        "BasicMotions", [f"{sensor} {axis}" for sensor in ("accelerometer", "gyroscope") for axis in "xyz"]
+    )
 
 
 def macrodata() -> Panel:
@@ -70,24 +72,24 @@ def macrodata() -> Panel:
     """
     path = package_folder("statsmodels", "series") / "datasets" / "macrodata" / "macrodata.csv"
     rows = list(csv.DictReader(files.read(path, MOST).decode().splitlines()))
-    found = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-    growth = [100 * np.diff(np.log(found[of])) for of in RATES.values()]
-    values = np.stack([*growth, *(found[of][1:] for of in LEVELS.values())], 1)
-    months = ((found["year"] - 1970) * 12 + (found["quarter"] - 1) * 3)[1:].astype("datetime64[M]")
+    data = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    growth = [100 * np.diff(np.log(data[source])) for source in RATES.values()]
+    values = np.stack([*growth, *(data[source][1:] for source in LEVELS.values())], 1)
+    months = ((data["year"] - 1970) * 12 + (data["quarter"] - 1) * 3)[1:].astype("datetime64[M]")
     times = months.astype("datetime64[s]").astype(np.float64)
     units = [*["% a quarter"] * len(RATES), "% a year", "%", "%"]
     columns = [Column(name, unit=unit) for name, unit in zip([*RATES, *LEVELS], units, strict=True)]
     return Panel([Series("United States", values, times)], Columns(tuple(columns)), "macrodata")
 
 
-def _archived(name: str, columns: list[str]) -> Panel:
+def _load_archive(name: str, columns: list[str]) -> Panel:
     """Load a data set of the archive; every fifth training sequence of each class is used for validation."""
-    place = package_folder("aeon", "series") / "datasets" / "data" / name
-    series, seen = [], dict[str, int]()
+    folder = package_folder("aeon", "series") / "datasets" / "data" / name
+    series, counts = [], dict[str, int]()
     for split in ("train", "test"):
-        for number, (values, label) in enumerate(read_ts(place / f"{name}_{split.upper()}.ts")):
-            seen[label] = seen.get(label, 0) + 1
-            part = "validation" if split == "train" and seen[label] % 5 == 0 else split
+        for number, (values, label) in enumerate(read_ts(folder / f"{name}_{split.upper()}.ts")):
+            counts[label] = counts.get(label, 0) + 1
+            part = "validation" if split == "train" and counts[label] % 5 == 0 else split
             series.append(Series(f"{split} {number}", values, group=label, split=part))
     return Panel(series, Columns(tuple(map(Column, columns))), name)
 
@@ -97,4 +99,4 @@ def read_ts(path: Path) -> Iterator[tuple[np.ndarray, str]]:
     for line in files.read(path, MOST).decode().splitlines():
         if line.strip() and line[0] not in "#@":
             *dimensions, label = line.strip().split(":")
-            yield np.array([each.split(",") for each in dimensions], np.float64).T, label
+            yield np.array([numbers.split(",") for numbers in dimensions], np.float64).T, label

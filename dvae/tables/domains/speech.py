@@ -61,7 +61,7 @@ def recordings(folder: str | Path = PLACE) -> dict[str, np.ndarray]:
         raise FileNotFoundError(
             f"no wav files in {folder}; on Debian: apt install asterisk-core-sounds-en-wav, or give their folder"
         )
-    found = {}
+    signals = {}
     for path in paths:
         rate, samples = wavfile.read(path)
         if rate != RATE or samples.ndim != 1 or samples.dtype != np.int16:
@@ -70,8 +70,8 @@ def recordings(folder: str | Path = PLACE) -> dict[str, np.ndarray]:
             )
         values = samples / 2.0**15
         if len(values) >= WINDOW and np.abs(values).max() > SILENT:
-            found[path.relative_to(folder).with_suffix("").as_posix()] = voiced(values / np.abs(values).max())
-    return found
+            signals[path.relative_to(folder).with_suffix("").as_posix()] = voiced(values / np.abs(values).max())
+    return signals
 
 
 def voiced(samples: np.ndarray) -> np.ndarray:
@@ -87,20 +87,20 @@ def _transform() -> signal.ShortTimeFFT:
 
 def spectrum(samples: np.ndarray) -> np.ndarray:
     """Return the complex spectrum (T, 129) of a signal (samples,), at least as long as a window."""
-    found: np.ndarray = _transform().stft(samples).T
-    return found
+    coefficients: np.ndarray = _transform().stft(samples).T
+    return coefficients
 
 
 def power(samples: np.ndarray) -> np.ndarray:
     """Return squared magnitudes (T, 129) of the spectrum of a signal, plus `FLOOR`."""
-    found: np.ndarray = np.abs(spectrum(samples)) ** 2 + FLOOR
-    return found
+    powers: np.ndarray = np.abs(spectrum(samples)) ** 2 + FLOOR
+    return powers
 
 
 def sound(spectrum: np.ndarray, samples: int) -> np.ndarray:
     """Return the signal (samples,) of a complex spectrum (T, 129)."""
-    found: np.ndarray = _transform().istft(np.asarray(spectrum).T, k1=samples)
-    return found
+    waveform: np.ndarray = _transform().istft(np.asarray(spectrum).T, k1=samples)
+    return waveform
 
 
 def resynthesised(estimate: np.ndarray, samples: np.ndarray) -> np.ndarray:
