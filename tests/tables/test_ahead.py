@@ -1,4 +1,4 @@
-"""What comes after the end of a table: one window for each sequence, with all that is known of its past and future."""
+"""Windows for forecasts after the end of a table: one for each sequence, with its past and known covariates."""
 
 import numpy as np
 import pytest
@@ -15,25 +15,25 @@ PLANNED = Columns((Column("y"), Column("price", "past"), Column("plan", "known")
 CUT = Cut(4, 3, test=0.25)
 
 
-def table(told, future=0, lengths=(12, 9, 15, 10), uneven=False):
+def table(columns, future=0, lengths=(12, 9, 15, 10), uneven=False):
     rng = np.random.default_rng(0)
-    made = []
+    series = []
     for n, t in enumerate(lengths):
-        values = rng.normal(size=(t + future, len(told.columns)))
+        values = rng.normal(size=(t + future, len(columns.columns)))
         values[t:, :2] = NAN
         times = np.cumsum(rng.choice([1.0, 2.0, 2.0, 5.0], t + future)) if uneven else np.arange(t + future) * 10.0
-        made.append(Series(f"s{n}", values, times))
-    return Panel(made, told)
+        series.append(Series(f"s{n}", values, times))
+    return Panel(series, columns)
 
 
-def test_the_future_is_behind_the_last_target():
+def test_the_future_begins_after_the_last_target():
     panel = table(PLAIN)
     schema = PanelSchema.from_data(panel, CUT)
     windows = ahead(panel, schema)
     batch = windows.all()
-    for n, one in enumerate(panel):
-        np.testing.assert_array_equal(batch["x"][n, :4, 0], one.values[-4:, 0])
-        assert windows.keys[n][1:] == (one.name, len(one) - 4)
+    for n, series in enumerate(panel):
+        np.testing.assert_array_equal(batch["x"][n, :4, 0], series.values[-4:, 0])
+        assert windows.keys[n][1:] == (series.name, len(series) - 4)
     assert batch["mask"][:, :4].all()
     assert not batch["mask"][:, 4:].any()
     for horizon in (1, 7):
@@ -42,24 +42,23 @@ def test_the_future_is_behind_the_last_target():
     np.testing.assert_array_equal(times[0], np.arange(8, 15) * 10.0)
 
 
-def test_the_past_is_that_of_test_windows():
-    """Also what lies before the window: the last value of a covariate, and the first gap."""
+def test_the_past_equals_that_of_a_test_window():
     panel = table(PLANNED, future=3, uneven=True)
     for one in panel:
         one.values[3:-3, 1:3] = NAN
     schema = PanelSchema.from_data(panel, CUT)
     batch = ahead(panel, schema).all()
-    shown = Panel([Series(one.name, np.nan_to_num(one.values), one.times) for one in panel], PLANNED)
-    for one, other in zip(shown, panel, strict=True):
+    filled = Panel([Series(one.name, np.nan_to_num(one.values), one.times) for one in panel], PLANNED)
+    for one, other in zip(filled, panel, strict=True):
         one.values[:, 1:] = other.values[:, 1:]
-    test = PanelWindows(shown, schema, "last").all()
+    test = PanelWindows(filled, schema, "last").all()
     np.testing.assert_array_equal(batch["c"], test["c"])
     np.testing.assert_array_equal(batch["d"], test["d"])
     assert (batch["d"][:, 0] != 1).any()
     assert (batch["c"][:, 0, 0] != 0).any()  # the last value, from before the window, and not the mean
 
 
-def test_known_covariates_are_those_of_the_rows_behind():
+def test_future_rows_provide_the_known_covariates():
     panel = table(PLANNED, future=3)
     schema = PanelSchema.from_data(panel, CUT)
     batch = ahead(panel, schema).all()
@@ -70,7 +69,7 @@ def test_known_covariates_are_those_of_the_rows_behind():
 
 
 @pytest.mark.parametrize("future", [0, 2])
-def test_a_future_that_lacks_them_says_which_and_of_which_sequence(future):
+def test_missing_future_covariates_are_named_with_their_sequence(future):
     panel = table(PLANNED, future)
     with pytest.raises(
         ValueError,
@@ -87,15 +86,15 @@ def test_a_future_that_lacks_them_says_which_and_of_which_sequence(future):
     assert [name for _, name, _ in windows.keys] == ["s0", "s1", "s3"]
 
 
-def test_what_cannot_be_forecast_is_said_and_the_rest_is_forecast():
+def test_sequences_without_a_forecast_are_named_and_the_others_are_forecast():
     panel = table(PLAIN)
     with pytest.raises(ValueError, match="whole sequences have no horizon"):
         ahead(panel, PanelSchema.from_data(panel, Cut()))
     schema = PanelSchema.from_data(panel, CUT)
     panel.series[1].values[3:, 0] = NAN
-    said = "sequence 's1' has 3 steps up to its last target, and 4 are to be observed"
-    with pytest.warns(UserWarning, match=f"1 of 4 sequences have no forecast: {said}"):
+    message = "sequence 's1' has 3 steps up to its last target, and 4 are to be observed"
+    with pytest.warns(UserWarning, match=f"1 of 4 sequences have no forecast: {message}"):
         windows = ahead(panel, schema)
     assert [name for _, name, _ in windows.keys] == ["s0", "s2", "s3"]
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         ahead(panel.only(["s1"]), schema)
