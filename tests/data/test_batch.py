@@ -1,4 +1,4 @@
-"""Batches: attributes for what is not a variable, and reading each batch once."""
+"""Batches: attributes for masks, lengths and groups, and reading each batch once."""
 
 import pytest
 import torch
@@ -15,40 +15,42 @@ def model():
     return DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
 
 
-@pytest.mark.parametrize("named", [False, True])
-def test_attributes_are_entries_that_are_no_variables(named):
-    seen = X > 3
-    batch = Batch(x=X, mask={"x": seen} if named else seen, lengths=torch.tensor([3, 2, 3, 1]), group=torch.arange(4))
-    assert torch.equal(batch.mask(), seen)
+@pytest.mark.parametrize("is_dict", [False, True])
+def test_attributes_are_entries_that_are_no_variables(is_dict):
+    observed = X > 3
+    batch = Batch(
+        x=X, mask={"x": observed} if is_dict else observed, lengths=torch.tensor([3, 2, 3, 1]), group=torch.arange(4)
+    )
+    assert torch.equal(batch.mask(), observed)
     assert batch.masks().keys() == {"x"}
     assert batch.partial
-    assert torch.equal(batch.mask_to_nan().isnan(), ~seen)
+    assert torch.equal(batch.mask_to_nan().isnan(), ~observed)
     assert (batch.lengths.tolist(), batch.group.tolist()) == ([3, 2, 3, 1], [0, 1, 2, 3])
     plain = Batch(x=X)
     assert (plain.mask(), plain.lengths, plain.group, plain.log_det, plain.view_inputs) == (None, None, None, None, {})
     assert not plain.partial
 
 
-def test_parts_of_a_batch_are_batches_with_the_same_rows_of_every_tensor():
+def test_rows_of_a_batch_are_a_batch_with_these_rows_of_every_tensor():
     batch = Batch(x=X, mask={"x": X > 3}, view_inputs={"turns": X})
     for part in (slice(1, 3), [1, 2], torch.tensor([1, 2])):
-        found = batch.rows(part)
-        assert isinstance(found, Batch)
+        selected = batch.rows(part)
+        assert isinstance(selected, Batch)
         assert all(
-            torch.equal(value, whole[1:3]) for value, whole in zip(*(b.leaves().values() for b in (found, batch)))
+            torch.equal(value, full[1:3]) for value, full in zip(*(b.leaves().values() for b in (selected, batch)))
         )
     assert torch.equal((batch | {"x": -X})["x"], -X)
     assert isinstance(batch | {"x": -X}, Batch)
     assert torch.equal(batch["x"], X)
 
 
-def test_what_was_read_is_not_read_again(model):
-    read = model.read(X)
-    assert model.read(read) is read
-    for part in (rows(read, slice(2)), repeat(read, 3)):
+def test_a_batch_is_read_only_once(model):
+    batch = model.read(X)
+    assert model.read(batch) is batch
+    for part in (rows(batch, slice(2)), repeat(batch, 3)):
         assert model.read(part) is part
     with torch.no_grad():
-        terms = model.guide(read)
+        terms = model.guide(batch)
     assert terms["z"].shape == (4, 3, 1)
 
 
@@ -61,19 +63,19 @@ def test_what_was_read_is_not_read_again(model):
     ],
     ids=["item", "update", "or"],
 )
-def test_a_batch_that_was_changed_is_read_again(model, change):
-    read = model.read(X)
-    change(read)
-    found = model.read(read)
-    assert found is not read
-    assert found["x"].dtype == torch.float32
-    assert torch.equal(found["x"], -X)
+def test_a_changed_batch_is_read_again(model, change):
+    batch_read = model.read(X)
+    change(batch_read)
+    reread = model.read(batch_read)
+    assert reread is not batch_read
+    assert reread["x"].dtype == torch.float32
+    assert torch.equal(reread["x"], -X)
 
 
-def test_a_batch_is_read_anew_by_another_model_and_in_another_precision(model):
-    read = model.read(X)
+def test_another_model_or_precision_reads_a_batch_again(model):
+    batch = model.read(X)
     other = DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
-    assert other.read(read) is not read
-    assert model.double().read(read)["x"].dtype == torch.float64
+    assert other.read(batch) is not batch
+    assert model.double().read(batch)["x"].dtype == torch.float64
     precise = model.float().read(X.double(), precise=True)
     assert precise.reader is None

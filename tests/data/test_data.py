@@ -1,4 +1,4 @@
-"""Data by their protocols: asking what something is costs nothing, however large it is."""
+"""Protocols of data, and the data that functions accept."""
 
 import numpy as np
 import pandas as pd
@@ -25,24 +25,26 @@ from dvae.tables import Panel
 @pytest.mark.parametrize(
     "protocol", [Source, Listed, Batched, Fingerprinted, HeldOutWindows, Program, Forecasting, RequiresDraws]
 )
-def test_asking_what_something_is_reads_nothing_of_it(protocol):
-    read = []
-    members = {name: property(lambda _, name=name: read.append(name)) for name in get_protocol_members(protocol)}
+def test_a_check_of_a_protocol_reads_no_property(protocol):
+    properties_read = []
+    members = {
+        name: property(lambda _, name=name: properties_read.append(name)) for name in get_protocol_members(protocol)
+    }
     assert isinstance(type("Whole", (), members)(), protocol)
     members.popitem()
     assert not isinstance(type("Part", (), members)(), protocol)
-    assert not read, f"a fingerprint would be computed by this check: {read}"
+    assert not properties_read, f"this check would compute a fingerprint: {properties_read}"
 
 
-@pytest.mark.parametrize("named", [False, True])
-def test_a_past_holds_no_frame_of_the_future_but_of_context(named):
+@pytest.mark.parametrize("is_dict", [False, True])
+def test_a_past_contains_no_future_frame_except_context(is_dict):
     x, mask, context = torch.randn(2, 7, 3), torch.rand(2, 7, 3) < 0.5, torch.randn(2, 7, 1)
-    mask = {"x": mask} if named else mask
+    mask = {"x": mask} if is_dict else mask
     batch = Batch(x=x, mask=mask, view_inputs={"turns": x}, y=context, w=torch.randn(2, 4))
-    found, whole = batch.past(5).leaves(), batch.leaves()
-    assert found.keys() == whole.keys()
-    for name, value in found.items():
-        assert torch.equal(value, whole[name] if name in ("y", "w") else whole[name][:, :5])
+    past, full = batch.past(5).leaves(), batch.leaves()
+    assert past.keys() == full.keys()
+    for name, value in past.items():
+        assert torch.equal(value, full[name] if name in ("y", "w") else full[name][:, :5])
 
 
 # What functions accept as data
@@ -94,35 +96,35 @@ ENTRIES = {
     ("name", "table"),
     [*((name, FRAME) for name in ENTRIES), ("fit", FRAME.set_index(["unit", "step"]).to_xarray())],
 )
-def test_a_table_without_roles_is_refused_with_the_call_that_gives_them(model, name, table):
+def test_a_table_without_roles_is_an_error_with_a_suggested_call(model, name, table):
     with pytest.raises(TypeError, match=r"got (pandas|xarray)\..*PanelData\.of\(frame, dvae.tables.ColumnHints\(id="):
         ENTRIES[name](model, table)
 
 
 @pytest.mark.parametrize("name", ["fit", "validation", "a method's fit", "evaluate", "compare", "checks", "conformal"])
-def test_data_with_parts_stand_for_the_part_that_a_function_is_for(model, panel, name):
+def test_functions_select_their_split_of_the_data(model, panel, name):
     ENTRIES[name](model, panel)
 
 
 @pytest.mark.parametrize("entry", [fitted, fitted_by_method])
-def test_a_fit_to_data_with_parts_validates_on_their_own(model, panel, entry):
+def test_a_fit_uses_the_validation_split_of_its_data(model, panel, entry):
     assert entry(model, panel).best_step == 1
     assert entry(model, panel.windows("train")).best_step is None
     assert entry(model, panel.windows("train"), validation=panel).best_step == 1
 
 
 @pytest.mark.parametrize("data", [X.numpy(), {"x": X}, dvae.ArrayWindows(X, observed=4)], ids=type)
-def test_a_method_is_fitted_to_arrays_as_to_their_sizes(data):
-    found = fitted_by_method(None, data, validation=data)
+def test_fitting_a_method_to_arrays_equals_building_it_from_their_sizes(data):
+    fit = fitted_by_method(None, data, validation=data)
     with torch.random.fork_rng():
         torch.manual_seed(0)
         recipe = METHOD.train(dvae.data.Sequences({"x": X}), {"x": X}, 1)
-        told = dvae.fit(METHOD.build({"x": 3}), recipe, decay=0.5, **QUIET)
-    assert found.best_bound == told.best_bound
+        explicit = dvae.fit(METHOD.build({"x": 3}), recipe, decay=0.5, **QUIET)
+    assert fit.best_bound == explicit.best_bound
 
 
 @pytest.mark.parametrize("name", ["evaluate", "checks", "conformal"])
-def test_arrays_do_not_say_which_steps_are_observed(model, name):
+def test_evaluating_on_arrays_without_observed_steps_is_an_error(model, name):
     for data in (X, X.numpy(), {"x": X}):
         with pytest.raises(
             TypeError, match=r"got (Tensor|ndarray|dict); of an array x \(N, T, D\).*ArrayWindows\(x, ob"
@@ -131,7 +133,7 @@ def test_arrays_do_not_say_which_steps_are_observed(model, name):
 
 
 @pytest.mark.parametrize("name", ["fit", "validation", "a step", "a method's fit", "compare", "forecast", "bound"])
-def test_tensors_without_values_or_that_are_sparse_are_refused(model, name):
+def test_sparse_and_meta_tensors_are_an_error(model, name):
     with pytest.raises(TypeError, match=r"layout torch\.sparse_coo; .* x\.to_dense\(\)"):
         ENTRIES[name](model, X.to_sparse())
     with pytest.raises(ValueError, match=r"got a tensor \(20, 6, 3\) on the meta device, which has no values"):
@@ -141,7 +143,7 @@ def test_tensors_without_values_or_that_are_sparse_are_refused(model, name):
             ENTRIES[name](dvae.DynamicalVAE("p(z) p(x_t | z)", "q(z | x_{1:T})", {"z": 2, "x": 3}).to("meta"), X)
 
 
-def test_masks_of_arrays_are_masks_of_batches():
+def test_masks_of_numpy_arrays_are_masks_of_batches():
     x = np.ma.masked_values(np.arange(12.0).reshape(2, 3, 2) - 999 * (np.arange(12) == 5).reshape(2, 3, 2), -994)
     windows, (one, other) = ArrayWindows(x, observed=2), Panel.of(x)
     for batch in (sequences(x).batch, sequences({"x": x}).batch, windows.all()):
@@ -155,7 +157,7 @@ def test_masks_of_arrays_are_masks_of_batches():
 
 
 @pytest.mark.parametrize(
-    ("x", "said"),
+    ("x", "message"),
     [
         (np.ones((2, 3, 1), complex), "is complex128; expected real numbers: stack the real and the imaginary part"),
         (torch.ones((2, 3, 1), dtype=torch.complex64), "is torch.complex64; expected real numbers"),
@@ -163,8 +165,8 @@ def test_masks_of_arrays_are_masks_of_batches():
     ],
     ids=["complex", "tensor", "records"],
 )
-def test_what_no_model_reads_is_refused(x, said):
+def test_complex_numbers_and_records_are_an_error(x, message):
     model = dvae.method("autoregressive", width=2).build({"x": 1})
-    for read in (sequences, Panel.of, lambda x: ArrayWindows(x, 1), lambda x: model.model({"x": x})):
-        with pytest.raises(TypeError, match=said):
-            read(x)
+    for call in (sequences, Panel.of, lambda x: ArrayWindows(x, 1), lambda x: model.model({"x": x})):
+        with pytest.raises(TypeError, match=message):
+            call(x)

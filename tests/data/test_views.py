@@ -1,4 +1,4 @@
-"""Views: bijections with their log-determinants, and models that see through them as one would turn data by hand."""
+"""Views: bijections with log-determinants, and models with a view equal models of transformed data."""
 
 import pyro
 import pytest
@@ -18,7 +18,7 @@ LEGS = [i for i in range(D) if i % 6 < 3]
 ARMS = [i for i in range(D) if i % 6 >= 3]
 TURNED = ("x", "s", "y", "r", "legs", "arms")
 VIEWS = {
-    "as it is": (View(), D),
+    "identity": (View(), D),
     "parts and history": (Views(History("h"), Parts({"legs": LEGS, "arms": ARMS})), D),
     "first frame": (Past("s"), D),
     "heading": (Heading(WALKER, 3), D),
@@ -42,62 +42,66 @@ def view_and_data(request):
     return view, Batch(x=people(B, T, size))
 
 
-def test_the_way_back_is_the_inverse(view_and_data):
+def test_inverse_undoes_a_view_and_a_second_call_changes_nothing(view_and_data):
     view, data = view_and_data
-    once = view(data)
-    torch.testing.assert_close(view.inverse(once)["x"], data["x"])
-    again = view(once)  # what was seen is seen as it is
-    assert once.keys() == again.keys()
-    assert all(torch.equal(once[name], again[name]) for name in once)
+    transformed = view(data)
+    torch.testing.assert_close(view.inverse(transformed)["x"], data["x"])
+    twice = view(transformed)  # a second call changes nothing
+    assert transformed.keys() == twice.keys()
+    assert all(torch.equal(transformed[name], twice[name]) for name in transformed)
 
 
-def test_samples_of_the_future_go_back_as_the_past_was_seen(view_and_data):
-    """Seen values (S, B, H, D) beside what the view added to the past."""
+def test_samples_of_the_future_are_inverted_with_entries_of_the_past(view_and_data):
+    """The batch has future values (S, B, H, D) and the entries that the view added to the past."""
     view, data = view_and_data
     past, future = data["x"], people(B, 7, data["x"].shape[-1])
-    seen = view(Batch({"x": past}))
-    added = {name: seen[name] for name in view.names if name in seen}
-    if isinstance(view, Past) or "s" in seen:  # frames that go on from it are seen as such
-        later = {n: v for n, v in view(Batch({"x": torch.cat([past[:, :1], future], 1)})).items() if n != "s"}
+    past_view = view(Batch({"x": past}))
+    added = {name: past_view[name] for name in view.names if name in past_view}
+    if isinstance(view, Past) or "s" in past_view:  # the future continues from the first frame
+        future_view = {n: v for n, v in view(Batch({"x": torch.cat([past[:, :1], future], 1)})).items() if n != "s"}
     else:
-        later = view(Batch({"x": future}), seen)
-    made = {
-        name: value.expand(2, *value.shape) for name, value in later.items() if name not in ("heading", "h", "y", "r")
+        future_view = view(Batch({"x": future}), past_view)
+    samples = {
+        name: value.expand(2, *value.shape)
+        for name, value in future_view.items()
+        if name not in ("heading", "h", "y", "r")
     }
-    torch.testing.assert_close(view.inverse(Batch({**added, **made}))["x"], future.expand(2, *future.shape))
+    torch.testing.assert_close(view.inverse(Batch({**added, **samples}))["x"], future.expand(2, *future.shape))
 
 
 def test_views_keep_volume(view_and_data):
-    """The Jacobian of what is seen, by autograd; of a turn, at the heading that the window has."""
+    """Autograd's Jacobian, at the heading of the window, has the same log-determinant."""
     view, data = view_and_data
     heading = {"heading": torch.tensor([0.7], dtype=torch.float64)}
-    given = heading if "heading" in view.names and "s" not in view(data) else None
+    view_inputs = heading if "heading" in view.names and "s" not in view(data) else None
     names = [name for name in view(data) if name not in ("heading", "h", "y", "r")]
 
-    def seen(x):
-        found = view(Batch({"x": x[None]}), given)
-        return torch.cat([found[name].flatten() for name in names])
+    def flat_view(x):
+        transformed = view(Batch({"x": x[None]}), view_inputs)
+        return torch.cat([transformed[name].flatten() for name in names])
 
-    if "s" in names and "heading" in view.names:  # which tells the heading; the rest is turned by it
+    if "s" in names and "heading" in view.names:  # "s" determines the heading, which rotates the rest
         first, names = data["x"][0, :1], ["x"]
-        jacobian = torch.autograd.functional.jacobian(lambda x: seen(torch.cat([first, x])), data["x"][0, 1:])
+        jacobian = torch.autograd.functional.jacobian(lambda x: flat_view(torch.cat([first, x])), data["x"][0, 1:])
     else:
-        jacobian = torch.autograd.functional.jacobian(seen, data["x"][0])
+        jacobian = torch.autograd.functional.jacobian(flat_view, data["x"][0])
     rows = len(jacobian)
     _, log_det = torch.linalg.slogdet(jacobian.reshape(rows, rows))
     torch.testing.assert_close(log_det, view.log_det(data)[0], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("skeleton", [WALKER, HUMANEVA])
-def test_every_window_faces_one_way_and_stays_the_same_otherwise(skeleton):
+def test_every_window_faces_one_way_and_is_otherwise_unchanged(skeleton):
     x = people(B, T, 3 * skeleton.joints)
     for angle in (0.0, 2.5):
-        seen = Heading(skeleton, 2)(Batch({"x": turn(x, angle, skeleton)}))
-        torch.testing.assert_close(skeleton.heading(seen["x"].unflatten(-1, (-1, 3))[:, 1]), torch.zeros(B).double())
-        torch.testing.assert_close(seen["x"], Heading(skeleton, 2).face(x))
+        transformed = Heading(skeleton, 2)(Batch({"x": turn(x, angle, skeleton)}))
+        torch.testing.assert_close(
+            skeleton.heading(transformed["x"].unflatten(-1, (-1, 3))[:, 1]), torch.zeros(B).double()
+        )
+        torch.testing.assert_close(transformed["x"], Heading(skeleton, 2).face(x))
 
 
-# ------------------------------------------------------------------------------------------------- models that see so
+# -------------------------------------------------------------------------------------------------- models with views
 
 
 def build(view):
@@ -112,35 +116,35 @@ def seeded(call, *arguments, **options):
     return call(*arguments, **options)
 
 
-def missing():
-    """Windows, and a mask of whole joints and of heights that leaves the third pose alone."""
-    x, seen = people(B, T, D), torch.rand(B, T, J - 1, 1) < 0.7
-    mask = seen.expand(-1, -1, -1, 3).clone()
+def with_missing():
+    """Return windows, and a mask of whole joints and of heights, with a complete third pose."""
+    x, observed = people(B, T, D), torch.rand(B, T, J - 1, 1) < 0.7
+    mask = observed.expand(-1, -1, -1, 3).clone()
     mask[..., WALKER.vertical] &= torch.rand(B, T, J - 1) < 0.8
     mask[:, 2] = True
     return x, mask.flatten(-2)
 
 
 @pytest.mark.parametrize("hidden", [50.0, torch.nan])
-def test_missing_entries_through_a_view_are_those_of_windows_turned_by_hand(hidden):
+def test_missing_entries_through_a_view_equal_those_of_rotated_windows(hidden):
     heading = Heading(WALKER, 3)
     model, plain = build(heading), build(None)
-    x, mask = missing()
+    x, mask = with_missing()
     angle = heading.of(x)
-    ours = {"x": torch.where(mask, x, hidden), "mask": mask}
-    theirs = {"x": heading.face(x), "mask": mask}
-    imputed = seeded(plain.reconstruct, theirs, 2)["x"]
-    torch.testing.assert_close(seeded(model.reconstruct, ours, 2)["x"], turn(imputed, angle[:, None, None]))
+    batch = {"x": torch.where(mask, x, hidden), "mask": mask}
+    rotated = {"x": heading.face(x), "mask": mask}
+    imputed = seeded(plain.reconstruct, rotated, 2)["x"]
+    torch.testing.assert_close(seeded(model.reconstruct, batch, 2)["x"], turn(imputed, angle[:, None, None]))
     elbo = dvae.SequenceELBO()
-    torch.testing.assert_close(seeded(elbo.terms, model, ours).bound, seeded(elbo.terms, plain, theirs).bound)
-    past, by_hand = ({name: value[:, :4] for name, value in each.items()} for each in (ours, theirs))
-    future = seeded(plain.forecast, by_hand, 3, 2, draw_emission=True)["x"]
-    found = seeded(model.forecast, past, 3, 2, draw_emission=True)["x"]
-    torch.testing.assert_close(found, turn(future, angle[:, None, None]))
+    torch.testing.assert_close(seeded(elbo.terms, model, batch).bound, seeded(elbo.terms, plain, rotated).bound)
+    past, rotated_past = ({name: value[:, :4] for name, value in each.items()} for each in (batch, rotated))
+    future = seeded(plain.forecast, rotated_past, 3, 2, draw_emission=True)["x"]
+    forecast = seeded(model.forecast, past, 3, 2, draw_emission=True)["x"]
+    torch.testing.assert_close(forecast, turn(future, angle[:, None, None]))
 
 
-def test_what_a_turn_cannot_carry_is_refused():
-    model, (x, mask) = build(Heading(WALKER, 3)), missing()
+def test_masks_and_sizes_that_cannot_be_rotated_are_an_error():
+    model, (x, mask) = build(Heading(WALKER, 3)), with_missing()
     half = mask.clone()
     half[1, 4, 6:9] = torch.tensor([True, True, False])
     with pytest.raises(ValueError, match=r"window 1 is missing one horizontal coordinate of .* and has the other"):
@@ -152,7 +156,7 @@ def test_what_a_turn_cannot_carry_is_refused():
 
 
 def without(mask, window, frames, *names):
-    """The mask without joints of one window in some frames."""
+    """Return the mask without some joints of one window in some frames."""
     mask = mask.clone()
     for name in names:
         joint = 3 * (WALKER.names.index(name) - 1)
@@ -164,59 +168,59 @@ LEFT, RIGHT = ("LHip", "LShoulder"), ("RHip", "RShoulder")
 
 
 @pytest.mark.parametrize(
-    ("frames", "names", "tells"),
+    ("frames", "names", "frame"),
     [
-        ([1, 2], RIGHT, 0),  # no right side: the pose before
-        ([2], ["LHip"], 1),  # a whole pose goes before one with a shoulder alone
-        ([0, 1, 2], ["LHip", "RHip"], 2),  # the sides that are there
+        ([1, 2], RIGHT, 0),  # no right side: the previous pose
+        ([2], ["LHip"], 1),  # a complete pose is preferred to one with a shoulder only
+        ([0, 1, 2], ["LHip", "RHip"], 2),  # the sides that are observed
     ],
 )
-def test_the_nearest_pose_with_hips_and_shoulders_tells_the_heading(frames, names, tells):
+def test_the_nearest_pose_with_hips_and_shoulders_determines_the_heading(frames, names, frame):
     x = people(B, T, D)
     mask = without(torch.ones_like(x, dtype=torch.bool), 1, frames, *names)
     hidden = torch.where(mask, x, torch.nan)
-    seen = Heading(WALKER, 3)(Batch({"x": hidden, "mask": {"x": mask}}))
+    transformed = Heading(WALKER, 3)(Batch({"x": hidden, "mask": {"x": mask}}))
     joints = WALKER.with_root(x.unflatten(-1, (-1, 3)))
     expected = WALKER.heading(joints[:, 2])
-    pose = WALKER.with_root(hidden.unflatten(-1, (-1, 3)))[1, tells]
+    pose = WALKER.with_root(hidden.unflatten(-1, (-1, 3)))[1, frame]
     lateral = torch.stack([pose[WALKER.names.index(n)] for n in LEFT]).nanmean(0)
     lateral -= torch.stack([pose[WALKER.names.index(n)] for n in RIGHT]).nanmean(0)
     expected[1] = torch.atan2(lateral[0], lateral[2]) - torch.pi / 2
-    apart = seen["heading"] - expected
-    torch.testing.assert_close(torch.sin(apart), torch.zeros_like(apart), atol=1e-9, rtol=0)
-    assert (torch.cos(apart) > 0).all()
-    torch.testing.assert_close(Heading(WALKER, 3).inverse(seen)["x"][mask], x[mask])
+    difference = transformed["heading"] - expected
+    torch.testing.assert_close(torch.sin(difference), torch.zeros_like(difference), atol=1e-9, rtol=0)
+    assert (torch.cos(difference) > 0).all()
+    torch.testing.assert_close(Heading(WALKER, 3).inverse(transformed)["x"][mask], x[mask])
 
 
-@pytest.mark.parametrize("lacking", [T, 3])  # all frames, or those up to the pose
-def test_a_window_that_tells_no_heading_stays_as_it_is(lacking):
+@pytest.mark.parametrize("n_missing", [T, 3])  # all frames, or those up to the pose
+def test_a_window_without_a_heading_is_not_rotated(n_missing):
     x = people(B, T, D)
-    mask = without(torch.ones_like(x, dtype=torch.bool), 1, slice(lacking), *LEFT)
-    seen = Heading(WALKER, 3)(Batch({"x": x, "mask": {"x": mask}}))
-    assert seen["heading"][1] == 0
-    assert torch.equal(seen["x"][1][mask[1]], x[1][mask[1]])
+    mask = without(torch.ones_like(x, dtype=torch.bool), 1, slice(n_missing), *LEFT)
+    transformed = Heading(WALKER, 3)(Batch({"x": x, "mask": {"x": mask}}))
+    assert transformed["heading"][1] == 0
+    assert torch.equal(transformed["x"][1][mask[1]], x[1][mask[1]])
     past = Heading(WALKER, 3)(Batch({"x": x[:, :3], "mask": {"x": mask[:, :3]}}))
-    torch.testing.assert_close(past["heading"], seen["heading"])  # a forecast turns as training did
+    torch.testing.assert_close(past["heading"], transformed["heading"])  # a forecast is rotated as in training
 
 
-def test_samples_beside_a_batch_are_turned_back():
-    """Whatever a model hands out of the data goes through the view; before any batch there is no heading."""
+def test_samples_conditional_on_a_batch_are_rotated_back():
+    """Samples pass through the inverse view. Without a batch they have no heading."""
     model, x = build(Heading(WALKER, 3)), people(B, T, D)
     torch.testing.assert_close(model.sample(batch=x)["x"], x)
     assert model.sample(2, length=4)["x"].shape == (2, 4, D)
 
 
-def test_a_fixed_part_comes_back_bit_for_bit_and_is_seen_turned():
+def test_a_fixed_part_is_returned_bit_for_bit_and_rotated_for_the_model():
     view = Views(Heading(WALKER, 3, turned=TURNED), Parts({"legs": LEGS, "arms": ARMS}))
     equations = "p(z) p(legs_t | legs_{<t}, z) p(arms_t | legs_{<=t}, arms_{<t}, z)", "q(z | legs_{1:T}, arms_{1:T})"
     sizes = {"z": 2, "legs": len(LEGS), "arms": len(ARMS)}
     model = dvae.DynamicalVAE(*equations, sizes, Recurrent(4), view=view).double().eval()
     past, legs = people(B, 4, D), people(B, 3, len(LEGS))
-    found = seeded(model.forecast, past, 3, 2, fix={"legs": legs})
-    assert torch.equal(found["legs"], legs.expand(2, -1, -1, -1))
-    assert torch.equal(found["x"][..., LEGS], found["legs"])
-    turned = seeded(model.forecast, turn(past, 1.0), 3, 2, fix={"legs": turn(legs, 1.0)})
-    torch.testing.assert_close(turned["x"], turn(found["x"], 1.0))
+    future = seeded(model.forecast, past, 3, 2, fix={"legs": legs})
+    assert torch.equal(future["legs"], legs.expand(2, -1, -1, -1))
+    assert torch.equal(future["x"][..., LEGS], future["legs"])
+    rotated = seeded(model.forecast, turn(past, 1.0), 3, 2, fix={"legs": turn(legs, 1.0)})
+    torch.testing.assert_close(rotated["x"], turn(future["x"], 1.0))
 
 
 # ------------------------------------------------------------------------------------------------- bones
@@ -230,11 +234,11 @@ BONES = {
 
 
 def rigid(frames, size, skeleton=WALKER):
-    """Poses (B, T, D) of people whose bones have a length each, joint by joint from the root."""
+    """Return poses (B, T, D) with constant bone lengths, joint by joint from the root."""
     x, lengths = people(B, frames, skeleton.joints, 3), torch.rand(B, 1, skeleton.joints, 1, dtype=torch.float64) + 0.1
     for joint in skeleton.order[1:]:
-        way = x[:, :, joint] / x[:, :, joint].norm(dim=-1, keepdim=True)
-        x[:, :, joint] = x[:, :, skeleton.parents[joint]] + lengths[:, :, joint] * way
+        direction = x[:, :, joint] / x[:, :, joint].norm(dim=-1, keepdim=True)
+        x[:, :, joint] = x[:, :, skeleton.parents[joint]] + lengths[:, :, joint] * direction
     return (x if size == 3 * skeleton.joints else skeleton.without_root(x - x[:, :, :1])).flatten(-2)
 
 
@@ -248,33 +252,35 @@ def bones_and_data(request):
     return view, rigid(6, size)
 
 
-def test_directions_of_bones_have_length_one_and_lead_back_to_rigid_people(bones_and_data):
+def test_directions_of_bones_have_length_one_and_are_inverted_to_rigid_people(bones_and_data):
     view, x = bones_and_data
-    seen = view(Batch({"x": x}))
-    whole = seen["x"] if "x" in seen else Parts({"legs": LEGS, "arms": ARMS}).inverse(seen)["x"]
-    joints = whole.unflatten(-1, (-1, 3))
+    transformed = view(Batch({"x": x}))
+    directions = (
+        transformed["x"] if "x" in transformed else Parts({"legs": LEGS, "arms": ARMS}).inverse(transformed)["x"]
+    )
+    joints = directions.unflatten(-1, (-1, 3))
     bones = joints if joints.shape[2] < J else WALKER.without_root(joints)
     torch.testing.assert_close(bones.norm(dim=-1), torch.ones_like(bones[..., 0]))
-    torch.testing.assert_close(view.inverse(seen)["x"], x)
-    again = view(seen)
-    assert all(torch.equal(again[name], seen[name]) for name in seen)
+    torch.testing.assert_close(view.inverse(transformed)["x"], x)
+    twice = view(transformed)
+    assert all(torch.equal(twice[name], transformed[name]) for name in transformed)
 
 
-def test_whatever_is_made_of_them_no_bone_is_stretched(bones_and_data):
-    """Any numbers (S, B, H, D) in the place of directions; a root stays where it is made."""
+def test_the_inverse_of_any_directions_keeps_bone_lengths(bones_and_data):
+    """Arbitrary numbers (S, B, H, D) replace the directions. The root position is kept."""
     view, x = bones_and_data
-    seen = view(Batch({"x": x}))
-    made = {name: people(2, B, 7, value.shape[-1]) for name, value in seen.items() if value.dim() == 3}
-    added = {name: value for name, value in seen.items() if value.dim() < 3}
-    back = view.inverse(Batch({**made, **added}))
-    torch.testing.assert_close(lengths_of(back["x"]), lengths_of(x)[:, :1].expand(2, -1, 7, -1))
+    transformed = view(Batch({"x": x}))
+    samples = {name: people(2, B, 7, value.shape[-1]) for name, value in transformed.items() if value.dim() == 3}
+    added = {name: value for name, value in transformed.items() if value.dim() < 3}
+    inverse = view.inverse(Batch({**samples, **added}))
+    torch.testing.assert_close(lengths_of(inverse["x"]), lengths_of(x)[:, :1].expand(2, -1, 7, -1))
     if x.shape[-1] == 3 * J:
-        torch.testing.assert_close(back["x"][..., :3], made["x"][..., :3])
-    if "legs" in back:
-        assert torch.equal(back["legs"], back["x"][..., LEGS])
+        torch.testing.assert_close(inverse["x"][..., :3], samples["x"][..., :3])
+    if "legs" in inverse:
+        assert torch.equal(inverse["legs"], inverse["x"][..., LEGS])
 
 
-def test_lengths_are_the_means_over_the_observed_frames_that_are_no_padding():
+def test_bone_lengths_are_means_over_observed_frames_without_padding():
     x = people(B, 6, D)
     lengths = lengths_of(x)
     torch.testing.assert_close(Bones(WALKER, 4)(Batch({"x": x}))["bone_lengths"], lengths[:, :4].mean(1))
@@ -283,7 +289,7 @@ def test_lengths_are_the_means_over_the_observed_frames_that_are_no_padding():
     torch.testing.assert_close(Bones(WALKER, 4)(Batch({"x": x, "lengths": steps}))["bone_lengths"], expected)
 
 
-def test_directions_alone_have_no_density_and_need_both_ends():
+def test_directions_have_no_density_and_need_both_joints():
     x, view = rigid(5, D), Bones(WALKER, 3)
     with pytest.raises(ValueError, match=r"directions of bones has no density of positions: lengths are given"):
         view.log_det(Batch({"x": x}))
@@ -298,18 +304,18 @@ def test_directions_alone_have_no_density_and_need_both_ends():
         view(Batch({"x": x, "mask": {"x": mask}}))
 
 
-def test_a_part_that_hangs_from_another_does_not_tell_its_bones():
+def test_a_part_without_its_parent_joint_is_an_error():
     knee = [i for i in range(D) if i // 3 in (1, 2)]  # of the joints without the root: RKnee, RFoot
     rest = [i for i in range(D) if i not in knee]
     view, x = Bones(WALKER, 4, {"shank": knee, "rest": rest}), rigid(4, D)
-    seen = view(Batch({"x": x, "shank": x[..., knee]}))
-    assert torch.equal(seen["shank"], seen["x"][..., knee])
-    assert torch.equal(view(Batch({"rest": x[..., rest]}), seen)["rest"], seen["x"][..., rest])
+    transformed = view(Batch({"x": x, "shank": x[..., knee]}))
+    assert torch.equal(transformed["shank"], transformed["x"][..., knee])
+    assert torch.equal(view(Batch({"rest": x[..., rest]}), transformed)["rest"], transformed["x"][..., rest])
     with pytest.raises(ValueError, match="shank alone does not determine the direction of RKnee, whose parent is RHip"):
-        view(Batch({"shank": x[..., knee]}), seen)
+        view(Batch({"shank": x[..., knee]}), transformed)
 
 
-def test_a_model_of_directions_makes_rigid_people_and_has_no_bound():
+def test_a_model_of_directions_forecasts_rigid_people_and_has_no_bound():
     torch.manual_seed(0)
     equations = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
     distribution = {"p(x)": dvae.distributions.Directions(residual=0.5)}
@@ -334,7 +340,7 @@ MIXING = torch.tensor([[2.0, 1.0, 0.0], [0.0, 0.5, 0.3], [0.1, 0.0, 3.0]], dtype
 
 
 class Scaled(View):
-    """Each coordinate of x times a number of its own."""
+    """Each coordinate of x, multiplied by its factor."""
 
     def __call__(self, data, view_inputs=None):
         return {**data, "x": data["x"] * FACTORS} if "x" in data and "log_det" not in data else dict(data)
@@ -347,7 +353,7 @@ class Scaled(View):
 
 
 class Mixed(Scaled):
-    """Frames times a matrix; how much volume changes is known of whole sequences."""
+    """Frames, multiplied by a matrix; the log-determinant is one number for each sequence."""
 
     def __call__(self, data, view_inputs=None):
         return {**data, "x": data["x"] @ MIXING} if "x" in data and "log_det" not in data else dict(data)
@@ -369,58 +375,60 @@ ESTIMATES = {
 }
 
 
-def seeing(view):
+def with_view(view):
     torch.manual_seed(0)
     return dvae.DynamicalVAE(*SMALL, Recurrent(4), view=view).double().eval()
 
 
 def incomplete(kind):
-    """Windows, their entry of a batch, and which entries count."""
+    """Return windows, their mask or lengths, and which entries count."""
     counts = torch.ones(B, T, 3, dtype=torch.bool)
-    beside = {}
+    entries = {}
     if "mask" in kind:
         counts = torch.rand(B, T, 3) < 0.7
-        beside["mask"] = counts
+        entries["mask"] = counts
     if "lengths" in kind:
-        beside["lengths"] = torch.tensor([2, T, 4])
-        counts = counts & (torch.arange(T) < beside["lengths"][:, None])[..., None]
-    return people(B, T, 3), beside, counts
+        entries["lengths"] = torch.tensor([2, T, 4])
+        counts = counts & (torch.arange(T) < entries["lengths"][:, None])[..., None]
+    return people(B, T, 3), entries, counts
 
 
 @pytest.mark.parametrize(
     ("kind", "estimate"), [("mask" if n % 2 else "mask and lengths", name) for n, name in enumerate(ESTIMATES)]
 )
-def test_densities_are_of_the_data_as_given(estimate, kind):
-    """A change of variables: what is said of scaled data, and the log-determinant of the entries that are there."""
-    x, beside, counts = incomplete(kind)
+def test_densities_are_those_of_the_given_data(estimate, kind):
+    """The density of the scaled data plus the log-determinant of the observed entries is the density of the data."""
+    x, entries, counts = incomplete(kind)
     view = Scaled()
-    ours, theirs = {"x": x, **beside}, {"x": x * FACTORS, **beside}
-    expected = torch.where(counts, view.log_det(ours), 0.0).sum((1, 2))
-    plain, found = (seeded(ESTIMATES[estimate], seeing(v), data) for v, data in ((None, theirs), (view, ours)))
-    torch.testing.assert_close(found, plain + (expected if len(plain) == B else expected.sum()))
+    batch, scaled = {"x": x, **entries}, {"x": x * FACTORS, **entries}
+    expected = torch.where(counts, view.log_det(batch), 0.0).sum((1, 2))
+    plain, with_scaling = (
+        seeded(ESTIMATES[estimate], with_view(v), data) for v, data in ((None, scaled), (view, batch))
+    )
+    torch.testing.assert_close(with_scaling, plain + (expected if len(plain) == B else expected.sum()))
     assert (expected.abs() > 0.1).all()
 
 
 @pytest.mark.parametrize("estimate", ESTIMATES)
-def test_volume_that_is_known_of_whole_sequences_counts_where_they_are_complete(estimate):
-    x, model = people(B, T, 3), seeing(Mixed())
-    plain, found = (seeded(ESTIMATES[estimate], m, v) for m, v in ((seeing(None), x @ MIXING), (model, x)))
-    torch.testing.assert_close(found, plain + T * MIXING.logdet() * (B / len(plain)))
+def test_a_log_determinant_of_whole_sequences_requires_complete_sequences(estimate):
+    x, model = people(B, T, 3), with_view(Mixed())
+    plain, mixed = (seeded(ESTIMATES[estimate], m, v) for m, v in ((with_view(None), x @ MIXING), (model, x)))
+    torch.testing.assert_close(mixed, plain + T * MIXING.logdet() * (B / len(plain)))
     for partial in ("mask", "lengths"):
-        _, beside, _ = incomplete(partial)
+        _, entries, _ = incomplete(partial)
         with pytest.raises(
             ValueError, match=rf"log_det of .* has shape \(3,\), for data with {partial}; expected \(B,\)"
         ):
-            ESTIMATES[estimate](model, {"x": x, **beside})
+            ESTIMATES[estimate](model, {"x": x, **entries})
 
 
-def test_the_log_score_has_the_volume_of_the_future():
-    x, seen = people(B, T, 3), 3
-    plain = seeded(predictive_bound, seeing(None), x * FACTORS, seen, 8).bound
-    found = seeded(predictive_bound, seeing(Scaled()), x, seen, 8).bound
-    torch.testing.assert_close(found, plain + (T - seen) * FACTORS.abs().log().sum())
+def test_the_log_score_includes_the_log_determinant_of_the_future():
+    x, n_observed = people(B, T, 3), 3
+    plain = seeded(predictive_bound, with_view(None), x * FACTORS, n_observed, 8).bound
+    scaled = seeded(predictive_bound, with_view(Scaled()), x, n_observed, 8).bound
+    torch.testing.assert_close(scaled, plain + (T - n_observed) * FACTORS.abs().log().sum())
     with pytest.raises(ValueError, match="the share of the future in it is not known"):
-        predictive_bound(seeing(Mixed()), x, seen, 8)
+        predictive_bound(with_view(Mixed()), x, n_observed, 8)
 
 
 def test_the_oracle_of_a_scaled_model_is_the_density_of_the_data():
@@ -436,10 +444,10 @@ def test_the_oracle_of_a_scaled_model_is_the_density_of_the_data():
     torch.testing.assert_close(dvae.Oracle(scaled, T).evidence(x), expected)
 
 
-def test_views_in_a_row_add_their_volumes():
+def test_composed_views_add_their_log_determinants():
     parts = Parts({"legs": [0, 2], "arms": [1]})
-    x, beside, counts = incomplete("mask and lengths")
-    view, data = Views(Scaled(), parts), Batch({"x": x, **beside, "mask": {"x": beside["mask"]}})
+    x, entries, counts = incomplete("mask and lengths")
+    view, data = Views(Scaled(), parts), Batch({"x": x, **entries, "mask": {"x": entries["mask"]}})
     by_entry = torch.where(counts, Scaled().log_det(data), 0.0)
     torch.testing.assert_close(view.log_det(data), by_entry.sum((1, 2)))
     torch.testing.assert_close(view.counted(data), by_entry.sum(2))
@@ -454,14 +462,14 @@ def test_views_in_a_row_add_their_volumes():
     assert Views(Past("s"), Scaled()).log_det(Batch({"x": x})).shape == (B,)
 
 
-def test_what_a_scaled_model_makes_goes_back_and_it_is_fitted_by_the_bound_of_the_data():
-    x, model, plain = people(B, T, 3), seeing(Scaled()), seeing(None)
+def test_a_scaled_model_forecasts_unscaled_data_and_is_fitted_to_their_bound():
+    x, model, plain = people(B, T, 3), with_view(Scaled()), with_view(None)
     future = seeded(plain.forecast, x * FACTORS, 3, 2, draw_emission=True)["x"]
     torch.testing.assert_close(seeded(model.forecast, x, 3, 2, draw_emission=True)["x"], future / FACTORS)
     added = FACTORS.abs().log().sum().item()
-    ours, theirs = (
+    fit, plain_fit = (
         dvae.fit(m, data, data, steps=2, validate_every=1, log_every=1, progress=False)
         for m, data in ((model, x), (plain, x * FACTORS))
     )
-    assert ours.best_bound == pytest.approx(theirs.best_bound + added)
-    assert ours.series("loss")[1] == pytest.approx([loss - added for loss in theirs.series("loss")[1]])
+    assert fit.best_bound == pytest.approx(plain_fit.best_bound + added)
+    assert fit.series("loss")[1] == pytest.approx([loss - added for loss in plain_fit.series("loss")[1]])

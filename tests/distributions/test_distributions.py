@@ -1,4 +1,4 @@
-"""Distributions: what they draw is what they say, scales stay positive, and a description is plain data."""
+"""Distributions: draws match their moments, scales stay positive, and declarations are checked."""
 
 from dataclasses import dataclass, replace
 
@@ -44,15 +44,15 @@ def previous(distribution, *shape):
 def test_draws_have_the_mean_and_the_variance_of_the_distribution(name):
     distribution = build(name)
     parameters = distribution(torch.randn(B, T, D, dtype=torch.float64), previous(distribution, B, T))
-    said = distribution.distribution(parameters)
+    expected = distribution.distribution(parameters)
     n = 20_000
     draws = distribution.draw(
         tuple(p.expand(n, B, T, D) for p in parameters), distribution.noise((n, B, T, D), parameters[0])
     )
-    z_mean = (draws.mean(0) - said.mean) / (said.stddev / n**0.5)
+    z_mean = (draws.mean(0) - expected.mean) / (expected.stddev / n**0.5)
     # The variance of a sample variance needs the fourth moment, which is finite here (df is 9 or so).
-    squares = (draws - said.mean).square()
-    z_variance = (squares.mean(0) - said.variance) / (squares.std(0) / n**0.5)
+    squares = (draws - expected.mean).square()
+    z_variance = (squares.mean(0) - expected.variance) / (squares.std(0) / n**0.5)
     assert z_mean.abs().max() < 5
     assert z_variance.abs().max() < 5
 
@@ -62,9 +62,9 @@ def test_draws_have_the_mean_and_the_variance_of_the_distribution(name):
 def test_a_residual_location_keeps_its_share_of_the_previous_value(name, share):
     distribution = replace(DISTRIBUTIONS[name], residual=share).build(SHAPE).double()
     features, before = torch.randn(B, T, D, dtype=torch.float64), previous(distribution, B, T)
-    there, here = distribution(features, before), distribution(features, torch.zeros_like(before))
-    torch.testing.assert_close(there[0] - here[0], share * before)
-    torch.testing.assert_close(there[1:], here[1:])
+    with_previous, without_previous = distribution(features, before), distribution(features, torch.zeros_like(before))
+    torch.testing.assert_close(with_previous[0] - without_previous[0], share * before)
+    torch.testing.assert_close(with_previous[1:], without_previous[1:])
 
 
 @pytest.mark.parametrize("spec", [distributions.Normal(min_scale=0.2), distributions.StudentT(min_scale=0.2)])
@@ -79,12 +79,12 @@ def test_scales_stay_above_their_minimum(spec):
     ).all()
 
 
-# -------------------------------------------------------------------------------------------- families of one's own
+# ---------------------------------------------------------------------------------------------------- custom families
 
 
 @dataclass(frozen=True)
-class Own:
-    """A distribution of the user's own, of any class."""
+class Custom:
+    """A distribution of a custom class."""
 
     kind: type
 
@@ -93,7 +93,7 @@ class Own:
 
 
 class Bernoulli(distributions.ConditionalDistribution):
-    """Its location is a probability."""
+    """A Bernoulli distribution of each coordinate."""
 
     support, discrete = dist.constraints.boolean, True
 
@@ -111,7 +111,7 @@ class Bernoulli(distributions.ConditionalDistribution):
         return torch.bernoulli(parameters[0])
 
 
-class Stuck(Bernoulli):
+class NoGradient(Bernoulli):
     """A continuous family whose draws have no gradient."""
 
     support, discrete, reparameterised = dist.constraints.real, False, False
@@ -124,7 +124,7 @@ class Stuck(Bernoulli):
 
 
 class Pairs(Bernoulli):
-    """Two coordinates each are one event."""
+    """A normal distribution whose events are pairs of coordinates."""
 
     support, discrete = dist.constraints.real, False
 
@@ -135,46 +135,48 @@ class Pairs(Bernoulli):
 PAIR = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
 
 
-def model(**own):
-    return dvae.DynamicalVAE(*PAIR, {"z": 2, "x": 2}, Recurrent(4), {f"{k[0]}({k[1]})": Own(h) for k, h in own.items()})
+def model(**kinds):
+    return dvae.DynamicalVAE(
+        *PAIR, {"z": 2, "x": 2}, Recurrent(4), {f"{k[0]}({k[1]})": Custom(h) for k, h in kinds.items()}
+    )
 
 
-@pytest.mark.parametrize(("place", "factor"), [("qz", r"q\(z_t \|"), ("pz", r"p\(z_t \|")])
-def test_discrete_latents_are_refused(place, factor):
+@pytest.mark.parametrize(("key", "factor"), [("qz", r"q\(z_t \|"), ("pz", r"p\(z_t \|")])
+def test_discrete_latents_are_an_error(key, factor):
     with pytest.raises(ValueError, match=rf"the latent z from the distribution of {factor} are discrete.*no gradient"):
-        model(**{place: Bernoulli})
+        model(**{key: Bernoulli})
 
 
-def test_discrete_data_have_no_volume_that_a_view_could_change():
+def test_a_view_that_changes_the_volume_of_discrete_data_is_an_error():
     class Halved(View):
         def log_det(self, data):
             return torch.full_like(data["x"], 0.5).log()
 
-    arguments = {"z": 2, "x": 2}, Recurrent(4), {"p(x)": Own(Bernoulli)}
+    arguments = {"z": 2, "x": 2}, Recurrent(4), {"p(x)": Custom(Bernoulli)}
     with pytest.raises(ValueError, match="discrete"):
         dvae.DynamicalVAE(*PAIR, *arguments, view=Halved())
 
 
-def test_latents_whose_draws_have_no_gradient_are_refused():
+def test_latents_whose_draws_have_no_gradient_are_an_error():
     with pytest.raises(ValueError, match="reparameterised"):
-        model(qz=Stuck)
-    with torch.no_grad():  # the family is what counts, not where the model is made
-        model(pz=Stuck)
+        model(qz=NoGradient)
+    with torch.no_grad():  # the grad mode at construction does not matter
+        model(pz=NoGradient)
     with pytest.raises(ValueError, match="reparameterised"):  # the prior is the guide
         dvae.DynamicalVAE(
-            "p(z_t | c_t) p(x_t | z_t)", None, {"z": 1, "x": 1, "c": 1}, distributions={"p(z)": Own(Stuck)}
+            "p(z_t | c_t) p(x_t | z_t)", None, {"z": 1, "x": 1, "c": 1}, distributions={"p(z)": Custom(NoGradient)}
         )
 
 
-@pytest.mark.parametrize("place", ["px", "qz"])
-def test_events_of_some_coordinates_are_refused(place):
+@pytest.mark.parametrize("key", ["px", "qz"])
+def test_events_of_some_coordinates_are_an_error(key):
     x = torch.randn(2, 3, 2)
     with pytest.raises(ValueError, match=r"event \(2,\); by its event_dim = 0 it has no event"):
-        dvae.SequenceELBO().terms(model(**{place: Pairs}), x)
+        dvae.SequenceELBO().terms(model(**{key: Pairs}), x)
 
 
 @pytest.mark.parametrize("kind", [dist.Bernoulli, dist.Exponential])
-def test_a_law_that_does_not_declare_its_support_is_refused(kind):
+def test_a_distribution_with_an_undeclared_support_is_an_error(kind):
     class Undeclared(Bernoulli):
         support, discrete = dist.constraints.real, False
 
@@ -201,17 +203,17 @@ DECLARED = {
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_laws_declare_what_their_distributions_are(name):
-    """Event, discreteness, gradients of draws, and a value with a density."""
+def test_declarations_match_the_distributions(name):
+    """The declarations are event_dim, discreteness, gradients of draws, and a value with a density."""
     prior = "prior" in name
     distribution = DECLARED[name].build(Shape(4, 0 if prior else 5, not prior)).eval()
     features = torch.randn(1, 0 if prior else 5, requires_grad=True)
     parameters = distribution(features)
-    made = distribution.distribution(parameters)
-    drawn = distribution.draw(parameters, distribution.noise((1, 4), features))
-    assert len(made.event_shape) == distribution.event_dim
-    assert made.support.is_discrete == distribution.discrete
-    assert distribution.reparameterised == (drawn.requires_grad and not distribution.discrete) or name == "normals"
+    conditional = distribution.distribution(parameters)
+    draw = distribution.draw(parameters, distribution.noise((1, 4), features))
+    assert len(conditional.event_shape) == distribution.event_dim
+    assert conditional.support.is_discrete == distribution.discrete
+    assert distribution.reparameterised == (draw.requires_grad and not distribution.discrete) or name == "normals"
     inside = distribution.interior_point(4)
     value = torch.zeros(1, 4) if inside is None else inside[None]
-    assert distribution.support is None or torch.isfinite(made.log_prob(value)).all()
+    assert distribution.support is None or torch.isfinite(conditional.log_prob(value)).all()

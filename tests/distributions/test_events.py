@@ -1,4 +1,4 @@
-"""Distributions with one density for all that a step has: normals with full covariance, and classes."""
+"""Distributions with one event for each step: normals with full covariance, and categories."""
 
 import math
 
@@ -20,7 +20,7 @@ SIZES = {"w": 2, "z": 2, "x": 3}
 
 NORMAL = Family("MultivariateNormal")
 FULL = dict.fromkeys(("p(z)", "p(x)", "q(w)", "q(z)"), NORMAL)
-LAWS = {
+DISTRIBUTIONS = {
     "all": FULL,
     "latents": {**FULL, "p(x)": FixedNormal(learned=True)},
     "guide": {"q": NORMAL},
@@ -30,12 +30,12 @@ LAWS = {
 
 
 def build(kind, network=None):
-    return DynamicalVAE(*PAIR, SIZES, network or Recurrent(4), LAWS[kind]).double()
+    return DynamicalVAE(*PAIR, SIZES, network or Recurrent(4), DISTRIBUTIONS[kind]).double()
 
 
-def data(kind, **rest):
+def data(kind, **entries):
     x = torch.randn(B, T, 3, dtype=torch.float64)
-    return {"x": dist.OneHotCategorical(logits=x).sample() if kind == "classes" else x, **rest}
+    return {"x": dist.OneHotCategorical(logits=x).sample() if kind == "classes" else x, **entries}
 
 
 def whole_steps():
@@ -50,7 +50,7 @@ BATCHES = {
 }
 
 
-def test_a_step_is_missing_as_a_whole_or_not_at_all():
+def test_partly_missing_events_are_an_error():
     model, mask = build("all"), torch.ones(B, T, 3, dtype=torch.bool)
     mask[1, 2, 0] = False
     with pytest.raises(ValueError, match="entries"):
@@ -59,18 +59,18 @@ def test_a_step_is_missing_as_a_whole_or_not_at_all():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("kind", "batch"), [*zip(LAWS, [*BATCHES, "both"], strict=True)])
-def test_particles_weigh_what_the_program_scores(kind, batch):
-    """Without resampling, the particle filter is importance sampling; with it, it runs."""
-    model, given = build(kind), data(kind, **BATCHES[batch]())
-    run = Filter(model, given, 4)
+@pytest.mark.parametrize(("kind", "batch"), [*zip(DISTRIBUTIONS, [*BATCHES, "both"], strict=True)])
+def test_particle_weights_equal_the_densities_of_the_program(kind, batch):
+    """Without resampling, the particle filter is importance sampling; with resampling, its bound is finite."""
+    model, observations = build(kind), data(kind, **BATCHES[batch]())
+    run = Filter(model, observations, 4)
     bound = run.run(0.0).bound
     latents = {name: value for name, value in run.drawn.items() if name in model.latents}
-    many = dvae.program.batch.repeat(given, 4)
+    many = dvae.program.batch.repeat(observations, 4)
     trace = poutine.trace(poutine.condition(model.guide, data=latents)).get_trace(many)
     trace.compute_log_prob()
     log_q = sum(trace.nodes[name]["log_prob"] for name in model.latents)
     expected = sum(model.log_joint(many, latents).values()) - log_q
     torch.testing.assert_close(bound, expected.unflatten(0, (4, -1)).logsumexp(0) - math.log(4))
-    assert torch.isfinite(fivo_bound(model, given, 8, resample_below=1.0).bound).all()
-    assert torch.isfinite(iwae_bound(model, given, 30).bound).all()
+    assert torch.isfinite(fivo_bound(model, observations, 8, resample_below=1.0).bound).all()
+    assert torch.isfinite(iwae_bound(model, observations, 30).bound).all()

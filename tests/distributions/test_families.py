@@ -1,4 +1,4 @@
-"""Families of observations keep the contract of every model, and say what their distributions say."""
+"""Families of observations satisfy the contract of models, with correct densities, means and draws."""
 
 import re
 from pathlib import Path
@@ -34,7 +34,7 @@ def built(distribution, size=2):
 
 
 class Contract(dvae.testing.FactorizationContract):
-    """Of the families with something of their own; the others are distributions of the same class."""
+    """The contract, for one family of each class."""
 
     missing = None
     distribution = None
@@ -45,7 +45,9 @@ class Contract(dvae.testing.FactorizationContract):
 
 class TestCategorical(Contract):
     distribution = Family("OneHotCategorical")
-    # of one class, or of one of which each is seen once, there is nothing to learn
+
+
+# with one class, or each class observed once, there is no signal to learn
 
 
 class TestNormalMixture(Contract):
@@ -69,7 +71,7 @@ class TestMixed(Contract):
 
 
 class TestSeveralVariables(dvae.testing.FactorizationContract):
-    """Data variables of a family each, which read each other."""
+    """Several data variables that have different families and read each other."""
 
     missing = None
 
@@ -84,11 +86,11 @@ class TestSeveralVariables(dvae.testing.FactorizationContract):
         )
 
 
-# ------------------------------------------------------------------------------------------------- what they say
+# ------------------------------------------------------------------------------------------- means and densities
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_draws_have_the_mean_that_the_law_says(name):
+def test_draws_have_the_mean_of_their_distribution(name):
     distribution = ALL[name].build(Shape(3, 4)).double()
     parameters = distribution(torch.randn(2, 4, dtype=torch.float64))
     n = 20_000
@@ -118,29 +120,29 @@ DENSITIES = {
 
 
 @pytest.mark.parametrize("name", DENSITIES)
-def test_densities_are_those_of_scipy(name):
+def test_densities_equal_those_of_scipy(name):
     distribution = ALL[name].build(Shape(3, 4)).double()
     with torch.no_grad():
         parameters = distribution(torch.randn(2, 4, dtype=torch.float64))
         value = distribution.draw(parameters, distribution.noise((2, 3), parameters[0]))
-        found = distribution.distribution(parameters).log_prob(value)
+        log_densities = distribution.distribution(parameters).log_prob(value)
     expected = DENSITIES[name]([p.numpy() for p in parameters], value.numpy())
-    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6 if name == "angle" else 1e-10)
+    np.testing.assert_allclose(log_densities.numpy(), expected, atol=1e-6 if name == "angle" else 1e-10)
 
 
-def test_angles_have_densities_and_gradients_at_every_concentration_of_single_precision():
+def test_angles_have_densities_and_gradients_at_every_float32_concentration():
     distribution, logs = Family("VonMises", project=False).build(Shape(1, 2)), torch.linspace(-80.0, 80.0, 33)
     features = torch.stack([torch.full_like(logs, 0.25), logs], -1).requires_grad_()
     concentration = logs.exp().double().numpy()
     value = (0.25 + torch.exp(-logs / 2).clamp(max=2.0))[:, None]
-    apart = (value.double() - 0.25).numpy()[:, 0]
-    kernel = -2 * np.sin(apart / 2) ** 2
+    distance = (value.double() - 0.25).numpy()[:, 0]
+    kernel = -2 * np.sin(distance / 2) ** 2
     density = distribution.distribution(distribution(features)).log_prob(value)[:, 0]
     expected = concentration * kernel - np.log(2 * np.pi * special.i0e(concentration))
     np.testing.assert_allclose(density.detach().numpy(), expected, rtol=1e-5, atol=1e-5)
     (gradient,) = torch.autograd.grad(density.sum(), features)
-    np.testing.assert_allclose(gradient[:, 0].numpy(), concentration * np.sin(apart), rtol=1e-5)
-    moderate = logs < 25  # further up even scipy's 1 - I_1 / I_0 is 0
+    np.testing.assert_allclose(gradient[:, 0].numpy(), concentration * np.sin(distance), rtol=1e-5)
+    moderate = logs < 25  # at higher concentrations even scipy's 1 - I_1 / I_0 is 0
     slope = concentration * (kernel + 1 - special.i1e(concentration) / special.i0e(concentration))
     np.testing.assert_allclose(gradient[moderate, 1].numpy(), slope[moderate], rtol=1e-3, atol=1e-5)
     assert gradient.isfinite().all()
@@ -149,64 +151,66 @@ def test_angles_have_densities_and_gradients_at_every_concentration_of_single_pr
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if ALL[name].build(Shape(3, 4)).location_scale])
-def test_in_units_a_law_is_that_of_the_variable_in_its_unit(name):
+def test_rescaling_a_distribution_is_a_change_of_variables(name):
     distribution = ALL[name].build(Shape(3, 4)).double()
     parameters = distribution(torch.randn(2, 4, dtype=torch.float64))
     if name == "fixed":
-        assert distribution.learned  # what is given is in the variable's own unit
+        assert distribution.learned  # a given scale is in the unit of the variable
     scale = torch.tensor([0.5, 2.0, 30.0], dtype=torch.float64)
     mean = torch.arange(3.0).double() * (name in REAL)
-    there = distribution.rescale(parameters, mean, scale)
-    torch.testing.assert_close(distribution.mean(there), mean + scale * distribution.mean(parameters))
+    rescaled = distribution.rescale(parameters, mean, scale)
+    torch.testing.assert_close(distribution.mean(rescaled), mean + scale * distribution.mean(parameters))
     if not distribution.distribution(parameters).support.is_discrete:
         value = distribution.draw(parameters, distribution.noise((2, 3), parameters[0])).detach()
         volume = scale.log() if not distribution.distribution(parameters).event_shape else scale.log().sum()
-        here = distribution.distribution(parameters).log_prob(value)
-        torch.testing.assert_close(distribution.distribution(there).log_prob(mean + scale * value), here - volume)
+        log_density = distribution.distribution(parameters).log_prob(value)
+        torch.testing.assert_close(
+            distribution.distribution(rescaled).log_prob(mean + scale * value), log_density - volume
+        )
 
 
 REAL = ("real", "fixed", "robust", "laplace", "mixture", "correlated", "multivariate", "cauchy")
 
 
-def test_a_product_is_its_parts():
+def test_a_product_has_the_densities_and_means_of_its_parts():
     distribution = MIXED.build(Shape(4, 5)).double()
     parameters = distribution(torch.randn(2, 3, 5, dtype=torch.float64))
     value = distribution.draw(parameters, distribution.noise((2, 3, 4), parameters[0]))
-    whole, parts = distribution.distribution(parameters), distribution.each(parameters)
-    for own, places, theirs in parts:
-        expected = own.distribution(theirs).log_prob(value[..., places])
-        torch.testing.assert_close(whole.log_prob(value)[..., places], expected)
-        torch.testing.assert_close(distribution.mean(parameters)[..., places], own.mean(theirs))
-    assert whole.support.check(value).all()
-    assert not whole.support.check(value - 100)[..., 1:3].any()
-    twice = distributions.Product((((0, 1), distributions.Normal()), ((1,), distributions.Normal())))
+    product, parts = distribution.distribution(parameters), distribution.each(parameters)
+    for part, indices, part_parameters in parts:
+        expected = part.distribution(part_parameters).log_prob(value[..., indices])
+        torch.testing.assert_close(product.log_prob(value)[..., indices], expected)
+        torch.testing.assert_close(distribution.mean(parameters)[..., indices], part.mean(part_parameters))
+    assert product.support.check(value).all()
+    assert not product.support.check(value - 100)[..., 1:3].any()
+    overlapping = distributions.Product((((0, 1), distributions.Normal()), ((1,), distributions.Normal())))
     with pytest.raises(ValueError, match="each coordinate 0 to 3 of x exactly once"):
-        twice.build(Shape(4, 5, name="x"))
+        overlapping.build(Shape(4, 5, name="x"))
     with pytest.raises(ValueError, match="density"):
         distributions.Product((((0, 1), distributions.Delta()),)).build(Shape(2, 2, name="x"))
 
 
-def test_an_event_in_a_product_counts_once_and_is_missing_as_a_whole():
+def test_an_event_in_a_product_counts_once_and_cannot_be_partly_missing():
     model = built(ONE_OF_TWO, 3).double()
     data = model.sample(4, 5)
     mask = torch.ones_like(data["x"], dtype=torch.bool)
     mask[0, :, [0, 2]] = False
     with pytest.raises(ValueError, match="together"):
         model.log_joint({"x": data["x"], "mask": mask.index_fill(2, torch.tensor([2]), True)}, {"z": data["z"]})
-    whole = model.log_joint({"x": data["x"]}, {"z": data["z"]})["x"]
-    some = model.log_joint({"x": data["x"], "mask": mask}, {"z": data["z"]})["x"]
-    torch.testing.assert_close(whole[1:], some[1:], rtol=1e-12, atol=0)
-    assert whole[0] < some[0]
+    complete = model.log_joint({"x": data["x"]}, {"z": data["z"]})["x"]
+    masked = model.log_joint({"x": data["x"], "mask": mask}, {"z": data["z"]})["x"]
+    torch.testing.assert_close(complete[1:], masked[1:], rtol=1e-12, atol=0)
+    assert complete[0] < masked[0]
 
 
-# ------------------------------------------------------- draws against densities, by a posterior known on a grid
+# ------------------------------------------------------------- draws against densities, by a posterior on a grid
 
 T, SIZE, DRAWS = 5, 3, 9
 EDGES = torch.linspace(-5, 5, 402, dtype=torch.float64)
 
 
-def moved(distribution):
-    """w moves every parameter of the distribution, in the middle of its range and steadily."""
+def latent_model(distribution):
+    """Return a model whose latent w changes every parameter of the distribution."""
     torch.manual_seed(0)
     networks = {"p(x)": Dense((4,)), "default": Dense((2,))}
     model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w)", {"w": 1, "x": SIZE}, networks, {"p(x)": distribution}).double()
@@ -216,17 +220,17 @@ def moved(distribution):
 
 
 def posterior(model):
-    """Draws of w given x, from its density at the middles of 401 intervals, and evenly within the one that is drawn."""
+    """Return a guide that draws w given x from its density, constant on each of 401 intervals."""
 
     def guide(batch):
-        x, middles = batch["x"].unflatten(0, (DRAWS, -1))[0], (EDGES[1:] + EDGES[:-1]) / 2  # the others are the same
+        x, middles = batch["x"].unflatten(0, (DRAWS, -1))[0], (EDGES[1:] + EDGES[:-1]) / 2  # the other rows are copies
         w = middles[:, None]
         parameters = model.generator["x"]({"w": w}, len(w), T)
         distribution = model.generator["x"].head.distribution(tuple(p[:, None] for p in parameters))  # (G, 1, T, ...)
         log_likelihood = distribution.log_prob(x).flatten(2).sum(-1)
         logits = log_likelihood + dist.Normal(0.0, 1.0).log_prob(w)
-        chosen = dist.Categorical(logits=logits.T).sample((DRAWS,)).flatten()
-        value = middles[chosen] + (torch.rand(len(chosen)) - 0.5).double() * (EDGES[1] - EDGES[0])
+        interval = dist.Categorical(logits=logits.T).sample((DRAWS,)).flatten()
+        value = middles[interval] + (torch.rand(len(interval)) - 0.5).double() * (EDGES[1] - EDGES[0])
         with pyro.plate("sequences", len(value)):
             pyro.sample("w", dist.Delta(value[:, None]).to_event(1))
 
@@ -235,15 +239,15 @@ def posterior(model):
 
 @pytest.mark.parametrize("name", [*distributions.FAMILIES, "multivariate", "simplex"])
 def test_the_posterior_is_calibrated(name):
-    model = moved(ALL[name])
-    found = dvae.calibrate(model, T, 400, DRAWS, guide=posterior(model), progress=False)
-    assert found.p_value > 1e-3
+    model = latent_model(ALL[name])
+    calibration = dvae.calibrate(model, T, 400, DRAWS, guide=posterior(model), progress=False)
+    assert calibration.p_value > 1e-3
 
 
-# --------------------------------------------------------------------------------------------------- what is asked
+# ----------------------------------------------------------------------------------------------- forecasts and errors
 
 
-def test_forecasts_of_counts_are_draws_and_of_others_means_unless_told():
+def test_forecasts_of_discrete_data_are_draws_by_default():
     counts = built(Family("Poisson"))
     past = counts.sample(2, 4)["x"]
     assert not counts.forecast(past, 3, samples=5)["x"].frac().any()
@@ -253,7 +257,7 @@ def test_forecasts_of_counts_are_draws_and_of_others_means_unless_told():
 
 
 @pytest.mark.parametrize(
-    ("distribution", "value", "said"),
+    ("distribution", "value", "message"),
     [
         (Family("Poisson"), 0.5, "coordinate"),
         (Family("Bernoulli"), 2.0, "values are 0 or 1"),
@@ -268,27 +272,27 @@ def test_forecasts_of_counts_are_draws_and_of_others_means_unless_told():
         (Family("OneHotCategorical"), 1.0, "coordinate"),
     ],
 )
-def test_values_that_a_family_does_not_have_are_refused_unless_hidden(distribution, value, said):
+def test_observed_values_outside_the_support_are_an_error(distribution, value, message):
     model = built(distribution)
     data = model.sample(2, 4)["x"]
     if model.generator["x"].whole:
         data[1, 2] = 1.0
     data[1, 2, 0] = value
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         dvae.SequenceELBO().terms(model, data)
     mask = torch.ones_like(data, dtype=torch.bool)
     mask[1, 2] = False
     assert torch.isfinite(dvae.SequenceELBO().terms(model, {"x": data, "mask": mask}).bound).all()
 
 
-def test_values_beyond_where_a_law_happens_to_end_are_told_from_steps_that_are_too_large():
-    """Of twelve there are no twenty: where a support depends on parameters, the first bound tells."""
+def test_values_outside_a_support_that_depends_on_parameters_are_an_error():
+    """A binomial of 12 trials has no value 20; the first bound shows it."""
     x = torch.full((4, 3, 2), 20.0)
     with pytest.raises(NonFiniteError, match="sequences"):
         dvae.fit(built(Family("Binomial", given={"total_count": 12})), x, steps=1, progress=False)
 
 
-def test_a_distribution_without_a_mean_says_so_where_one_is_needed():
+def test_a_forecast_of_the_mean_needs_a_distribution_with_a_mean():
     shapes = {"locs": (4, -1), "coord_scale": (4, -1), "component_logits": (4,)}
     model = built(Family("MixtureOfDiagNormals", shapes=shapes))
     past = model.sample(2, 4)["x"]
@@ -297,20 +301,20 @@ def test_a_distribution_without_a_mean_says_so_where_one_is_needed():
         model.forecast(past, 2, draw_emission=False)
 
 
-def test_a_class_of_ones_own_is_a_family():
+def test_a_custom_class_is_a_valid_family():
     class Twice(dist.Poisson):
-        """Its own name."""
+        """A custom distribution."""
 
     assert built(Family(Twice)).generator["x"].head.label == "Twice"
 
 
-# ------------------------------------------------------------------------------------- the family of the docs page
+# ------------------------------------------------------------------------------ the custom family of docs/families.md
 
 PAGE = (Path(__file__).parents[2] / "docs" / "families.md").read_text(encoding="utf-8")
-SHOWN: dict = {}
+NAMESPACE: dict = {}
 for block in re.findall(r"```python\n(.*?)```", PAGE.partition("## A family of one's own")[2], re.DOTALL):
-    exec(compile("import torch, dvae\npair = " + repr(PAIR) + "\n" + block, "families.md", "exec"), SHOWN)
+    exec(compile("import torch, dvae\npair = " + repr(PAIR) + "\n" + block, "families.md", "exec"), NAMESPACE)
 
 
-class TestOfOnesOwn(SHOWN["TestBursts"]):
-    """In the lines that the page shows."""
+class TestCustomFamilyOfThePage(NAMESPACE["TestBursts"]):
+    """The family that docs/families.md defines."""

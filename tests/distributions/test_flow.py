@@ -1,4 +1,4 @@
-"""The QR flow is a bijection with the density it says, against Jacobians and the published number of parameters."""
+"""The QR flow is a bijection with the density by its Jacobian and the published number of parameters."""
 
 import pyro
 import pyro.distributions as dist
@@ -15,7 +15,7 @@ def start(size=5, layers=3):
 
 
 def build(size=5, layers=3, whitened=True):
-    """A flow with parameters that are not those it starts with."""
+    """Return a flow with perturbed parameters."""
     flow = start(size, layers).double()
     with torch.no_grad():
         for parameter in flow.parameters():
@@ -26,7 +26,7 @@ def build(size=5, layers=3, whitened=True):
 
 
 def normal(size=5):
-    """With a mean and correlations, always the same."""
+    """Return a normal distribution with a fixed mean and fixed correlations."""
     root = torch.randn(size, size, dtype=torch.float64, generator=torch.Generator().manual_seed(size))
     return dist.MultivariateNormal(torch.full((size,), 2.0, dtype=torch.float64), root @ root.T)
 
@@ -37,12 +37,12 @@ def values(count, size=5):
 
 @pytest.mark.parametrize(("size", "parameters"), [(48, 13_970), (42, 10_712)])
 def test_it_has_the_published_number_of_parameters(size, parameters):
-    """Of Human3.6M and HumanEva-I; the latter's log rounds to 0.01071 million."""
+    """The sizes are Human3.6M and HumanEva-I, whose log reports 0.01071 million."""
     assert sum(parameter.numel() for parameter in start(size).parameters()) == parameters
 
 
 @pytest.mark.parametrize("size", [1, 7])
-def test_q_is_the_product_of_the_reflections_the_last_one_first(size):
+def test_q_is_the_product_of_the_reflections_in_reverse_order(size):
     flow = build(size)
     q, r = flow.factors()
     x = torch.randn(size, dtype=torch.float64)
@@ -59,17 +59,17 @@ def test_q_is_the_product_of_the_reflections_the_last_one_first(size):
 
 @pytest.mark.parametrize("whitened", [False, True])
 @pytest.mark.parametrize(("size", "layers"), SIZES)
-def test_the_determinant_is_that_of_the_jacobian_and_the_inverse_is_exact(size, layers, whitened):
+def test_the_log_determinant_equals_the_jacobian_and_the_inverse_is_exact(size, layers, whitened):
     flow, x = build(size, layers, whitened), values(6, size).unflatten(0, (2, 3))
     z, log_det = flow.to_noise(x)
     assert (z.shape, log_det.shape) == (x.shape, x.shape[:-1])
     torch.testing.assert_close(flow.from_noise(z), x, rtol=0, atol=1e-10)
-    for each, found in zip(x.flatten(0, 1), log_det.flatten(), strict=True):
-        jacobian = torch.autograd.functional.jacobian(lambda v: flow.to_noise(v)[0], each)
-        torch.testing.assert_close(torch.linalg.slogdet(jacobian).logabsdet, found, rtol=0, atol=1e-10)
+    for value, expected in zip(x.flatten(0, 1), log_det.flatten(), strict=True):
+        jacobian = torch.autograd.functional.jacobian(lambda v: flow.to_noise(v)[0], value)
+        torch.testing.assert_close(torch.linalg.slogdet(jacobian).logabsdet, expected, rtol=0, atol=1e-10)
 
 
-def test_it_is_a_distribution_of_pyro():
+def test_it_is_a_valid_pyro_distribution():
     flow = build()
 
     def model(x=None):
@@ -89,7 +89,7 @@ def test_it_is_a_distribution_of_pyro():
     assert all(parameter.grad is not None for parameter in (flow.triangular, flow.reflections, flow.bias))
 
 
-def test_values_that_do_not_vary_are_whitened_too():
+def test_constant_values_can_be_whitened():
     x = values(40)
     x[:, 2] = 0.5
     flow = build()

@@ -1,4 +1,4 @@
-"""Priors of static latents: densities that integrate to one, draws that follow them, KLs that have no closed form."""
+"""Priors of static latents: densities integrate to one, draws follow them, and some KLs are Monte Carlo."""
 
 import copy
 import math
@@ -27,12 +27,14 @@ PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_
 
 
 def build(kind, size=2):
-    """A model with such a prior, and parameters that are not those it starts with."""
+    """Return a model with a prior and perturbed parameters."""
     sizes, network = {"w": size, "z": 2, "x": 2}, Recurrent(4, hidden=(4,))
     model = DynamicalVAE(*PAIR, sizes, network, distributions={"p(w)": PRIORS[kind]}).double()
     with torch.no_grad():
         for name, parameter in (*model.generator["w"].named_parameters(), *model.encoder["w"].named_parameters()):
-            parameter.add_((0.05 if ".nn." in name else 0.2) * torch.randn_like(parameter))  # .nn.: of a coupling
+            parameter.add_(
+                (0.05 if ".nn." in name else 0.2) * torch.randn_like(parameter)
+            )  # .nn.: networks of couplings
     return model
 
 
@@ -46,7 +48,7 @@ def data():
 
 
 def grid(model):
-    """Points, their density under the prior, and the step between them."""
+    """Return the axis of a grid and the density of the prior on it."""
     axis = torch.linspace(-12, 12, 361 if model.sizes["w"] == 2 else 4_801, dtype=torch.float64)
     points = torch.cartesian_prod(*[axis] * model.sizes["w"]).reshape(-1, model.sizes["w"])
     density = distribution(model, len(points)).log_prob(points).exp()
@@ -59,13 +61,13 @@ def test_a_prior_is_a_density_and_draws_follow_it(kind, size):
     model = build(kind, size)
     axis, density = grid(model)
     step = axis[1] - axis[0]
-    # what the grid leaves at the kinks of a spline
+    # the tolerance covers the error of the grid at the kinks of a spline
     assert (density.sum() * step**size).item() == pytest.approx(1, abs=3e-3)
     draws = model.sample(20_000, 1)["w"]
     for d in range(size):
         marginal = density.sum(1 - d) * step if size == 2 else density
         cumulative = (marginal.cumsum(0) - marginal / 2) * step
-        assert stats.kstest(draws[:, d], lambda at, cdf=cumulative: np.interp(at, axis, cdf)).pvalue > 1e-4
+        assert stats.kstest(draws[:, d], lambda points, cdf=cumulative: np.interp(points, axis, cdf)).pvalue > 1e-4
     if size == 2:
         product = (density * axis[:, None] * axis).sum() * step**2
         products = draws.prod(1)
@@ -73,24 +75,24 @@ def test_a_prior_is_a_density_and_draws_follow_it(kind, size):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in PRIORS if kind != "normal"])
-def test_where_no_closed_form_is_known_the_kl_is_the_log_ratio_at_the_draw(kind):
+def test_without_a_closed_form_the_kl_is_the_log_ratio_at_the_draw(kind):
     model, x = build(kind), data()
     torch.manual_seed(1)
     kl = SequenceELBO().terms(model, x).kl["w"]
     torch.manual_seed(1)
     w = model.guide(x)["w"]
-    ours = model.encoder["w"].head.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
-    torch.testing.assert_close(kl, ours.log_prob(w) - distribution(model, B).log_prob(w))
+    posterior = model.encoder["w"].head.distribution(model.encoder["w"]({"x": x}, B, T)).to_event(1)
+    torch.testing.assert_close(kl, posterior.log_prob(w) - distribution(model, B).log_prob(w))
 
 
-def test_the_vamp_prior_is_the_mean_of_the_guides_posteriors_at_its_pseudo_sequences():
+def test_the_vamp_prior_averages_the_guide_at_its_pseudo_sequences():
     model, points = build("vamp"), torch.randn(6, 2, dtype=torch.float64)
     pseudo = model.generator["w"].head.pseudo["x"]
     loc, scale = model.encoder["w"]({"x": pseudo}, 3, 4)
     each = torch.distributions.Normal(loc, scale).log_prob(points[:, None]).sum(-1)
     torch.testing.assert_close(distribution(model, 6).log_prob(points), each.logsumexp(1) - math.log(3))
-    own = [name for name, _ in model.generator["w"].named_parameters()]
-    assert own == ["head.pseudo.x"]  # the guide stays the model's
+    names = [name for name, _ in model.generator["w"].named_parameters()]
+    assert names == ["head.pseudo.x"]  # the parameters of the guide are not among them
     surrogate = copy.deepcopy(model)
     assert surrogate.generator["w"].head.guide is surrogate.encoder["w"]
 
@@ -113,13 +115,13 @@ def weights(run: Path):
     return (run / "last.safetensors").read_bytes()
 
 
-def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
-    """By the run's seed; and a resumed run goes on from where they have come."""
+def test_pseudo_sequences_start_at_training_windows_and_survive_a_resume(people, tmp_path):
+    """The seed of the run selects the windows, and a resumed run keeps their current values."""
     data, method = MotionData.open(people), dvae.method("hit-dvae", **VAMP)
-    still = dvae.Training(steps=1, batch_size=2, learning_rate=0.0, progress=False, validate_every=2)
+    frozen = dvae.Training(steps=1, batch_size=2, learning_rate=0.0, progress=False, validate_every=2)
     starts = []
     for seed, name in ((0, "a"), (0, "b"), (1, "c")):
-        dvae.fit(method, data, out=tmp_path / name, **vars(replace(still, seed=seed)))
+        dvae.fit(method, data, out=tmp_path / name, **vars(replace(frozen, seed=seed)))
         starts.append(dvae.load(tmp_path / name).model.generator["w"].head.pseudo["x"])
     assert torch.equal(starts[0], starts[1])
     assert not torch.equal(starts[0], starts[2])
@@ -127,7 +129,7 @@ def test_pseudo_sequences_start_at_training_windows_once(people, tmp_path):
     for pseudo in starts[0]:
         assert (windows == pseudo).flatten(1).all(1).any()
 
-    training = replace(still, learning_rate=0.01)
+    training = replace(frozen, learning_rate=0.01)
     dvae.fit(method, data, out=tmp_path / "whole", **vars(replace(training, steps=2)))
     dvae.fit(method, data, out=tmp_path / "parts", **vars(training))
     runs.resume(tmp_path / "parts", steps=2)

@@ -1,4 +1,4 @@
-"""Recursions in blocks are those of one step after the other: values, gradients, digits; only the calls are fewer."""
+"""Recursions in blocks have the same values and gradients as one step after another, with fewer calls."""
 
 from dataclasses import fields, replace
 
@@ -12,40 +12,40 @@ from dvae.distributions.scan import Covariances, States
 
 
 def chain(steps, batch=2, size=2, dtype=torch.float64):
-    """Matrices near the identity, a third of the frames not seen, and the end of the last sequence."""
+    """Return a chain with matrices near the identity, some unobserved frames and a sequence with an unobserved end."""
     transition = 0.9 * torch.eye(size) + 0.2 * torch.randn(steps - 1, batch, size, size)
     root, emission = torch.randn(steps - 1, batch, size, size), torch.randn(steps, batch, size, size)
-    seen = (torch.rand(steps, batch) < 0.7).to(dtype)
-    seen[steps * 2 // 3 :, -1] = 0
+    observed = (torch.rand(steps, batch) < 0.7).to(dtype)
+    observed[steps * 2 // 3 :, -1] = 0
     chain = LinearGaussianChain(
         transition=transition.to(dtype),
         offset=torch.randn(steps - 1, batch, size, dtype=dtype),
         noise=(root @ root.mT + 0.1 * torch.eye(size)).to(dtype),
         mean=torch.randn(batch, size, dtype=dtype),
         covariance=20 * torch.eye(size, dtype=dtype).expand(batch, -1, -1),
-        information=(emission @ emission.mT / 0.03).to(dtype) * seen[..., None, None],
-        potential=torch.randn(steps, batch, size, dtype=dtype) / 0.03 * seen[..., None],
+        information=(emission @ emission.mT / 0.03).to(dtype) * observed[..., None, None],
+        potential=torch.randn(steps, batch, size, dtype=dtype) / 0.03 * observed[..., None],
     )
     return chain
 
 
-def results(built, noise):
-    return [*built.predicted, *built.filtered, *built.smoothed, built.lag_one, built.draw(noise)]
+def results(model, noise):
+    return [*model.predicted, *model.filtered, *model.smoothed, model.lag_one, model.draw(noise)]
 
 
-def with_gradients(built, noise, seed=1):
-    """All results, and gradients of a random linear combination of them."""
-    leaves = {f.name: getattr(built, f.name).detach().clone().requires_grad_() for f in fields(built)}
-    found = results(replace(built, **leaves), noise)
+def with_gradients(model, noise, seed=1):
+    """Return all results, and gradients of a random linear combination of them."""
+    leaves = {f.name: getattr(model, f.name).detach().clone().requires_grad_() for f in fields(model)}
+    values = results(replace(model, **leaves), noise)
     generator = torch.Generator().manual_seed(seed)
-    total = sum((torch.randn(v.shape, generator=generator, dtype=v.dtype) * v).sum() for v in found)
+    total = sum((torch.randn(v.shape, generator=generator, dtype=v.dtype) * v).sum() for v in values)
     gradients = torch.autograd.grad(total, list(leaves.values()), allow_unused=True, materialize_grads=True)
-    return [v.detach() for v in found] + [*gradients]
+    return [v.detach() for v in values] + [*gradients]
 
 
 @pytest.fixture
 def one_by_one(monkeypatch):
-    """Runs something without blocks."""
+    """Return a function that runs an action without blocks."""
 
     def run(action, *inputs):
         with monkeypatch.context() as patch:
@@ -59,18 +59,18 @@ def one_by_one(monkeypatch):
     ("steps", "batch", "size", "block"), [(1, 2, 2, 2), (66, 1, 3, 16), (97, 2, 4, 16), (300, 3, 1, 2)]
 )
 def test_blocks_change_neither_values_nor_gradients(steps, batch, size, block, monkeypatch, one_by_one):
-    """With 300 steps there are seven levels. 16 does not divide 65, and 96 are six blocks."""
+    """300 steps have seven levels, 16 does not divide 65, and 96 are six blocks."""
     monkeypatch.setattr(scan, "BLOCK", block)
-    built = chain(steps, batch, size)
-    assert scan.use_blocks(built.transition) == (steps > 2)
-    inputs = built, torch.randn_like(built.potential)
+    model = chain(steps, batch, size)
+    assert scan.use_blocks(model.transition) == (steps > 2)
+    inputs = model, torch.randn_like(model.potential)
     for one, other in zip(with_gradients(*inputs), one_by_one(with_gradients, *inputs), strict=True):
         scale = other.abs().max().item() if other.numel() else 1.0
         torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * scale)
 
 
 @pytest.mark.parametrize("call", [States, Covariances])
-def test_a_recursion_has_the_gradient_of_finite_differences(call, monkeypatch):
+def test_the_gradient_of_a_recursion_equals_finite_differences(call, monkeypatch):
     monkeypatch.setattr(scan, "BLOCK", 2)
     shape = (13, 1, 2, 2)
     matrix, offset, start = (torch.randn(s, dtype=torch.float64) for s in (shape, shape, shape[1:]))

@@ -11,7 +11,7 @@ from dvae import Evaluation
 from dvae.runs.directory import resume
 
 
-def test_demo_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
+def test_the_demo_resumes_after_an_interruption(tmp_path, monkeypatch):
     resumed = []
     with monkeypatch.context() as patch:
         patch.setattr(demo.dvae, "fit", partial(dvae.fit, callbacks=[At(1, interrupt)]))

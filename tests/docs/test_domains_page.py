@@ -1,4 +1,4 @@
-"""What makes the page of the domains, on little: it goes on where it was, and its tables are of what is there."""
+"""The script of the domains page, on little data: it resumes, and its tables contain the finished runs."""
 
 import json
 
@@ -32,7 +32,7 @@ def panel():
 
 @pytest.fixture
 def page(tmp_path, monkeypatch):
-    monkeypatch.setattr(torch, "set_num_threads", lambda number: None)  # the script takes one
+    monkeypatch.setattr(torch, "set_num_threads", lambda number: None)  # the script sets one thread
     monkeypatch.setitem(tables.domains.DOMAINS, "tiny", tables.domains.DOMAINS["chorales"])
     monkeypatch.setattr(reading, "domain", lambda name: panel())
     section = domains.Section(CASES, SMALL, Cut(4, 2), unit="day", particles=5)
@@ -43,35 +43,38 @@ def page(tmp_path, monkeypatch):
     return path
 
 
-def test_the_page_of_the_domains_is_of_the_runs_that_are_there(page, tmp_path, capsys):
+def test_the_domains_page_contains_the_finished_runs(page, tmp_path, capsys):
     runs = tmp_path / "runs"
     domains.main(("tiny",), runs, page, "validation", seeds=(0, 1))
     text = page.read_text()
-    for said in ("Before.\n", "### Tiny, validation", "2 sequences, 31 steps; 2 seeds", "nats a day"):
-        assert said in text
+    for text_part in ("Before.\n", "### Tiny, validation", "2 sequences, 31 steps; 2 seeds", "nats a day"):
+        assert text_part in text
     assert text.count("| dkf |") == 1
-    written = {path: path.stat().st_mtime_ns for path in runs.rglob("*")}
+    modified = {path: path.stat().st_mtime_ns for path in runs.rglob("*")}
     capsys.readouterr()
     domains.main(("tiny",), runs, page, "validation", seeds=(0, 1))
-    assert {path: path.stat().st_mtime_ns for path in runs.rglob("*")} == written
+    assert {path: path.stat().st_mtime_ns for path in runs.rglob("*")} == modified
     assert page.read_text() == text
     assert not capsys.readouterr().out
-    for case, there in (("dkf", False), (domains.BASELINE, True)):  # whose file has the references
+    for case, has_references in (
+        ("dkf", False),
+        (domains.BASELINE, True),
+    ):  # the file of the baseline has the references
         domains.main(("tiny",), runs, page, "test", (case,))
         assert "3 sequences, 54 steps; 1 seeds" in page.read_text()
         assert page.read_text().count("| dkf |") == 2
-        assert ("climatology" in page.read_text()) == there
+        assert ("climatology" in page.read_text()) == has_references
 
 
-def test_bounds_are_by_step_and_their_errors_over_sequences(page, tmp_path):
+def test_bounds_are_per_step_with_standard_errors_over_sequences(page, tmp_path):
     domains.main(("tiny",), tmp_path, page, "validation", (domains.BASELINE,), (0, 1))
     folders = [tmp_path / "tiny" / f"{domains.BASELINE}-{seed}" for seed in (0, 1)]
-    found = [json.loads((folder / "validation.json").read_text())["bounds"] for folder in folders]
+    stored = [json.loads((folder / "validation.json").read_text())["bounds"] for folder in folders]
     steps = np.array([15.0, 16.0])
-    assert found[0]["weights"] == steps.tolist()
-    bounds = np.array([own["rows"][engine.OURS][domains.BOUND] for own in found])
+    assert stored[0]["weights"] == steps.tolist()
+    bounds = np.array([run_bounds["rows"][engine.OURS][domains.BOUND] for run_bounds in stored])
     expected = TwoWayErrors.of(bounds, steps).estimate()
-    read = engine.read(tmp_path / "tiny", [domains.BASELINE], "validation.json")[domains.BASELINE]
-    assert read.of("bounds").estimate(domains.BOUND) == expected
+    results = engine.read(tmp_path / "tiny", [domains.BASELINE], "validation.json")[domains.BASELINE]
+    assert results.of("bounds").estimate(domains.BOUND) == expected
     assert expected.mean == pytest.approx((bounds * steps).sum() / 62)
-    assert domains.said(read, "bounds", domains.BOUND) == str(expected)
+    assert domains.said(results, "bounds", domains.BOUND) == str(expected)

@@ -1,4 +1,4 @@
-"""The notebooks are stored with what they show, and a run from top to bottom shows the same."""
+"""The notebooks are stored with their outputs, and running them gives the same outputs."""
 
 import re
 from pathlib import Path
@@ -23,16 +23,16 @@ def one_kernel():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS[:4], ids=lambda path: path.stem)  # the others: `make studies`
-# The kernel's transport warns of its own affairs.
+# The transport of the kernel emits warnings that are unrelated to the notebooks.
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.timeout(1200)
 @pytest.mark.slow
-def test_a_run_shows_what_is_stored(path, one_kernel):
+def test_running_a_notebook_gives_the_stored_outputs(path, one_kernel):
     notebooks.check(path, one_kernel)
 
 
 @each_notebook
-def test_a_notebook_is_stored_whole_with_its_pictures(path):
+def test_a_notebook_is_stored_completely_with_its_figures(path):
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -41,13 +41,15 @@ def test_a_notebook_is_stored_whole_with_its_pictures(path):
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
     for cell in code:
-        drawn = any(word in cell.source for word in ("plt.show()", "animate(test", "animate(skeleton", "surfaces(body"))
-        assert not drawn or any("image/png" in output.get("data", {}) for output in cell.outputs)
+        is_plot = any(
+            word in cell.source for word in ("plt.show()", "animate(test", "animate(skeleton", "surfaces(body")
+        )
+        assert not is_plot or any("image/png" in output.get("data", {}) for output in cell.outputs)
     assert str(ROOT) not in path.read_text(encoding="utf-8")
 
 
 @each_notebook
-def test_a_share_is_taken_of_all_training(path):
+def test_every_training_of_a_notebook_can_be_shortened(path):
     code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     trained = [source for source in code if re.search(r"\.fit\(", source)]
     assert all(notebooks.SHARED.search(source) for source in trained)
@@ -59,16 +61,16 @@ def test_notebooks_are_small():
     assert sum(sizes) < 1.7e6
 
 
-def test_words_of_a_table_are_held_in_any_order_of_its_rows():
+def test_tables_of_outputs_are_compared_by_words_in_any_order_of_rows():
     stable = notebooks._stable
     table = "<pre>┃ name ┃ bound ┃\n│ first │ 1.5 ± 0.1 │\n│ second │ 1 % │</pre>"
     assert stable(table) == stable("<pre>┃ name ┃ bound ┃\n│ second │ 2 % │\n│ first │ 11.5 ± 0.1 │</pre>")
     assert stable(table) != stable(table.replace("second", "third"))
-    assert stable("<pre>data 1ab457e0c8bf</pre>") == stable("<pre>data 04cdf7e0c8ff</pre>")  # of bits of motion
+    assert stable("<pre>data 1ab457e0c8bf</pre>") == stable("<pre>data 04cdf7e0c8ff</pre>")  # a fingerprint of motion
 
 
 @pytest.mark.parametrize("widgets", [None, "installed"])
-def test_a_notebook_has_a_bar_only_where_there_are_widgets(monkeypatch, widgets):
+def test_a_notebook_has_a_progress_bar_only_if_widgets_are_installed(monkeypatch, widgets):
     monkeypatch.setattr(console, "_is_jupyter", lambda: True)
     monkeypatch.setattr(result, "find_spec", {"ipywidgets": widgets}.get)
     assert result.progress_bar(True).disable == (widgets is None)

@@ -1,4 +1,4 @@
-"""What exact posteriors depend on, by d-separation, against what the guides of the literature read."""
+"""Audits: dependencies of exact posteriors by d-separation, compared with published guides."""
 
 import doctest
 import re
@@ -22,7 +22,7 @@ DKF = "p(z_t | z_{t-1}) p(x_t | z_t)"
 STORN = "p(z_t) p(x_t | x_{<t}, z_{<=t})"
 HIT_DVAE = "p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)"
 
-# name: (generative, inference, missing, redundant), each worked out by hand.
+# name: (generative, inference, missing, redundant), derived by hand
 PUBLISHED = {
     "dkf mean field": (DKF, "q(z_t | x_{1:T})", {"z": ("z_{t-1}",)}, {}),
     "dkf backward": (DKF, "q(z_t | z_{t+1}, x_{<=t})", {}, {}),
@@ -30,11 +30,11 @@ PUBLISHED = {
     "storn original": (STORN, "q(z_t | x_{<t})", {"z": ("x_{>=t}", "z_{<t}")}, {"z": ("x_{<t}",)}),
     "long lag": ("p(z_t | z_{t-25:t-1}) p(x_t | z_t)", "q(z_t | z_{t-9:t-1}, x_{>=t})", {"z": ("z_{t-25:t-10}",)}, {}),
 }
-"""What docs/audits.md does not list."""
+"""Guides that docs/audits.md does not list."""
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_guides_of_the_literature(name):
+def test_audits_of_published_guides_match_those_by_hand(name):
     generative, inference, missing, redundant = PUBLISHED[name]
     result = audit(generative, inference)
     assert result.missing == missing
@@ -44,8 +44,8 @@ def test_guides_of_the_literature(name):
 
 @settings(max_examples=20, deadline=None)
 @given(factorizations())
-def test_a_guide_given_what_it_misses_is_exact(pair):
-    # A {t-2} alone makes patterns periodic in time, which relations list only as far as seen.
+def test_a_guide_with_its_missing_parents_added_is_exact(pair):
+    # A {t-2} alone makes patterns periodic in time, and relations list only a few periods.
     assume(not any(lag in text for text in pair for lag in ("{t-2}", "{t+2}")))
     inference = Factorization.parse(pair[1])
     missing = audit(*pair).missing_parents
@@ -54,7 +54,7 @@ def test_a_guide_given_what_it_misses_is_exact(pair):
         reads = ", ".join(map(str, (*factor.parents, *missing.get(factor.child, ()))))
         text += f"q({factor.child}{'_t' if factor.local else ''}{' | ' if reads else ''}{reads})"
     richer = Factorization.parse(text)
-    # Reading more it may be drawn in another order, which has other exact conditionals.
+    # With more parents its order of drawing may change, and the exact conditionals with it.
     assume(richer.blocks == inference.blocks)
     assert audit(pair[0], richer).exact
 
@@ -78,12 +78,12 @@ def test_a_guide_given_what_it_misses_is_exact(pair):
         ),
     ],
 )
-def test_where_the_analytic_kl_is_unbiased(generative, inference, hidden, analytic):
-    found = analytic_kl(Factorization.parse(generative), Factorization.parse(inference), {*hidden})
-    assert found == analytic
+def test_analytic_kl_is_used_only_if_unbiased(generative, inference, hidden, analytic):
+    is_unbiased = analytic_kl(Factorization.parse(generative), Factorization.parse(inference), {*hidden})
+    assert is_unbiased == analytic
 
 
-def test_masks_of_the_users_own_are_looked_up_at_the_length_of_the_run():
+def test_custom_masks_are_evaluated_at_the_given_length():
     masks = {"far": far}
     pair = (
         Factorization.parse("p(z_t | z_{far}) p(x_t | z_t)", masks=masks),
@@ -109,7 +109,7 @@ def far(length):
         ("p(z_t | z_{far}) p(x_t | z_t)", "q(z_t | z_{<t}, x_{1:T})", False),
     ],
 )
-def test_masks_of_the_users_own_are_audited_over_all_steps_of_one_length(generative, inference, missing):
+def test_custom_masks_are_audited_over_all_steps_of_one_length(generative, inference, missing):
     model = Factorization.parse(generative, masks={"first": first, "far": far})
     result = audit(model, inference, steps=12)
     assert bool(result.missing) == missing
@@ -121,12 +121,12 @@ def test_masks_of_the_users_own_are_audited_over_all_steps_of_one_length(generat
 @pytest.mark.parametrize(
     "module", [dvae.factorization.graph, dvae.factorization.inversion, dvae.factorization.notation]
 )
-def test_examples_in_the_docstrings(module):
+def test_examples_in_docstrings_run(module):
     assert doctest.testmod(module, extraglobs={"dvae": dvae}).failed == 0
 
 
 def documented():
-    """Name -> (generative, inference, missing, redundant), each a list of terms, of the table in docs/audits.md."""
+    """Return name -> (generative, inference, missing, redundant) of the table in docs/audits.md, as lists of terms."""
     page = Path(__file__).parents[2] / "docs" / "audits.md"
     first = page.read_text(encoding="utf-8").partition("<!-- end of tables -->")[0]
     lines = [line for line in first.splitlines() if line.startswith("| ")]
@@ -141,28 +141,28 @@ DOCUMENTED = documented()
 
 
 @pytest.mark.parametrize("name", DOCUMENTED)
-def test_the_page_of_audits_tells_what_audit_tells(name):
+def test_the_audits_page_agrees_with_audit(name):
     (generative,), (inference,), missing, redundant = DOCUMENTED[name]
     result = audit(generative, inference)
     assert missing == [term for terms in result.missing.values() for term in terms]
     assert redundant == [term for terms in result.redundant.values() for term in terms]
 
 
-def test_the_page_of_audits_lists_what_its_script_does():
+def test_the_audits_page_lists_the_models_of_its_script():
     assert {name: (p, q) for name, ((p,), (q,), *_) in DOCUMENTED.items()} == FAMILY
 
 
-def test_no_guide_is_the_prior_and_an_empty_one_infers_nothing():
-    found = audit("p(z_t | z_{t-1}) p(x_t | z_t)", None)
-    assert str(found.inference) == "q(z_{1:T}) = ∏_t q(z_t | z_{t-1})"
-    assert [str(parent) for parent in found.missing["z"]] == ["x_{>=t}"]
+def test_without_a_guide_the_prior_is_used_and_an_empty_one_needs_no_latents():
+    result = audit("p(z_t | z_{t-1}) p(x_t | z_t)", None)
+    assert str(result.inference) == "q(z_{1:T}) = ∏_t q(z_t | z_{t-1})"
+    assert [str(parent) for parent in result.missing["z"]] == ["x_{>=t}"]
     with pytest.raises(ValueError, match="latent"):
         audit("p(z_t) p(x_t | z_t)", "")
     for guide in (None, ""):
         assert audit("p(x_t | x_{<t})", guide).exact
 
 
-def test_how_an_audit_shows():
+def test_an_audit_is_printed_as_a_table():
     result = audit(*FAMILY["HiT-DVAE"])
     assert str(result).splitlines()[:3] == [
         "guide factor         missing  redundant",
@@ -188,14 +188,14 @@ def edges(ax):
     return [patch for patch in ax.patches if isinstance(patch, FancyArrowPatch)]
 
 
-def test_no_edge_hides_behind_a_node(ax):
+def test_no_edge_passes_behind_a_node(ax):
     f = Factorization.parse("p(u_t | u_{<t}) p(z_t | z_{<t}, u_t) p(x_t | x_{<t}, z_t)")
     assert f.draw(4, ax=ax) is ax
     assert len(edges(ax)) == f.dag(4).number_of_edges()
     nodes = [patch for patch in ax.patches if isinstance(patch, Circle)]
     assert len(nodes) == len(f.dag(4))
     centres, radius = np.array([node.center for node in nodes]), nodes[0].radius
-    ax.figure.canvas.draw()  # settles the aspect, and with it the curves
+    ax.figure.canvas.draw()  # fixes the aspect, and so the curves
     for edge in edges(ax):
         on_screen = edge.get_transform().transform_path(edge.get_path()).to_polygons(closed_only=False)
         path = ax.transData.inverted().transform(np.concatenate(on_screen))

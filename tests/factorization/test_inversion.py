@@ -1,4 +1,4 @@
-"""Derived guides: they miss nothing, they need every edge, and at their best the bound is the evidence."""
+"""Derived guides are exact, and every edge of them is necessary."""
 
 from dataclasses import replace
 
@@ -24,18 +24,18 @@ TWO_LAYERS = "p(u_t | u_{t-1}) p(z_t | z_{t-1}, u_t) p(x_t | z_t)"
 
 @settings(max_examples=15, deadline=None)
 @given(factorizations())
-def test_markov_boundary_is_d_separation(pair):
+def test_markov_boundaries_agree_with_d_separation(pair):
     dag = Factorization.parse(pair[0]).dag(3)
-    known, boundaries = {node for node in dag if node[0] == "x"}, MarkovBoundaries(dag)
-    for node in sorted(set(dag) - known, key=str):
-        boundary = boundaries.of(node, known)
-        assert boundary == {u for u in known if not nx.is_d_separator(dag, {node}, {u}, known - {u})}
-        assert nx.is_d_separator(dag, {node}, known - boundary, boundary) or boundary == known
-        known = known | {node}
+    given_nodes, boundaries = {node for node in dag if node[0] == "x"}, MarkovBoundaries(dag)
+    for node in sorted(set(dag) - given_nodes, key=str):
+        boundary = boundaries.of(node, given_nodes)
+        assert boundary == {u for u in given_nodes if not nx.is_d_separator(dag, {node}, {u}, given_nodes - {u})}
+        assert nx.is_d_separator(dag, {node}, given_nodes - boundary, boundary) or boundary == given_nodes
+        given_nodes = given_nodes | {node}
 
 
-def fewer(guide, width):
-    """The guide without one of the offsets, or static parents, that it reads, each in turn."""
+def smaller_guides(guide, width):
+    """Yield the guide without one of its offsets or static parents, for each of them."""
     for factor in guide.factors:
         for parent in factor.parents:
             cuts = [None]
@@ -43,10 +43,12 @@ def fewer(guide, width):
                 reads = [k for k in range(1 - width, width) if parent.relation.reads(k, 0)]
                 cuts = [parent.relation & ~Relation.of([(k, k)]) for k in reads]
             for cut in cuts:
-                left = () if cut is None or not cut.intervals else (replace(parent, relation=cut),)
-                parents = [p for each in factor.parents for p in (left if each is parent else (each,))]
-                less = replace(factor, parents=tuple(parents))
-                yield replace(guide, factors=tuple(less if each is factor else each for each in guide.factors))
+                reduced = () if cut is None or not cut.intervals else (replace(parent, relation=cut),)
+                parents = [p for each in factor.parents for p in (reduced if each is parent else (each,))]
+                smaller_factor = replace(factor, parents=tuple(parents))
+                yield replace(
+                    guide, factors=tuple(smaller_factor if each is factor else each for each in guide.factors)
+                )
 
 
 @settings(max_examples=15, deadline=None)
@@ -54,13 +56,13 @@ def fewer(guide, width):
 def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
     generative = pair[0]
     order = data.draw(st.sampled_from(list(orders(generative))), label="order")
-    found = faithful_inverse(generative, order=order)
-    audit = dvae.audit(generative, found)
+    derived = faithful_inverse(generative, order=order)
+    audit = dvae.audit(generative, derived)
     assert audit.exact
-    # A lag of 2 alone may make patterns periodic in time, of which relations have no end.
+    # A lag of 2 alone may make patterns periodic in time, and their relations would be infinite.
     assert not audit.redundant or "{t-2}" in generative
     if not audit.redundant:
-        smaller = list(fewer(found, width=4))
+        smaller = list(smaller_guides(derived, width=4))
         for less in data.draw(st.permutations(smaller))[:3]:
             assert not dvae.audit(generative, less).exact, less.text
 
@@ -76,13 +78,13 @@ def test_a_derived_guide_is_exact_and_no_smaller_one_is(pair, data):
         ("p(x_t | x_{<t})", None, ""),
     ],
 )
-def test_guides_worked_out_by_hand(generative, order, expected):
-    found = faithful_inverse(generative, order=order)
-    assert found == (Factorization.parse(expected) if expected else Factorization("q", ()))
+def test_derived_guides_match_those_by_hand(generative, order, expected):
+    derived = faithful_inverse(generative, order=order)
+    assert derived == (Factorization.parse(expected) if expected else Factorization("q", ()))
 
 
 @pytest.mark.parametrize("name", FAMILY)
-def test_a_repaired_guide_keeps_the_order_and_misses_nothing(name):
+def test_a_repaired_guide_is_exact_and_keeps_the_order(name):
     audit = dvae.audit(*FAMILY[name])
     repaired = dvae.audit(audit.generative, audit.repaired)
     assert repaired.exact
@@ -94,32 +96,32 @@ def test_a_repaired_guide_keeps_the_order_and_misses_nothing(name):
             assert {p.name: p.relation for p in reads} == {p.name: p.relation for p in factor.parents}
 
 
-def test_alternatives_are_told_by_what_they_cost():
-    found = dvae.alternatives("p(w) p(u_t | w) p(z_t | z_{t-1}, u_t) p(x_t | z_t)")
-    texts = {each.inference.text for each in found.guides}
-    assert len(texts) == len(found) == len(found.guides)
-    loops = [bool(each.looped) for each in found.guides]
+def test_alternatives_list_their_costs():
+    alternatives = dvae.alternatives("p(w) p(u_t | w) p(z_t | z_{t-1}, u_t) p(x_t | z_t)")
+    texts = {entry.inference.text for entry in alternatives.guides}
+    assert len(texts) == len(alternatives) == len(alternatives.guides)
+    loops = [bool(entry.looped) for entry in alternatives.guides]
     assert loops == sorted(loops)
-    for each in found.guides:
-        assert each.edges == each.inference.dag(found.steps).number_of_edges()
-        closed = analytic_kl(found.generative, each.inference)
-        assert each.sampled == tuple(name for name in closed if not closed[name])
-        assert all(text in str(found) for text in (each.inference.text, describe_order(each.order)))
-    assert found[0] == found.guides[0].inference
-    assert "<td>" in found._repr_html_()
+    for entry in alternatives.guides:
+        assert entry.edges == entry.inference.dag(alternatives.steps).number_of_edges()
+        closed = analytic_kl(alternatives.generative, entry.inference)
+        assert entry.sampled == tuple(name for name in closed if not closed[name])
+        assert all(text in str(alternatives) for text in (entry.inference.text, describe_order(entry.order)))
+    assert alternatives[0] == alternatives.guides[0].inference
+    assert "<td>" in alternatives._repr_html_()
 
 
-def test_the_price_of_an_edge_is_that_of_the_guide_without_it():
-    found = dvae.edge_costs(DKF, steps=3, seeds=2)
-    assert list(found) == sorted(found, key=lambda edge: -found[edge].mean())
+def test_the_cost_of_an_edge_is_the_gap_of_the_guide_without_it():
+    costs = dvae.edge_costs(DKF, steps=3, seeds=2)
+    assert list(costs) == sorted(costs, key=lambda edge: -costs[edge].mean())
     without = dvae.kl_gap(DKF, "q(z_t | z_{t-1}, x_{>t})", {"z": 1, "x": 1}, steps=3, seeds=2)
-    torch.testing.assert_close(found["x_t to z_t"], without, atol=1e-8, rtol=0)
-    assert all((cost > 1e-6).all() for cost in found.values())  # none of a derived guide is for nothing
-    spare = dvae.edge_costs(DKF, "q(z_t | z_{t-1}, x_{1:T})", steps=3, seeds=1)
-    assert abs(spare["x_{<t} to z_t"]) < 1e-8
+    torch.testing.assert_close(costs["x_t to z_t"], without, atol=1e-8, rtol=0)
+    assert all((cost > 1e-6).all() for cost in costs.values())  # every edge of a derived guide is necessary
+    redundant = dvae.edge_costs(DKF, "q(z_t | z_{t-1}, x_{1:T})", steps=3, seeds=1)
+    assert abs(redundant["x_{<t} to z_t"]) < 1e-8
 
 
-def test_a_model_takes_the_word():
+def test_a_model_accepts_faithful_as_its_guide():
     model = dvae.DynamicalVAE(DKF, "faithful", {"z": 2, "x": 3})
     assert model.inference == faithful_inverse(DKF)
     bound = dvae.SequenceELBO().terms(model, {"x": torch.randn(4, 5, 3)}).bound
@@ -129,7 +131,7 @@ def test_a_model_takes_the_word():
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda: faithful_inverse(DKF, order=[Block(("u",), 1)]), "latents"),
         (lambda: faithful_inverse(HIT_DVAE, order=[Block(("w", "z"), 1)]), "mixes static and local"),
@@ -147,6 +149,6 @@ def test_a_model_takes_the_word():
         ),
     ],
 )
-def test_errors_say_what_is_wrong(call, told):
-    with pytest.raises(ValueError, match=told):
+def test_wrong_arguments_are_an_error(call, message):
+    with pytest.raises(ValueError, match=message):
         call()

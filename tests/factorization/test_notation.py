@@ -1,4 +1,4 @@
-"""The grammar: what is read, what it means as masks and drawing order, and how the rest is refused."""
+"""The grammar: parsing, masks, order of drawing, and errors."""
 
 import contextlib
 import html
@@ -56,7 +56,7 @@ relations = st.lists(
 
 
 @given(relations, relations, st.integers(1, 9))
-def test_relations_compose_as_their_masks_do(a, b, T):
+def test_relations_compose_like_their_masks(a, b, T):
     assert ((a | b).mask(T) == (a.mask(T) | b.mask(T))).all()
     assert ((a & b).mask(T) == (a.mask(T) & b.mask(T))).all()
     assert ((~a).mask(T) == ~a.mask(T)).all()
@@ -81,17 +81,17 @@ def test_fonts_are_ignored():
 
 
 @given(factorizations())
-def test_the_factors_of_what_is_displayed_are_read_back(pair):
+def test_displayed_factors_are_parsed_back(pair):
     for f in map(parse, pair):
         latex = f._repr_latex_().strip("$").partition("=")[2]
-        shown = re.sub("<sub>(.*?)</sub>", r"_{\1}", f._repr_html_()).replace("_{<i>t</i>}", "_t").partition("=")[2]
-        plain = html.unescape(re.sub("</?(?:i|span)>", "", shown))
+        markdown = re.sub("<sub>(.*?)</sub>", r"_{\1}", f._repr_html_()).replace("_{<i>t</i>}", "_t").partition("=")[2]
+        plain = html.unescape(re.sub("</?(?:i|span)>", "", markdown))
         assert parse(f.text) == f
         for text in (latex, plain):
             assert sorted(parse(text).factors, key=str) == sorted(f.factors, key=str)
 
 
-def test_what_a_factorization_knows():
+def test_attributes_of_a_factorization():
     f = parse("p(z_t | z_{t-1}, c_t, pose) p(x_t | z_t, arm_left_{<t})")
     assert f.kind == "p"
     assert f.variables == ("z", "x")
@@ -112,13 +112,13 @@ tokens = ["p(", "q(", ")", " | ", ", ", "x_t", "z_t", "z_{<t}", "x_{1:T}", "x_{t
 
 @settings(max_examples=150)
 @given(st.lists(st.sampled_from(tokens), max_size=12).map("".join))
-def test_any_text_is_read_or_refused_as_a_value_error(text):
+def test_any_text_is_parsed_or_a_value_error(text):
     with contextlib.suppress(ValueError):
         assert parse(text).factors
 
 
 @pytest.mark.parametrize(
-    ("text", "column", "says"),
+    ("text", "column", "expected"),
     [
         ("r(x)", 0, "expected a factor: p(...) or q(...)"),
         ("p(z_t | z_{<<t})", 10, "unknown relation {<<t}; known are t, {t-1}"),
@@ -132,11 +132,11 @@ def test_any_text_is_read_or_refused_as_a_value_error(text):
         ("p(z_t) q(x_t)", 7, "p and q in one factorization"),
     ],
 )
-def test_what_cannot_be_read_is_shown_at_its_column(text, column, says):
-    with pytest.raises(NotationError) as caught:
+def test_syntax_errors_point_at_their_column(text, column, expected):
+    with pytest.raises(NotationError) as error:
         parse(text)
-    message, line, caret = str(caught.value).split("\n")
-    assert message.startswith(says)
+    message, line, caret = str(error.value).split("\n")
+    assert message.startswith(expected)
     assert line == "    " + text
     assert caret == "    " + " " * column + "^"
 
@@ -155,7 +155,7 @@ def test_masks_have_one_row_or_column_for_static_ends():
     assert (f.mask("z", "x", 5) == np.triu(np.ones((5, 5), dtype=bool))).all()
 
 
-def test_masks_of_the_users_own():
+def test_custom_masks_are_parsed_validated_and_ordered():
     f = parse("p(z_t | z_{band}, z_{t-3}) p(x_t | z_t)", band=band)
     t = np.arange(6)
     lag = t[:, None] - t
@@ -167,14 +167,14 @@ def test_masks_of_the_users_own():
     static = parse("q(w | x_{first})", first=lambda T: np.arange(T)[None] < 3)
     assert static.mask("w", "x", 5).tolist() == [[True, True, True, False, False]]
     assert parse("q(z_t | z_{own})", own=lambda T: band(T).T).blocks == (Block(("z",), -1),)
-    for text, own, said in (
+    for text, custom_mask, message in (
         ("q(w | x_{own})", band, "static"),
         ("p(x_t | z_{own})", np.eye, "expected"),
         ("p(x_t | z_{own})", lambda T: True, "expected"),
         ("p(x_t | x_{own})", lambda T: np.tril(np.ones((T, T), dtype=bool)), "reads"),
     ):
-        with pytest.raises(ValueError, match=said):
-            parse(text, own=own)
+        with pytest.raises(ValueError, match=message):
+            parse(text, own=custom_mask)
 
 
 # ----------------------------------------------------------------------------------------------------- blocks
@@ -193,7 +193,7 @@ def test_masks_of_the_users_own():
         ("p(x_t | c_{>=t}, x_{t-1})", [("x", 1)]),
     ],
 )
-def test_blocks_and_directions(text, blocks):
+def test_blocks_have_the_expected_variables_and_directions(text, blocks):
     assert parse(text).blocks == tuple(Block(tuple(names), direction) for names, direction in blocks)
 
 
@@ -201,17 +201,17 @@ def test_blocks_and_directions(text, blocks):
 def test_blocks_draw_parents_before_children(pair, T):
     for f in map(parse, pair):
         dag = f.dag(T)
-        drawn = [node for node in dag if node[0] in f.context]
+        nodes = [node for node in dag if node[0] in f.context]
         for block in f.blocks:
             steps = [None] if not f.local(block.names[0]) else range(1, T + 1)[:: block.direction or 1]
-            drawn += [(name, t) for t in steps for name in block.names]
-        assert sorted(drawn, key=str) == sorted(dag, key=str)
-        place = {node: i for i, node in enumerate(drawn)}
-        assert all(place[parent] < place[child] for parent, child in dag.edges)
+            nodes += [(name, t) for t in steps for name in block.names]
+        assert sorted(nodes, key=str) == sorted(dag, key=str)
+        position = {node: i for i, node in enumerate(nodes)}
+        assert all(position[parent] < position[child] for parent, child in dag.edges)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         (
             "p(z_t | x_{<=t}) p(x_t | z_t)",
@@ -230,17 +230,17 @@ def test_blocks_draw_parents_before_children(pair, T):
         ("p(a | b) p(b | a)", "p(a | b) reads b, but b is drawn from a (cycle b -> a -> b)"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_with_the_cycle(text, says):
-    with pytest.raises(ValueError) as caught:
+def test_a_cyclic_factorization_is_an_error_that_names_the_cycle(text, message):
+    with pytest.raises(ValueError) as error:
         parse(text)
-    assert says in str(caught.value)
+    assert message in str(error.value)
 
 
 # --------------------------------------------------------------------------------------------------- the pair
 
 
 @pytest.mark.parametrize(
-    ("inference", "observed", "sizes", "says"),
+    ("inference", "observed", "sizes", "message"),
     [
         (
             "q(w)",
@@ -258,7 +258,7 @@ def test_what_cannot_be_drawn_is_refused_with_the_cycle(text, says):
         ("q(w) q(z_t)", ["x"], {"w": 1, "z": 1, "x": 1, "v": 1}, "equations have"),
     ],
 )
-def test_a_pair_that_does_not_fit(inference, observed, sizes, says):
-    with pytest.raises(ValueError) as caught:
+def test_an_inconsistent_pair_is_an_error(inference, observed, sizes, message):
+    with pytest.raises(ValueError) as error:
         check_pair(parse("p(w) p(z_t | w) p(x_t | z_t)"), parse(inference), observed=observed, sizes=sizes)
-    assert says in str(caught.value)
+    assert message in str(error.value)

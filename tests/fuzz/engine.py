@@ -1,12 +1,12 @@
-"""Fuzzing by the clock: hypothesis draws examples, at least one, until a test's share of the time is over.
+"""Fuzzing with a time limit: hypothesis draws examples, at least one, until a test's share of the time is over.
 
-All tests of this directory together take DVAE_FUZZ_SECONDS (15 where it is not set), each in proportion to the share
-that it names. DVAE_FUZZ_SEED (0) decides which examples are tried, in which order; time decides how far one gets.
+All tests of this directory together take DVAE_FUZZ_SECONDS (15 by default), in proportion to their shares.
+DVAE_FUZZ_SEED (0) determines the examples and their order; time determines their number.
 
     def test_sums_are_symmetric():
         fuzz(lambda pair: check(*pair), st.tuples(st.integers(), st.integers()), seconds=5)
 
-A check that may be killed, hang or take all memory goes to a process of its own:
+A check that may be killed, hang or take all memory runs in a separate process:
 
     @limited(5)
     def test_files_are_read_or_refused(tmp_path):
@@ -32,27 +32,27 @@ from hypothesis.strategies import SearchStrategy
 Example = TypeVar("Example")
 
 SECONDS = float(os.environ.get("DVAE_FUZZ_SECONDS", "15"))
-"""Of all tests together."""
+"""Seconds for all tests together."""
 
 SEED = int(os.environ.get("DVAE_FUZZ_SEED", "0"))
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)
-"""What the command line takes for an answer; anything else it calls a bug."""
+"""Exceptions that the command line reports as errors; it reports any other as a bug."""
 
 HANG, LARGEST = 60.0, 2**30
-"""Seconds after which a call hangs, and bytes that it may take."""
+"""Time limit of a call in seconds, and its memory limit in bytes."""
 
 _BATCH = 50
 _SHRINKING = 20.0
 
 
 def scaled(seconds: float) -> float:
-    """A share of a minute, in this run's time."""
+    """Return a share of a minute, scaled to the time of this run."""
     return seconds * SECONDS / 60
 
 
 def limited(seconds: float) -> Callable[[Any], Any]:
-    """Of a test of that share: it is slow, and the time after which it hangs."""
+    """Return a decorator that marks a test as slow and sets its timeout."""
     return lambda test: pytest.mark.slow(pytest.mark.timeout(300 + scaled(seconds))(test))
 
 
@@ -60,9 +60,9 @@ def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], se
     """Try examples until the time is over.
 
     Args:
-        check: raises where an example breaks a distribution.
-        examples: where they come from. Their `repr` is printed, and tells them apart.
-        seconds: this test's share of the default minute.
+        check: function that raises if an example violates a property.
+        examples: strategy of the examples. Their `repr` is printed, and must distinguish them.
+        seconds: share of the default minute.
     """
     end = time.monotonic() + scaled(seconds)
     failed: set[str] = set()
@@ -99,14 +99,14 @@ def fuzz(check: Callable[[Example], None], examples: SearchStrategy[Example], se
 
 
 class Isolated:
-    """A check in a process of its own, which may fail, die or hang without taking the test along.
+    """A check in a separate process, which may fail, die or hang without ending the test.
 
-    Beyond the check itself, a call must not hang or take more than `LARGEST` bytes; it ends by no signal,
-    with no exception but `EXPECTED`, and opens nothing for writing outside its directory.
+    In addition to the check, a call must not hang, take more than `LARGEST` bytes, end by a signal, raise an
+    exception other than `EXPECTED`, or open a file for writing outside its directory.
 
     Args:
-        check: `check(example, directory)`, importable by its name, for both go through a pipe.
-        directory: the only one that may be written to.
+        check: `check(example, directory)`, importable by its name, as it is sent through a pipe.
+        directory: the only directory that the check may write to.
     """
 
     def __init__(self, check: Callable[[Any, Path], None], directory: Path):
@@ -140,10 +140,10 @@ class Isolated:
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self._pipe, there = context.Pipe()
-        self._process = context.Process(target=_serve, args=(there, self._check, self._directory), daemon=True)
+        self._pipe, child_pipe = context.Pipe()
+        self._process = context.Process(target=_serve, args=(child_pipe, self._check, self._directory), daemon=True)
         self._process.start()
-        there.close()
+        child_pipe.close()
         if not self._pipe.poll(120) or self._pipe.recv() != "ready":
             self._stop()
             raise AssertionError("the process that checks did not start")
@@ -160,16 +160,16 @@ class Isolated:
 def _serve(pipe: Any, check: Callable[[Any, Path], None], directory: Path) -> None:
     sys.dont_write_bytecode = True
     pipe.send("ready")
-    watched = False
+    is_watched = False
     while True:
         try:
             example = pipe.recv()
         except EOFError:
             return
-        if not watched:  # from here on: what starts a process opens files of its own
+        if not is_watched:  # only from here on, because the start of a process opens files
             _bound_memory()
             _watch(directory)
-            watched = True
+            is_watched = True
         failure = None
         try:
             check(example, directory)
@@ -181,8 +181,8 @@ def _serve(pipe: Any, check: Callable[[Any, Path], None], directory: Path) -> No
 
 
 def _bound_memory() -> None:
-    """No more than `LARGEST` beyond what the process has; a request for more is a MemoryError."""
-    if not sys.platform.startswith("linux"):  # elsewhere the system keeps no such limit
+    """Limit further memory to `LARGEST` bytes; a larger request is a MemoryError."""
+    if not sys.platform.startswith("linux"):  # other systems do not enforce this limit
         return
     import resource
 
@@ -192,12 +192,12 @@ def _bound_memory() -> None:
 
 
 def _watch(directory: Path) -> None:
-    """Let nothing outside a directory be written, and nothing be run."""
+    """Raise an error for each write outside a directory and for each start of a process."""
     changes = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod"}
     runs = {"os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "ctypes.dlopen"}
     writing = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
-    def outside(path: Any) -> bool:
+    def is_outside(path: Any) -> bool:
         if not isinstance(path, str | bytes | os.PathLike):
             return False
         real = os.path.realpath(os.fsdecode(path))
@@ -206,9 +206,9 @@ def _watch(directory: Path) -> None:
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if event in runs:
             raise AssertionError(f"runs something: {event} {arguments}")
-        if event == "open" and arguments[2] & writing and outside(arguments[0]):
+        if event == "open" and arguments[2] & writing and is_outside(arguments[0]):
             raise AssertionError(f"writes outside its directory: {arguments[0]}")
-        if event in changes and any(map(outside, arguments)):
+        if event in changes and any(map(is_outside, arguments)):
             raise AssertionError(f"changes something outside its directory: {event} {arguments}")
 
     sys.addaudithook(hook)

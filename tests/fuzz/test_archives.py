@@ -1,4 +1,4 @@
-"""Motion archives that somebody else made: read right, or refused in a sentence, whatever is in them."""
+"""Untrusted motion archives are read correctly, or are an error of one sentence."""
 
 import pickle
 import pickletools
@@ -52,7 +52,7 @@ def pickled(path, content, **options):
 
 
 def python2(content):
-    """A dictionary of dictionaries of arrays as Python 2 and its numpy pickle it: what is bytes there is text here."""
+    """Return the pickle of nested dictionaries of arrays by Python 2 and its numpy, where texts are bytes."""
 
     def text(value):
         return b"T" + struct.pack("<i", len(value)) + value
@@ -85,28 +85,28 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize(("layout", "protocol"), [(layout, n % 6) for n, layout in enumerate(LAYOUTS)])
-def test_dictionaries_that_numpy_pickles_are_read(tmp_path, protocol, layout):
-    there = [LAYOUTS[layout](array) for array in clips()]
-    for content in (nested(there), np.array(nested(there), dtype=object)):
+def test_pickled_dictionaries_of_arrays_are_read(tmp_path, protocol, layout):
+    arrays = [LAYOUTS[layout](array) for array in clips()]
+    for content in (nested(arrays), np.array(nested(arrays), dtype=object)):
         path = pickled(tmp_path / "a.npz", pickle.dumps(content, protocol), compression=zipfile.ZIP_DEFLATED)
-        read = read_motion(path, skeleton=WALKER)
-        assert [clip.key for clip in read] == [("train", "walk 1"), ("train", "sit"), ("test", "walk 1")]
-        for clip, array in zip(read, there, strict=True):
+        archive = read_motion(path, skeleton=WALKER)
+        assert [clip.key for clip in archive] == [("train", "walk 1"), ("train", "sit"), ("test", "walk 1")]
+        for clip, array in zip(archive, arrays, strict=True):
             np.testing.assert_array_equal(clip.positions, array.astype(np.float32))
             assert clip.positions.flags.writeable
 
 
-def test_dictionaries_that_python_2_pickles_are_read(tmp_path):
-    there = clips()
-    read = read_motion(pickled(tmp_path / "a.npz", python2(nested(there))), skeleton=WALKER)
-    for clip, array in zip(read, there, strict=True):
+def test_pickled_dictionaries_of_python_2_are_read(tmp_path):
+    arrays = clips()
+    archive = read_motion(pickled(tmp_path / "a.npz", python2(nested(arrays))), skeleton=WALKER)
+    for clip, array in zip(archive, arrays, strict=True):
         np.testing.assert_array_equal(clip.positions, array)
     header = "{'descr': '<f4', 'fortran_order': False, 'shape': (5L, 17L, 3L), }"
-    npz(tmp_path / "b.npz", [("walk.npy", npy(there[0].tobytes(), header))])
-    np.testing.assert_array_equal(read_motion(tmp_path / "b.npz", skeleton=WALKER).clips[0].positions, there[0])
+    npz(tmp_path / "b.npz", [("walk.npy", npy(arrays[0].tobytes(), header))])
+    np.testing.assert_array_equal(read_motion(tmp_path / "b.npz", skeleton=WALKER).clips[0].positions, arrays[0])
 
 
-def test_names_may_be_numpy_strings_and_empty_clips_are_said_to_be_empty(tmp_path):
+def test_names_may_be_numpy_strings_and_empty_clips_are_an_error(tmp_path):
     content = {np.str_("train"): {np.str_("walk"): clips()[0]}}
     for protocol in range(6):
         path = pickled(tmp_path / "a.npz", pickle.dumps(content, protocol))
@@ -128,13 +128,13 @@ def test_names_may_be_numpy_strings_and_empty_clips_are_said_to_be_empty(tmp_pat
     ],
 )
 @pytest.mark.parametrize("order", "CF")
-def test_plain_arrays_are_what_they_were(tmp_path, value, order):
+def test_plain_arrays_are_read_unchanged(tmp_path, value, order):
     value = np.asarray(value, order=order)
     for swapped in (value, value.astype(value.dtype.newbyteorder(">"))):
         np.savez(tmp_path / "a.npz", value=swapped)
-        read = read_arrays(tmp_path / "a.npz")["value"]
-        assert read.dtype == swapped.dtype
-        np.testing.assert_array_equal(read, value)
+        array = read_arrays(tmp_path / "a.npz")["value"]
+        assert array.dtype == swapped.dtype
+        np.testing.assert_array_equal(array, value)
 
 
 # ------------------------------------------------------------------------------------------------ known attacks
@@ -144,13 +144,13 @@ F4 = b"cnumpy\ndtype\n\x8c\x02f4\x89\x88\x87R(K\x03\x8c\x01<NNNJ\xff\xff\xff\xff
 OBJECT = b"cnumpy\ndtype\n\x8c\x02O8\x89\x88\x87R(K\x03\x8c\x01|NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK?tb"
 
 
-def one(clip):
+def pickle_of_clip(clip):
     """A pickle of one clip."""
     return b"\x80\x04}\x8c\x05train}\x8c\x04walk" + clip + b"ss."
 
 
 def doublings(count):
-    """A tuple of two tuples of two tuples ..., of which a hash takes 2^count steps."""
+    """Return a tuple of two tuples of two tuples ..., whose hash takes 2^count steps."""
     return b")" + b"2\x86" * count
 
 
@@ -158,7 +158,7 @@ def dtype_state(state):
     return G + b"(K\x01K\x05\x85cnumpy\ndtype\n\x8c\x02f4\x89\x88\x87R" + state + b"b\x89C\x14" + bytes(20) + b"tb"
 
 
-def filled(shape, dtype, content, fortran=b"\x89"):
+def array_with(shape, dtype, content, fortran=b"\x89"):
     return G + b"(K\x01" + shape + dtype + fortran + content + b"tb"
 
 
@@ -167,55 +167,61 @@ LONG_TEXT = b"X" + struct.pack("<I", 10**6) + b"a" * 10**6 + b"\x94"  # in the m
 LONG_LIST = b"](" + b"K\x01" * 10**5 + b"e\x94"
 
 ATTACKS = {
-    "dtype with fields at an address": one(dtype_state(b"(K\x03\x8c\x01|N\x8c\x01a\x85}K\x08K\x08K\x10t")),
-    "dtype with a subarray": one(dtype_state(b"(K\x03\x8c\x01|\x8c\x02f8K\x08\x85\x86NNK\x40K\x01K\x00t")),
-    "dtype of text with an object as its field": one(
+    "dtype with fields at an address": pickle_of_clip(dtype_state(b"(K\x03\x8c\x01|N\x8c\x01a\x85}K\x08K\x08K\x10t")),
+    "dtype with a subarray": pickle_of_clip(dtype_state(b"(K\x03\x8c\x01|\x8c\x02f8K\x08\x85\x86NNK\x40K\x01K\x00t")),
+    "dtype of text with an object as its field": pickle_of_clip(
         G
         + b"(K\x01K\x01\x85cnumpy\ndtype\n\x8c\x02S8\x89\x88\x87R(K\x03\x8c\x01|N\x8c\x01a\x85}\x8c\x01a"
         + OBJECT
         + b"K\x00\x86sK\x08K\x01K\x3ftb\x89]Natb"
     ),
-    "dtype of numbers that are counted as objects": one(
+    "dtype of numbers that are counted as objects": pickle_of_clip(
         G
         + b"(K\x01K\x03\x85cnumpy\ndtype\n\x8c\x02i8\x89\x88\x87R(K\x03\x8c\x01<NNNJ\xff\xff\xff\xff"
         + b"J\xff\xff\xff\xffK\x3ftb\x89]("
         + (b"\x8a\x08" + b"A" * 8) * 3
         + b"etb"
     ),
-    "dtype of another size": one(dtype_state(b"(K\x03\x8c\x01<NNNJ\x00\x00\x00\x40K\x01K\x00t")),
-    "dtype whose numbers are objects": one(dtype_state(b"(K\x03\x8c\x01|NNNK\x08K\x08K\x3ft")),
-    "dtype whose fields are text": one(dtype_state(b"(K\x03\x8c\x01<\x8c\x01aNNJ\xff\xff\xff\xffK\x01K\x00t")),
-    "dtype of numbers": one(dtype_state(b"(K\x03K\x01NNNK\x04K\x04K\x00t")),
-    "dtype of fields": one(G + b"cnumpy\ndtype\n(\x8c\x01a\x8c\x02f4\x86l\x85R"),
-    "objects of too short a list": one(filled(b"M\x00\x10\x85", OBJECT, b"]N\x61")),
-    "objects of bytes": one(filled(b"K\x01\x85", OBJECT, b"C\x08" + b"A" * 8)),
-    "objects without a list": one(filled(b"K\x02\x85", OBJECT, b"N")),
-    "objects from a buffer": one(
+    "dtype of another size": pickle_of_clip(dtype_state(b"(K\x03\x8c\x01<NNNJ\x00\x00\x00\x40K\x01K\x00t")),
+    "dtype whose numbers are objects": pickle_of_clip(dtype_state(b"(K\x03\x8c\x01|NNNK\x08K\x08K\x3ft")),
+    "dtype whose fields are text": pickle_of_clip(
+        dtype_state(b"(K\x03\x8c\x01<\x8c\x01aNNJ\xff\xff\xff\xffK\x01K\x00t")
+    ),
+    "dtype of numbers": pickle_of_clip(dtype_state(b"(K\x03K\x01NNNK\x04K\x04K\x00t")),
+    "dtype of fields": pickle_of_clip(G + b"cnumpy\ndtype\n(\x8c\x01a\x8c\x02f4\x86l\x85R"),
+    "objects of too short a list": pickle_of_clip(array_with(b"M\x00\x10\x85", OBJECT, b"]N\x61")),
+    "objects of bytes": pickle_of_clip(array_with(b"K\x01\x85", OBJECT, b"C\x08" + b"A" * 8)),
+    "objects without a list": pickle_of_clip(array_with(b"K\x02\x85", OBJECT, b"N")),
+    "objects from a buffer": pickle_of_clip(
         b"cnumpy.core.numeric\n_frombuffer\n(C\x08AAAAAAAA" + OBJECT + b"K\x01\x85\x8c\x01CtR"
     ),
-    "object from a scalar": one(b"cnumpy.core.multiarray\nscalar\n" + OBJECT + b"C\x08AAAAAAAA\x86R"),
-    "bytes too few": one(filled(b"M\x00\x10K\x11K\x03\x87", F4, b"C\x10" + bytes(16))),
-    "a negative length": one(filled(b"J\xfe\xff\xff\xffJ\xfe\xff\xff\xff\x86", F4, b"C\x10" + bytes(16))),
-    "lengths that overflow": one(filled(WORD + b"K\x04\x86", F4, b"C\x00")),
-    "places that hold nothing": one(filled(WORD + b"K\x00\x86", F4, b"C\x00")),
-    "a shape of arrays": one(filled(G + b"\x85", F4, b"C\x00")),
-    "a shape that is no tuple": one(filled(b"K\x04", F4, b"C\x10" + bytes(16))),
-    "content that is an array": one(filled(b"K\x04\x85", F4, G)),
-    "a state twice": one(filled(b"K\x01\x85", F4, b"C\x04abcd") + b"(K\x01K\x01\x85" + F4 + b"\x89C\x04abcdtb"),
-    "no state": one(G),
-    "array as its own state": one(G + b"\x94h\x00b"),
+    "object from a scalar": pickle_of_clip(b"cnumpy.core.multiarray\nscalar\n" + OBJECT + b"C\x08AAAAAAAA\x86R"),
+    "bytes too few": pickle_of_clip(array_with(b"M\x00\x10K\x11K\x03\x87", F4, b"C\x10" + bytes(16))),
+    "a negative length": pickle_of_clip(
+        array_with(b"J\xfe\xff\xff\xffJ\xfe\xff\xff\xff\x86", F4, b"C\x10" + bytes(16))
+    ),
+    "lengths that overflow": pickle_of_clip(array_with(WORD + b"K\x04\x86", F4, b"C\x00")),
+    "places that hold nothing": pickle_of_clip(array_with(WORD + b"K\x00\x86", F4, b"C\x00")),
+    "a shape of arrays": pickle_of_clip(array_with(G + b"\x85", F4, b"C\x00")),
+    "a shape that is no tuple": pickle_of_clip(array_with(b"K\x04", F4, b"C\x10" + bytes(16))),
+    "content that is an array": pickle_of_clip(array_with(b"K\x04\x85", F4, G)),
+    "a state twice": pickle_of_clip(
+        array_with(b"K\x01\x85", F4, b"C\x04abcd") + b"(K\x01K\x01\x85" + F4 + b"\x89C\x04abcdtb"
+    ),
+    "no state": pickle_of_clip(G),
+    "array as its own state": pickle_of_clip(G + b"\x94h\x00b"),
     "LONG_BINPUT at 2^29": b"\x80\x04}r\x00\x00\x00\x20.",
     "PUT at 10^30": b"}p" + b"1" + b"0" * 30 + b"\n.",
     "PUT at minus one": b"}p-1\n.",
     "forty doublings as a key": b"\x80\x04}" + doublings(40) + b"Ns.",
     "forty doublings as a split": b"\x80\x04}\x8c\x01a" + doublings(40) + b"s.",
-    "forty doublings as a shape": one(filled(doublings(40), F4, b"C\x00")),
-    "forty doublings as a dtype": one(b"cnumpy\ndtype\n" + doublings(40) + b"\x85R"),
-    "forty doublings as a codec": one(b"c_codecs\nencode\n\x8c\x01a" + doublings(40) + b"\x86R"),
-    "forty doublings as arguments": one(b"c_codecs\nencode\n" + doublings(40) + b"R"),
-    "forty doublings as a state": one(G + doublings(40) + b"b"),
-    "forty doublings as a function": one(doublings(40) + b")R"),
-    "forty doublings as an order": one(
+    "forty doublings as a shape": pickle_of_clip(array_with(doublings(40), F4, b"C\x00")),
+    "forty doublings as a dtype": pickle_of_clip(b"cnumpy\ndtype\n" + doublings(40) + b"\x85R"),
+    "forty doublings as a codec": pickle_of_clip(b"c_codecs\nencode\n\x8c\x01a" + doublings(40) + b"\x86R"),
+    "forty doublings as arguments": pickle_of_clip(b"c_codecs\nencode\n" + doublings(40) + b"R"),
+    "forty doublings as a state": pickle_of_clip(G + doublings(40) + b"b"),
+    "forty doublings as a function": pickle_of_clip(doublings(40) + b")R"),
+    "forty doublings as an order": pickle_of_clip(
         b"cnumpy.core.numeric\n_frombuffer\n(C\x04abcd" + F4 + b"K\x01\x85" + doublings(40) + b"tR"
     ),
     "tuples in tuples in tuples": b"\x80\x04)" + b"\x85" * 500_000 + b".",
@@ -253,7 +259,7 @@ ATTACKS = {
     + b"e.",
     "a long tuple as arguments": b"\x80\x04(" + b"N" * 10**5 + b"t\x94" + b"c_codecs\nencode\nh\x00R" * 1000 + b".",
     "one array as clip after clip": b"\x80\x04}\x8c\x05train}(\x8c\x01a"
-    + filled(b"M\x10\x27K\x11K\x03\x87", F4, b"B" + struct.pack("<I", 10_000 * 204) + bytes(10_000 * 204))
+    + array_with(b"M\x10\x27K\x11K\x03\x87", F4, b"B" + struct.pack("<I", 10_000 * 204) + bytes(10_000 * 204))
     + b"\x94"
     + b"".join(b"\x8c\x04%04dh\x00" % n for n in range(2000))
     + b"us.",
@@ -299,27 +305,27 @@ HEADERS = {
 }
 
 
-def refused(path, directory=None):
-    """What is said of a file that cannot be read."""
-    sentences = []
+def error_messages(path, directory=None):
+    """Return the errors of all readers for a file."""
+    messages = []
     readers = {"load": lambda p: read_motion(p, skeleton=WALKER), "arrays": read_arrays, "paths": read_paths}
-    for name, read in readers.items():
+    for name, reader in readers.items():
         try:
-            read(path)
+            reader(path)
         except (ValueError, OSError) as error:
-            sentence = str(error)
-            assert path.stem in sentence, f"{name}: {sentence!r} does not name the file"
-            assert len(sentence) < 1500, f"{name}: {len(sentence)} characters"
-            assert is_name(sentence), f"{name}: {sentence!r} has control characters"
-            sentences.append(sentence)
+            message = str(error)
+            assert path.stem in message, f"{name}: {message!r} does not name the file"
+            assert len(message) < 1500, f"{name}: {len(message)} characters"
+            assert is_name(message), f"{name}: {message!r} has control characters"
+            messages.append(message)
         except RuntimeError as error:
             raise AssertionError(f"{name}: {error!r}") from error
     is_forecasts(path)
-    return sentences
+    return messages
 
 
 def must_be_refused(path, directory):
-    assert len(refused(path)) == 3
+    assert len(error_messages(path)) == 3
 
 
 @pytest.fixture(scope="module")
@@ -329,19 +335,19 @@ def isolated(tmp_path_factory):
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_hostile_pickles_are_refused_in_time_and_memory(isolated, tmp_path, attack):
+def test_hostile_pickles_are_an_error_within_time_and_memory_limits(isolated, tmp_path, attack):
     isolated(pickled(tmp_path / "attack.npz", ATTACKS[attack], compression=zipfile.ZIP_DEFLATED))
 
 
 @pytest.mark.parametrize("header", HEADERS)
-def test_hostile_headers_are_refused_in_time_and_memory(isolated, tmp_path, header):
+def test_hostile_headers_are_an_error_within_time_and_memory_limits(isolated, tmp_path, header):
     version = b"\x01\x00" if len(HEADERS[header]) < 60000 else b"\x02\x00"
     content = npy(clips()[0].tobytes(), HEADERS[header], version)
     isolated(npz(tmp_path / "attack.npz", [("train/walk.npy", content)]))
     isolated(npz(tmp_path / "attack.npz", [("positions_3d.npy", content)]))
 
 
-def test_what_an_archive_may_not_be_compressed_or_named_with(tmp_path):
+def test_compressed_encrypted_and_repeated_members_are_an_error(tmp_path):
     plain = npy(clips()[0].tobytes(), "{'descr': '<f4', 'fortran_order': False, 'shape': (5, 17, 3), }")
     for method, name in ((zipfile.ZIP_BZIP2, "bzip2"), (zipfile.ZIP_LZMA, "LZMA")):
         path = npz(tmp_path / "a.npz", [("train/walk.npy", plain)], compression=method)
@@ -351,25 +357,25 @@ def test_what_an_archive_may_not_be_compressed_or_named_with(tmp_path):
     with pytest.raises(ValueError, match=r"a\.npz: walk occurs twice"):
         read_arrays(path)
     content = bytearray(npz(tmp_path / "a.npz", [("walk.npy", plain)]).read_bytes())
-    for signature, place in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
-        content[content.index(signature) + place] |= 1
+    for signature, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        content[content.index(signature) + offset] |= 1
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"a\.npz: walk is encrypted"):
         read_motion(path, skeleton=WALKER)
 
 
-def test_damaged_bytes_of_a_member_are_told(tmp_path):
+def test_a_damaged_member_is_an_error_that_names_it(tmp_path):
     save(tmp_path / "a.npz", MotionSet([Clip("train", "walk", clips()[0])], WALKER))
     content = bytearray((tmp_path / "a.npz").read_bytes())
-    for place in (100, 300):
+    for offset in (100, 300):
         damaged = content.copy()
-        damaged[place] ^= 0xFF
+        damaged[offset] ^= 0xFF
         (tmp_path / "a.npz").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"a\.npz: train/walk: (damaged|declares|no npy)"):
             read_motion(tmp_path / "a.npz", skeleton=WALKER)
 
 
-def test_positions_that_float32_cannot_hold_are_refused_by_the_clips_name(tmp_path):
+def test_positions_beyond_float32_are_an_error_that_names_the_clip(tmp_path):
     positions = clips(1, dtype=np.float64)[0]
     positions[2, 3] = 1e300
     with pytest.raises(ValueError, match=r"clip train/walk has NaN or infinite .* first RFoot at frame 2"):
@@ -377,16 +383,16 @@ def test_positions_that_float32_cannot_hold_are_refused_by_the_clips_name(tmp_pa
     np.savez(tmp_path / "a.npz", **{"train/walk": positions, "train/sit": clips(1)[0]})
     with pytest.raises(ValueError, match=r"a: clip train/walk has NaN or infinite"):
         read_motion(tmp_path / "a.npz", skeleton=WALKER)
-    kept = read_motion(tmp_path / "a.npz", skeleton=WALKER, skip_bad=True)
-    assert [clip.name for clip in kept] == ["sit"]
-    assert kept.skipped[0][:2] == ("train", "walk")
+    clips_read = read_motion(tmp_path / "a.npz", skeleton=WALKER, skip_bad=True)
+    assert [clip.name for clip in clips_read] == ["sit"]
+    assert clips_read.skipped[0][:2] == ("train", "walk")
 
 
 # ------------------------------------------------------------------------------------------------ memory
 
 
 @pytest.mark.parametrize("kind", ["plain", "deflated", "pickled"])
-def test_reading_takes_little_more_than_the_data(tmp_path, kind):
+def test_reading_takes_little_more_memory_than_the_data(tmp_path, kind):
     arrays = {f"train/{n}": clips(1, frames=4_000)[0] for n in range(8)}
     size = sum(array.nbytes for array in arrays.values())
     if kind == "pickled":
@@ -404,7 +410,7 @@ def test_reading_takes_little_more_than_the_data(tmp_path, kind):
     assert peak < 1.5 * size + 2**21, f"{peak / size:.2f} times the data"
 
 
-def test_zeros_are_not_unpacked_to_a_hundred_times_their_size(isolated, tmp_path):
+def test_a_zip_bomb_is_not_unpacked(isolated, tmp_path):
     path = tmp_path / "a.npz"
     frames = 2**27 // 204
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({frames}, 17, 3), }}"
@@ -412,11 +418,11 @@ def test_zeros_are_not_unpacked_to_a_hundred_times_their_size(isolated, tmp_path
     npz(path, [("train/walk.npy", content)], compression=zipfile.ZIP_DEFLATED)
     with pytest.raises(ValueError, match=r"a\.npz: it would unpack to 134,[\d,]+ bytes, at most 67,108,864 are read"):
         read_motion(path, skeleton=WALKER)
-    lying = bytearray(path.read_bytes())
-    for signature, place in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):  # the size that it says it has
-        at = lying.rindex(signature) + place
-        lying[at : at + 4] = struct.pack("<I", 500)
-    path.write_bytes(lying)
+    forged = bytearray(path.read_bytes())
+    for signature, offset in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):  # the declared size
+        position = forged.rindex(signature) + offset
+        forged[position : position + 4] = struct.pack("<I", 500)
+    path.write_bytes(forged)
     isolated(path)
 
 
@@ -424,13 +430,13 @@ def test_zeros_are_not_unpacked_to_a_hundred_times_their_size(isolated, tmp_path
 
 
 def bases():
-    """Valid members of archives by name: (member, what is pickled or None, content)."""
-    there = nested(clips(3, 2))
-    found = {f"protocol {n}": pickle.dumps(there, n) for n in range(6)}
-    found["objects"] = pickle.dumps(np.array(there, dtype=object), 3)
-    found["layouts"] = pickle.dumps({"a": {k: make(clips(1, 2)[0]) for k, make in LAYOUTS.items()}}, 5)
-    found["python 2"] = python2(there)
-    return found
+    """Return valid pickles for archives by name."""
+    content = nested(clips(3, 2))
+    pickles = {f"protocol {n}": pickle.dumps(content, n) for n in range(6)}
+    pickles["objects"] = pickle.dumps(np.array(content, dtype=object), 3)
+    pickles["layouts"] = pickle.dumps({"a": {k: make(clips(1, 2)[0]) for k, make in LAYOUTS.items()}}, 5)
+    pickles["python 2"] = python2(content)
+    return pickles
 
 
 BASES = bases()
@@ -442,7 +448,7 @@ SNIPPETS = sorted(
 TEXTS = sorted({*HEADERS.values(), "{'descr': '<f4', 'fortran_order': True, 'shape': (2, 17, 3), }"})
 
 places = st.floats(0, 1, exclude_max=True)
-of_bytes = st.one_of(
+byte_mutations = st.one_of(
     st.tuples(st.just("flip"), places, st.integers(1, 255)),
     st.tuples(st.just("write"), places, st.binary(max_size=8)),
     st.tuples(st.just("cut"), places, st.integers(1, 40)),
@@ -450,7 +456,7 @@ of_bytes = st.one_of(
     st.tuples(st.just("repeat"), places, st.integers(1, 300)),
     st.tuples(st.just("write at the end"), places, st.binary(min_size=1, max_size=8)),
 )
-of_opcodes = st.one_of(
+opcode_mutations = st.one_of(
     st.tuples(st.just("drop"), places, st.just(0)),
     st.tuples(st.just("twice"), places, st.integers(1, 3)),
     st.tuples(st.just("insert"), places, st.integers(0, len(SNIPPETS) - 1)),
@@ -459,10 +465,10 @@ of_opcodes = st.one_of(
 )
 archives = st.tuples(
     st.sampled_from([*BASES, "plain"]),
-    st.lists(of_opcodes, max_size=4),  # of the pickle
-    st.lists(of_bytes, max_size=2),  # of the member
-    st.none() | st.sampled_from(TEXTS),  # its header
-    st.lists(of_bytes, max_size=3),  # of the file
+    st.lists(opcode_mutations, max_size=4),  # mutations of the pickle
+    st.lists(byte_mutations, max_size=2),  # mutations of the member
+    st.none() | st.sampled_from(TEXTS),  # header of the member
+    st.lists(byte_mutations, max_size=3),  # mutations of the file
     st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED]),
 )
 
@@ -470,20 +476,20 @@ archives = st.tuples(
 def mutate_bytes(content, mutations):
     content = bytearray(content)
     for kind, place, value in mutations:
-        at = int(place * len(content))
+        start = int(place * len(content))
         if kind == "flip" and content:
-            content[at] ^= value
+            content[start] ^= value
         elif kind == "write":
-            content[at : at + len(value)] = value
+            content[start : start + len(value)] = value
         elif kind == "cut":
-            del content[at : at + value]
+            del content[start : start + value]
         elif kind == "truncate":
-            del content[at:]
+            del content[start:]
         elif kind == "repeat":
-            content[at:at] = content[at : at + value]
-        elif kind == "write at the end":  # where a zip lists what it holds
-            at = max(0, len(content) - 1 - int(place * 120))
-            content[at : at + len(value)] = value
+            content[start:start] = content[start : start + value]
+        elif kind == "write at the end":  # the directory of a zip is at its end
+            start = max(0, len(content) - 1 - int(place * 120))
+            content[start : start + len(value)] = value
     return bytes(content)
 
 
@@ -491,18 +497,18 @@ def mutate_opcodes(content, mutations):
     starts = [place for _, _, place in pickletools.genops(content)]
     chunks = [content[a:b] for a, b in zip(starts, [*starts[1:], len(content)], strict=True)]
     for kind, place, value in mutations:
-        at = int(place * len(chunks))
+        start = int(place * len(chunks))
         if kind == "drop":
-            del chunks[at : at + 1]
+            del chunks[start : start + 1]
         elif kind == "twice":
-            chunks[at:at] = chunks[at : at + value]
+            chunks[start:start] = chunks[start : start + value]
         elif kind == "insert":
-            chunks.insert(at, SNIPPETS[value])
+            chunks.insert(start, SNIPPETS[value])
         elif kind == "swap":
             other = int(value * len(chunks))
-            chunks[at], chunks[other] = chunks[other], chunks[at]
+            chunks[start], chunks[other] = chunks[other], chunks[start]
         elif kind == "argument":
-            chunks[at] = chunks[at][:1] + value + chunks[at][1 + len(value) :]
+            chunks[start] = chunks[start][:1] + value + chunks[start][1 + len(value) :]
     return b"".join(chunks)
 
 
@@ -520,18 +526,18 @@ def read_mutated(example, directory):
         content = mutate_opcodes(BASES[base], opcodes)
         npz(path, [("positions_3d.npy", mutate_bytes(npy(content, header), member))], compression=method)
     path.write_bytes(mutate_bytes(path.read_bytes(), file))
-    refused(path)
+    error_messages(path)
     if sorted(p.name for p in directory.iterdir()) != ["mutated.npz"]:
         raise AssertionError("reading left something behind")
 
 
-def test_mutations_leave_the_bases_valid(tmp_path):
+def test_archives_without_mutations_are_valid(tmp_path):
     for base in [*BASES, "plain"]:
         read_mutated((base, [], [], None, [], zipfile.ZIP_DEFLATED), tmp_path)
         assert len(read_motion(tmp_path / "mutated.npz", skeleton=WALKER)) > 0
 
 
 @limited(SHARE)
-def test_mutated_archives_are_read_or_refused(tmp_path):
+def test_mutated_archives_are_read_or_an_error(tmp_path):
     with Isolated(read_mutated, tmp_path) as isolated:
         fuzz(isolated, archives, SHARE)

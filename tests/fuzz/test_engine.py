@@ -22,11 +22,11 @@ def faulty(example, directory):
     }[example]()
 
 
-def test_what_breaks_a_law_is_told_and_the_next_example_goes_on(tmp_path):
+def test_each_kind_of_failure_is_reported_and_the_next_example_runs(tmp_path):
     directory = tmp_path / "inside"
     directory.mkdir()
     (directory / "link").symlink_to(tmp_path / "target")
-    distributions = {
+    messages = {
         "allocates": "MemoryError",
         "dies": "died with exit code -11",
         "is a bug": "KeyError",
@@ -36,10 +36,10 @@ def test_what_breaks_a_law_is_told_and_the_next_example_goes_on(tmp_path):
         "writes through a link": "writes outside",
     }
     with Isolated(faulty, directory) as isolated:
-        for example, distribution in distributions.items():
+        for example, message in messages.items():
             if example == "allocates" and not Path("/proc/self/statm").exists():
                 continue
-            with pytest.raises(AssertionError, match=distribution):
+            with pytest.raises(AssertionError, match=message):
                 isolated(example)
         isolated("refuses")
         isolated("writes here")
@@ -56,13 +56,13 @@ def test_a_failing_example_is_found_and_printed():
     assert "example=1000" in "".join(failure.value.__notes__)
 
 
-def test_the_same_examples_come_in_the_same_order():
-    def drawn():
-        seen = []
-        fuzz(seen.append, st.integers(), seconds=2)
-        return seen[:20]
+def test_examples_are_the_same_in_every_run():
+    def draw():
+        examples = []
+        fuzz(examples.append, st.integers(), seconds=2)
+        return examples[:20]
 
-    first, second = drawn(), drawn()
-    shared = min(len(first), len(second))  # how many there are depends on the machine
+    first, second = draw(), draw()
+    shared = min(len(first), len(second))  # the number of examples depends on the machine
     assert second[:shared] == first[:shared]
     assert len(set(first[:shared])) > 3

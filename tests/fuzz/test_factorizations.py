@@ -1,6 +1,6 @@
-"""Random pairs of equations, run in every way that changes what the model reads.
+"""Random pairs of equations, with every option that changes the inputs of the model.
 
-With missing entries, padding, scheduled sampling and masks of one's own, bound and gradient are those of the dense
+With missing entries, padding, scheduled sampling and custom masks, bound and gradient equal those of the dense
 Gaussian.
 """
 
@@ -28,24 +28,27 @@ def check(example):
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(B, steps, SIZES["x"], generator=generator, dtype=torch.float64)
     lengths = [steps, int(rng.integers(1, steps + 1))]
-    seen = torch.rand(x.shape, generator=generator) < rng.choice([0.5, 1.0])
-    fed = torch.rand(B, steps, generator=generator) < probability
-    feeding = ScheduledSampling(probability, gradient=gradient)
-    found = library_bound(model, x, lengths=lengths, seen=seen, fed=fed, feeding=feeding)
+    mask = torch.rand(x.shape, generator=generator) < rng.choice([0.5, 1.0])
+    is_fed = torch.rand(B, steps, generator=generator) < probability
+    schedule = ScheduledSampling(probability, gradient=gradient)
+    bounds = library_bound(model, x, lengths=lengths, seen=mask, fed=is_fed, feeding=schedule)
     expected = torch.stack(
-        [exact_bound(model, x[b], length=lengths[b], seen=seen[b], fed=fed[b], detach=not gradient) for b in range(B)]
+        [
+            exact_bound(model, x[b], length=lengths[b], seen=mask[b], fed=is_fed[b], detach=not gradient)
+            for b in range(B)
+        ]
     )
-    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(bounds, expected, rtol=1e-9, atol=1e-9)
     parameters = list(model.parameters())
     gradients = [
         torch.autograd.grad(bound.sum(), parameters, allow_unused=True, materialize_grads=True)
-        for bound in (found, expected)
+        for bound in (bounds, expected)
     ]
     torch.testing.assert_close(*gradients, rtol=1e-8, atol=1e-8)
 
 
 @limited(15)
-def test_the_bound_and_its_gradient_are_those_of_the_dense_gaussian():
+def test_the_bound_and_its_gradient_equal_the_dense_gaussian():
     examples = st.tuples(
         factorizations(),
         st.integers(1, 5),

@@ -1,4 +1,4 @@
-"""Files of what somebody has seen of segments: read, or refused in a sentence, whatever is in them."""
+"""Untrusted files of observed segments are read, or are an error of one sentence."""
 
 import warnings
 
@@ -13,7 +13,7 @@ from dvae.motion.segments.frames import TimedFrames
 from dvae.motion.segments.recovery import LARGEST, MOST, read_seen
 
 from .engine import Isolated, fuzz, limited
-from .test_archives import mutate_bytes, of_bytes, places
+from .test_archives import byte_mutations, mutate_bytes, places
 
 SHARE = 5
 
@@ -32,22 +32,22 @@ observations = st.tuples(
         [(SURFACES, TIMES), (POINTS, TIMES), (SPOTS, TIMES), (POINTS, SPOTS, FRAMES), (SPOTS, SHAPE, FRAMES)]
     ),
     st.lists(changes, max_size=3),
-    st.lists(of_bytes, max_size=2),
+    st.lists(byte_mutations, max_size=2),
 )
 
 
 SKELETON = bodies.fit_to_body(simulate(clips=1, frames=30, seed=1), bodies.human()).skeleton
 MODEL = MotionLatent(latent=2, widths=(4,)).build(SegmentSchema.from_data(TimedFrames(SKELETON), bodies.human())).eval()
-"""Made where a process begins, before its time and memory are watched."""
+"""The model is built at import, before time and memory are limited."""
 
 
-def seen(names, many=2, moments=3):
-    """As a file has it."""
+def observed(names, many=2, moments=3):
+    """Return the arrays of a valid file."""
     vertices = len(MODEL.body.template)
     spots = {SURFACES: (vertices, 3), POINTS: (5, 3), SPOTS: (16, 3)}
-    found = {name: np.zeros((many, moments, *spots[name])) for name in names if name in spots}
-    found |= {name: np.tile(np.arange(moments) / 30, (many, 1)) for name in names if name in (TIMES, FRAMES)}
-    return found | ({SHAPE: np.zeros((many, 8))} if SHAPE in names else {})
+    arrays = {name: np.zeros((many, moments, *spots[name])) for name in names if name in spots}
+    arrays |= {name: np.tile(np.arange(moments) / 30, (many, 1)) for name in names if name in (TIMES, FRAMES)}
+    return arrays | ({SHAPE: np.zeros((many, 8))} if SHAPE in names else {})
 
 
 def changed(arrays, changes):
@@ -61,7 +61,7 @@ def changed(arrays, changes):
             del arrays[names[first % len(names)]]
         elif kind == "cast":
             with np.errstate(all="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of numbers that are complex no more
+                warnings.simplefilter("ignore")  # discarding the imaginary part warns
                 arrays[names[first % len(names)]] = arrays[names[first % len(names)]].astype(third)
         elif (array := arrays[names[first % len(names)]]).size and array.dtype.kind == "f":
             with np.errstate(over="ignore"):
@@ -70,33 +70,35 @@ def changed(arrays, changes):
 
 
 def read_changed(example, directory):
-    names, changes, of_file = example
+    names, changes, file_mutations = example
     path = directory / "seen.npz"
-    np.savez_compressed(path, **changed(seen(names), changes))
-    path.write_bytes(mutate_bytes(path.read_bytes(), of_file))
+    np.savez_compressed(path, **changed(observed(names), changes))
+    path.write_bytes(mutate_bytes(path.read_bytes(), file_mutations))
     try:
-        found = read_seen(path, MODEL)
+        observations_read = read_seen(path, MODEL)
     except ValueError as error:
         sentence = str(error)
         if not sentence.startswith(str(path)) or len(sentence) - len(str(path)) > 500 or not sentence.isprintable():
             raise AssertionError(sentence) from error
     else:
-        if sum(value.nbytes for value in found.values()) > 8 * LARGEST:
+        if sum(value.nbytes for value in observations_read.values()) > 8 * LARGEST:
             raise AssertionError("more than may be read")
-        places = [value for name, value in found.items() if name in (SURFACES, POINTS, SPOTS)] or [*found.values()]
+        places = [value for name, value in observations_read.items() if name in (SURFACES, POINTS, SPOTS)] or [
+            *observations_read.values()
+        ]
         if not any(value.isfinite().any() for value in places):
             raise AssertionError("no observations")
     if [p.name for p in directory.iterdir()] != ["seen.npz"]:
         raise AssertionError("reading left something behind")
 
 
-def test_what_is_not_changed_is_read(tmp_path):
+def test_unchanged_files_are_read(tmp_path):
     for names in ((SURFACES, TIMES), (POINTS, SPOTS, FRAMES), (SPOTS, SHAPE, FRAMES)):
-        np.savez(tmp_path / "seen.npz", **seen(names))
+        np.savez(tmp_path / "seen.npz", **observed(names))
         assert read_seen(tmp_path / "seen.npz", MODEL).keys() == {*names}
 
 
 @limited(SHARE)
-def test_changed_observations_are_read_or_refused(tmp_path):
+def test_changed_observations_are_read_or_an_error(tmp_path):
     with Isolated(read_changed, tmp_path) as isolated:
         fuzz(isolated, observations, SHARE)

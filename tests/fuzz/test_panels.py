@@ -1,4 +1,4 @@
-"""Tables and schemas that somebody else wrote: read right, or refused in a sentence."""
+"""Untrusted tables and schemas are read correctly, or are an error of one sentence."""
 
 import io
 import os
@@ -55,11 +55,11 @@ NUMBERS = st.sampled_from(["<f8", ">f8", "<f2", "<i8", "|u1", "|b1", "<c16", "|O
 
 @st.composite
 def separated(draw):
-    """A CSV of a few cells, perhaps damaged."""
+    """Draw a CSV of a few cells, perhaps damaged."""
     names = draw(st.lists(NAMES, min_size=1, max_size=5))
     columns = [draw(st.lists(CELLS, min_size=1, max_size=3)) for _ in names]
     count = draw(st.integers(0, 30))
-    rows = [[draw(st.sampled_from(own)) for own in columns] for _ in range(min(count, 8))]
+    rows = [[draw(st.sampled_from(cells)) for cells in columns] for _ in range(min(count, 8))]
     rows += [[str(n // 4), *map(str, np.arange(len(names) - 1) * n)] for n in range(count - 8)]
     end, separator = draw(ENDS), draw(st.sampled_from([",", ",", ",", ";", "\t"]))
     text = end.join(separator.join(row) for row in [names, *rows]).encode("utf-8", "surrogatepass")
@@ -68,7 +68,7 @@ def separated(draw):
 
 @st.composite
 def damaged(draw, content):
-    """Bytes, of some examples with a few others in their place, or cut short."""
+    """Draw the content, unchanged, with some bytes replaced, or truncated."""
     if draw(st.integers(0, 3)):
         return content
     content = bytearray(content)
@@ -82,10 +82,10 @@ def damaged(draw, content):
 
 @st.composite
 def arrays(draw):
-    """An npz with a header of its own invention."""
+    """Draw an npz with a random header."""
     shape = draw(st.lists(st.sampled_from([0, 1, 2, 3, 12, 40, 5000, 10**6, 10**12, -1, 2**63]), max_size=4))
-    said = {"descr": draw(NUMBERS), "fortran_order": draw(st.booleans()), "shape": tuple(shape)}
-    header = draw(damaged(repr(said).ljust(117).encode() + b"\n"))
+    fields = {"descr": draw(NUMBERS), "fortran_order": draw(st.booleans()), "shape": tuple(shape)}
+    header = draw(damaged(repr(fields).ljust(117).encode() + b"\n"))
     size = min(int(np.prod([min(abs(n), 100) for n in shape], dtype=float)), 4000)
     values = np.random.default_rng(len(header)).integers(0, 5, size).astype("<f8").tobytes()
     content = io.BytesIO()
@@ -101,14 +101,14 @@ def check_sentence(error: Exception):
 
 
 def read(example, directory: Path):
-    """Open a table; what is read comes back from its schema."""
+    """Open a table, and check that its schema survives writing."""
     content, suffix = example
     path = directory / f"a{suffix}"
     path.write_bytes(content)
     try:
         data = PanelData.open(path)
-        again = PanelData.reopened(data.recorded(), data.schema)
-        assert again.fingerprint == data.fingerprint
+        reopened = PanelData.reopened(data.recorded(), data.schema)
+        assert reopened.fingerprint == data.fingerprint
         batch = data.windows("train").all()
         assert all(value.isfinite().all() for value in batch.values())
         columns, cut = read_schema(written_schema(data.panel.columns, data.protocol))
@@ -120,7 +120,7 @@ def read(example, directory: Path):
 
 
 @limited(OF_TABLES)
-def test_tables_are_read_or_refused(tmp_path):
+def test_tables_are_read_or_an_error(tmp_path):
     with Isolated(read, tmp_path) as isolated:
         fuzz(isolated, st.one_of(separated(), arrays()), seconds=OF_TABLES)
 
@@ -146,7 +146,7 @@ split = "time"
 
 @st.composite
 def schemas(draw):
-    """A schema of a few words, or one with some of them in it."""
+    """Draw a schema of a few words, or a valid one with some words inserted."""
     words = draw(st.lists(WORDS, max_size=12))
     if not draw(st.integers(0, 3)):
         return draw(st.sampled_from(["", " "])).join(words)
@@ -154,11 +154,11 @@ def schemas(draw):
     return VALID[:place] + "".join(words[:2]) + VALID[draw(st.integers(place, min(len(VALID), place + 9))) :]
 
 
-def understand(text, directory: Path):
-    """Read a schema; what is read comes back."""
+def check_schema(text, directory: Path):
+    """Read a schema, and check that it survives writing."""
     try:
         columns, cut = read_schema(text)
-    except (ValueError, TypeError) as error:  # of values of another type: the reader of files says which file
+    except (ValueError, TypeError) as error:  # values of another type; the reader of files adds the name
         check_sentence(error)
         return
     if columns is not None:
@@ -168,6 +168,6 @@ def understand(text, directory: Path):
 
 
 @limited(OF_SCHEMAS)
-def test_schemas_are_read_or_refused(tmp_path):
-    with Isolated(understand, tmp_path) as isolated:
+def test_schemas_are_read_or_an_error(tmp_path):
+    with Isolated(check_schema, tmp_path) as isolated:
         fuzz(isolated, schemas(), seconds=OF_SCHEMAS)

@@ -1,4 +1,4 @@
-"""Recordings that somebody else made, of every format: read right, or refused in a sentence, whatever is in them."""
+"""Untrusted recordings of every format are read correctly, or are an error of one sentence."""
 
 import io
 import shutil
@@ -7,7 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
-import roma  # noqa: F401, it makes folders as it is imported, which what is watched must not
+import roma  # noqa: F401, its import creates folders, which is not allowed later
 from c3d import write_c3d
 from hypothesis import strategies as st
 
@@ -20,7 +20,7 @@ from .test_tables import edited
 
 SHARE = 3
 MUTATIONS = 100
-"""Of each format, at the least."""
+"""Minimum number for each format."""
 
 
 def bvh(folder):
@@ -60,31 +60,31 @@ SAMPLES |= {"csv": (csv, "a.csv"), "amass": (amass, "a.npz"), "c3d": (c3d, "a.c3
 
 
 def small(format, folder):
-    """A sample in a folder of its own, what of it is mutated, and what is read."""
+    """Write a sample to a folder; return the file to mutate and the file to read."""
     make, name = SAMPLES[format]
     make(folder)
     return folder / name, folder / ("a.amc" if format == "asf" else name)
 
 
 @pytest.mark.parametrize("format", SAMPLES)
-def test_what_was_not_changed_is_read(format, tmp_path):
+def test_unchanged_recordings_are_read(format, tmp_path):
     _, path = small(format, tmp_path)
     assert read_motion(path).clips[0].frames == (4 if format == "c3d" else 2 if format == "expmap" else 3)
 
 
 def read_changed(example, directory):
-    content, changed, path = example
-    for file in (directory / changed).parent.iterdir():
+    content, original, path = example
+    for file in (directory / original).parent.iterdir():
         (directory / "now").mkdir(exist_ok=True)
         shutil.copyfile(file, directory / "now" / file.name)
-    where = directory / "now" / path
-    where.with_name(changed.name).write_bytes(content)
+    target = directory / "now" / path
+    target.with_name(original.name).write_bytes(content)
     sentence = ""
     try:
-        read_motion(where)
-    except (ValueError, FileNotFoundError) as error:  # nothing else
+        read_motion(target)
+    except (ValueError, FileNotFoundError) as error:  # any other exception is a bug
         sentence = str(error)
-    assert not sentence or str(where.parent) in sentence, f"{sentence!r} does not name the file"
+    assert not sentence or str(target.parent) in sentence, f"{sentence!r} does not name the file"
     assert len(sentence) < 2500, f"{len(sentence)} characters"
     assert is_name(sentence[:1000]), f"{sentence!r} has control characters"
 
@@ -114,14 +114,14 @@ WORDS = [
 
 
 def mutations(content, random):
-    """Bytes changed, cut, repeated; words put in the place of others; the end left away."""
+    """Return the content with bytes changed, cut or repeated, words replaced, or the end removed."""
     text = content.split(b" ")
     kind = random.integers(6)
     if kind == 0:
-        found = bytearray(content)
+        changed_bytes = bytearray(content)
         for _ in range(random.integers(1, 8)):
-            found[random.integers(len(found))] = random.integers(256)
-        return bytes(found)
+            changed_bytes[random.integers(len(changed_bytes))] = random.integers(256)
+        return bytes(changed_bytes)
     if kind == 1:
         return content[: random.integers(len(content))]
     if kind == 2:
@@ -136,24 +136,24 @@ def mutations(content, random):
 
 
 def zipped(content, random):
-    """An npz of which one member is changed before it is zipped: its bytes, or values, shape and kind of its array."""
+    """Return an npz with one changed member: its bytes, or the values, shape or type of its array."""
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         members = {name: file.read(name) for name in file.namelist()}
-    read = [name for name in members if name not in ("betas.npy", "gender.npy")]
-    name = read[random.integers(len(read))]
+    names = [name for name in members if name not in ("betas.npy", "gender.npy")]
+    name = names[random.integers(len(names))]
     kind = random.integers(8)
     if kind == 0:
         members[name] = mutations(members[name], random)
     elif kind == 1:
-        members[name] = members[read[random.integers(len(read))]]
+        members[name] = members[names[random.integers(len(names))]]
     elif kind == 2:
         members[f"{name[:-4]}{random.integers(9)}.npy"] = members.pop(name)
     else:
         array, new = np.load(io.BytesIO(members[name])).copy(), io.BytesIO()
         if kind < 6:
             values = [np.nan, np.inf, -1e308, 1e-320, 1e6, -1.0, 0.0, np.pi]
-            some = random.random(array.shape) < (1 if array.ndim == 0 else random.random())
-            array = np.where(some, values[random.integers(len(values))], array)
+            selected = random.random(array.shape) < (1 if array.ndim == 0 else random.random())
+            array = np.where(selected, values[random.integers(len(values))], array)
         elif kind == 6:
             array = array.astype(["i8", "f2", "f4", "U3", "?", "c16", "S2"][random.integers(7)])
         else:
@@ -161,33 +161,33 @@ def zipped(content, random):
             array = shapes[random.integers(len(shapes))]
         np.save(new, array)
         members[name] = new.getvalue()
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w") as file:
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as file:
         for name, member in members.items():
             file.writestr(name, member)
-    return made.getvalue()
+    return archive.getvalue()
 
 
 @pytest.mark.parametrize("format", SAMPLES)
-def test_changed_files_are_read_or_refused(format, isolated, tmp_path):
-    changed, path = small(format, tmp_path)
-    content, random = changed.read_bytes(), np.random.default_rng(0)
+def test_changed_recordings_are_read_or_an_error(format, isolated, tmp_path):
+    target, path = small(format, tmp_path)
+    content, random = target.read_bytes(), np.random.default_rng(0)
     for number in range(MUTATIONS):
         change = zipped if format == "amass" and number % 5 else mutations
-        isolated((change(content, random), changed, path.name))
+        isolated((change(content, random), target, path.name))
 
 
 def test_most_changed_archives_reach_the_reader_of_their_arrays(tmp_path):
-    changed, path = small("amass", tmp_path)
-    content, random, said = changed.read_bytes(), np.random.default_rng(0), []
+    target, path = small("amass", tmp_path)
+    content, random, messages = target.read_bytes(), np.random.default_rng(0), []
     for _ in range(100):
-        changed.write_bytes(zipped(content, random))
+        target.write_bytes(zipped(content, random))
         try:
             read_motion(path)
         except ValueError as error:
-            said.append(str(error))
-    assert len(said) > 30
-    assert sum("damaged" in sentence or "npy" in sentence for sentence in said) < len(said) / 3
+            messages.append(str(error))
+    assert len(messages) > 30
+    assert sum("damaged" in sentence or "npy" in sentence for sentence in messages) < len(messages) / 3
 
 
 edits = st.lists(
@@ -200,14 +200,18 @@ edits = st.lists(
 
 
 @limited(SHARE)
-def test_edited_files_are_read_or_refused(isolated, tmp_path):
-    there = {}
+def test_edited_recordings_are_read_or_an_error(isolated, tmp_path):
+    samples = {}
     for format in SAMPLES:
         (tmp_path / format).mkdir()
-        changed, path = small(format, tmp_path / format)
-        there[format] = changed.read_bytes(), changed, path.name
-    examples = st.tuples(st.sampled_from(list(there)), edits)
-    fuzz(lambda of: isolated((edited(there[of[0]][0], of[1]), *there[of[0]][1:])), examples, SHARE)
+        target, path = small(format, tmp_path / format)
+        samples[format] = target.read_bytes(), target, path.name
+    examples = st.tuples(st.sampled_from(list(samples)), edits)
+    fuzz(
+        lambda example: isolated((edited(samples[example[0]][0], example[1]), *samples[example[0]][1:])),
+        examples,
+        SHARE,
+    )
 
 
 @pytest.mark.parametrize(
@@ -221,25 +225,25 @@ def test_edited_files_are_read_or_refused(isolated, tmp_path):
     ],
     ids=["frames", "fewer frames", "digits", "joints", "channels"],
 )
-def test_what_is_announced_takes_no_memory(old, new, isolated, tmp_path):
-    changed, path = small("bvh", tmp_path)
-    content = changed.read_bytes()
+def test_declared_sizes_take_no_memory(old, new, isolated, tmp_path):
+    target, path = small("bvh", tmp_path)
+    content = target.read_bytes()
     assert old in content
-    isolated((content.replace(old, new, 1), changed, path.name))
-    changed.write_bytes(content.replace(old, new, 1))
+    isolated((content.replace(old, new, 1), target, path.name))
+    target.write_bytes(content.replace(old, new, 1))
     with pytest.raises(ValueError, match=r"a\.bvh"):
-        read_motion(changed)
+        read_motion(target)
 
 
-def test_parameters_without_end_take_no_time(isolated, tmp_path):
-    """Eight megabytes of them: time that grows with their square would be a minute."""
-    changed, path = small("c3d", tmp_path)
-    content = changed.read_bytes()
-    one = struct.pack("<bb", 1, 1) + b"A" + struct.pack("<h", 8) + struct.pack("<bBBB", -1, 2, 1, 1) + b"x\0"
+def test_many_parameters_are_read_in_linear_time(isolated, tmp_path):
+    """Eight megabytes of parameters would take a minute in quadratic time."""
+    target, path = small("c3d", tmp_path)
+    content = target.read_bytes()
+    parameter = struct.pack("<bb", 1, 1) + b"A" + struct.pack("<h", 8) + struct.pack("<bBBB", -1, 2, 1, 1) + b"x\0"
     first = content.index(b"\x04\x01USED")
     for blocks in (0, 1, 255):
         head = content[:514] + bytes([blocks]) + content[515:first]
-        isolated((head + one * (2**23 // len(one)) + content[first:], changed, path.name))
+        isolated((head + parameter * (2**23 // len(parameter)) + content[first:], target, path.name))
 
 
 @pytest.mark.parametrize(
@@ -260,7 +264,7 @@ def test_parameters_without_end_take_no_time(isolated, tmp_path):
         ("mocap_framerate", np.array("30"), "mocap_framerate holds"),
     ],
 )
-def test_arrays_that_are_no_motion_are_refused(name, value, message, tmp_path):
+def test_arrays_that_are_no_motion_are_an_error(name, value, message, tmp_path):
     path, _ = small("amass", tmp_path)
     arrays = {**np.load(path), name: value}
     np.savez(path, **arrays)
@@ -268,7 +272,7 @@ def test_arrays_that_are_no_motion_are_refused(name, value, message, tmp_path):
         read_motion(path)
 
 
-def test_another_npz_in_a_folder_of_motion_is_named_as_what_it_is(tmp_path):
+def test_an_npz_without_motion_in_a_folder_is_an_error(tmp_path):
     _, path = small("amass", tmp_path)
     np.savez(path.parent / "z.npz", weights=np.zeros(3))
     with pytest.raises(ValueError, match=r"z\.npz: it holds weights, expected AMASS's poses and trans"):

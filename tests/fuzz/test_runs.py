@@ -1,4 +1,4 @@
-"""Run directories that somebody else made: a run goes on, or is refused in a sentence, whatever lies in them."""
+"""Untrusted run directories: a run is used, or is an error of one sentence."""
 
 import contextlib
 import hashlib
@@ -12,7 +12,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import lightning_fabric  # noqa: F401  # before anything is watched
+import lightning_fabric  # noqa: F401  # imported before files are watched
 import matplotlib.figure  # noqa: F401
 import torch
 from hypothesis import strategies as st
@@ -43,15 +43,15 @@ NOTHING_LEFT = (
     RuntimeError,
     MemoryError,
 )
-"""Of a change to what an earlier one has already broken."""
+"""Errors of a mutation of a file that an earlier mutation has damaged."""
 LAST_OF_ALL = ("longer", "link", "special")
-"""Changes after which a file can no longer be read here either."""
+"""Mutations that come last, because they cannot read the file afterwards."""
 TARGETS = ("mine.txt", "nowhere", "fifo")
 CALLS = ("load", "resume", "forecast", "evaluate")
 
 
 def values():
-    """What a key may hold: each type, the ends of its range and beyond."""
+    """Return a strategy of values of every type, at and beyond the ends of its range."""
     numbers = [-1, 0, 1, 2, 40, 4096, 20_000, 100_000, 10**9, 2**63, 10**400, 0.5, -0.0, 1e308, math.nan, math.inf]
     texts = ["", "vae", "gsps", "../mine.txt", "/dev/zero", "simulated", "\0", "[/red]", "é" * 20_000]
     return st.recursive(
@@ -94,19 +94,19 @@ DAMAGES = {
 
 
 def paths(value: Any, before: tuple = ()) -> list[tuple]:
-    """The keys that lead to every value of a nest of dicts and lists."""
+    """Return the keys of every value in nested dicts and lists."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path for key, each in inner for path in [(*before, key), *paths(each, (*before, key))]]
 
 
-def at(value: Any, path: tuple) -> Any:
+def value_at(value: Any, path: tuple) -> Any:
     for key in path:
         value = value[key]
     return value
 
 
 def commit(run: Path, name: str, content: bytes, signed: bool) -> None:
-    """Replace a file, and its fingerprint too if its author is not clumsy."""
+    """Replace a file, and its fingerprint if `signed`."""
     (run / name).write_bytes(content)
     if signed:
         state = json.loads((run / STATE).read_text())
@@ -118,11 +118,11 @@ def mutate(run: Path, kind: str, *arguments: Any) -> None:
     if kind in ("value", "without"):
         name, place, *new = arguments
         content = json.loads((run / name).read_text())
-        *to, last = (found := paths(content))[place % len(found)]
+        *parents, last = (all_paths := paths(content))[place % len(all_paths)]
         if new:
-            at(content, tuple(to))[last] = new[0]
+            value_at(content, tuple(parents))[last] = new[0]
         else:
-            del at(content, tuple(to))[last]
+            del value_at(content, tuple(parents))[last]
         (run / name).write_text(json.dumps(content))
     elif kind == "text":
         name, place, text = arguments
@@ -133,7 +133,9 @@ def mutate(run: Path, kind: str, *arguments: Any) -> None:
         name, changes, signed = arguments
         content = bytearray((run / name).read_bytes())
         for place, byte in changes:
-            content[place % min(len(content), 4096 if place % 2 else len(content))] = byte  # where the headers are
+            content[place % min(len(content), 4096 if place % 2 else len(content))] = (
+                byte  # half of the changes are in the headers
+            )
         commit(run, name, bytes(content), signed)
     elif kind == "shorter":
         name, place, signed = arguments
@@ -144,13 +146,13 @@ def mutate(run: Path, kind: str, *arguments: Any) -> None:
         with (run / name).open("r+b") as file:
             file.truncate(file.seek(0, 2) + size)
     elif kind in ("link", "special"):
-        name, what = arguments
+        name, target = arguments
         (run / name).unlink(missing_ok=True)
         if kind == "link":
-            (run / name).symlink_to(run.parent / what)
-        elif what == "fifo":
+            (run / name).symlink_to(run.parent / target)
+        elif target == "fifo":
             os.mkfifo(run / name)
-        elif what == "directory":
+        elif target == "directory":
             (run / name).mkdir()
     elif kind == "weights":
         name, place, damage = arguments
@@ -162,28 +164,28 @@ def mutate(run: Path, kind: str, *arguments: Any) -> None:
         commit(run, name, save(tensors), True)
 
 
-def clear(place: Path) -> None:
+def clear(folder: Path) -> None:
     """Remove a folder file by file, since the engine checks paths and `shutil.rmtree` gives it none."""
-    for folder, inner, names in os.walk(place, topdown=False):
+    for parent, inner, names in os.walk(folder, topdown=False):
         for name in names:
-            os.unlink(os.path.join(folder, name))
+            os.unlink(os.path.join(parent, name))
         for name in inner:
-            os.rmdir(os.path.join(folder, name))
-    if place.exists():
-        place.rmdir()
+            os.rmdir(os.path.join(parent, name))
+    if folder.exists():
+        folder.rmdir()
 
 
 def check(example: tuple, directory: Path) -> None:
-    """Damage a copy of the run and use it; the files outside of it stay as they are."""
+    """Damage a copy of a run and use it; check that files outside of it are unchanged."""
     call, fitted, changes = example
-    place = directory / "inside"
-    clear(place)
-    run = place / "run"
+    folder = directory / "inside"
+    clear(folder)
+    run = folder / "run"
     shutil.copytree(directory / fitted, run)
-    canary = place / "mine.txt"
+    canary = folder / "mine.txt"
     canary.write_text("of value")
-    os.mkfifo(place / "fifo")
-    before = sorted(each.name for each in place.iterdir())
+    os.mkfifo(folder / "fifo")
+    before = sorted(each.name for each in folder.iterdir())
     for change in sorted(changes, key=lambda change: LAST_OF_ALL.index(change[0]) if change[0] in LAST_OF_ALL else -1):
         with contextlib.suppress(*NOTHING_LEFT):
             mutate(run, *change)
@@ -193,7 +195,7 @@ def check(example: tuple, directory: Path) -> None:
             use(call, fitted, run, directory / "people.npz")
     finally:
         assert canary.read_text() == "of value"
-        assert sorted(each.name for each in place.iterdir()) == before
+        assert sorted(each.name for each in folder.iterdir()) == before
 
 
 def use(call: str, fitted: str, run: Path, data: Path) -> None:
@@ -214,7 +216,7 @@ def use(call: str, fitted: str, run: Path, data: Path) -> None:
 
 
 @limited(SHARE)
-def test_runs_go_on_or_are_refused(tmp_path):
+def test_damaged_runs_are_used_or_an_error(tmp_path):
     motion.save(tmp_path / "people.npz", motion.simulate(clips=12, frames=76, seed=1))
     method = dvae.method("vrnn", latent=2, width=4, embed=(4,), embed_latent=(4,), warm_up=1)
     training = dvae.Training(steps=4, batch_size=2, validate_every=2, log_every=1, progress=False)

@@ -1,4 +1,4 @@
-"""Skeletons, labels and paths that somebody else made: read right, or refused in a sentence."""
+"""Untrusted skeletons, labels and paths are read correctly, or are an error of one sentence."""
 
 import csv
 import json
@@ -31,21 +31,21 @@ VALID = {
 
 
 def skeleton(path, **changes):
-    """A skeleton file with some values replaced."""
+    """Write a skeleton file with some values replaced."""
     path.write_text(json.dumps({**VALID, **changes}))
     return path
 
 
-def told(read, path):
-    """What is said of a file that cannot be read; None if it can."""
+def error_message(reader, path):
+    """Return the error of a reader for a file, or None."""
     try:
-        read(path)
+        reader(path)
     except (ValueError, FileNotFoundError) as error:
-        sentence = str(error)
-        assert path.name in sentence, f"{sentence!r} does not name the file"
-        assert len(sentence) < 1500, f"{len(sentence)} characters"
-        assert is_name(sentence), f"{sentence!r} has control characters"
-        return sentence
+        message = str(error)
+        assert path.name in message, f"{message!r} does not name the file"
+        assert len(message) < 1500, f"{len(message)} characters"
+        assert is_name(message), f"{message!r} has control characters"
+        return message
     return None
 
 
@@ -106,25 +106,25 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("what", BROKEN)
-def test_what_is_no_skeleton_is_told_in_a_sentence_that_names_the_file(tmp_path, what):
-    changes, message = BROKEN[what]
+@pytest.mark.parametrize("case", BROKEN)
+def test_an_invalid_skeleton_is_an_error_that_names_the_file(tmp_path, case):
+    changes, message = BROKEN[case]
     path = tmp_path / "a.npz.skeleton.json"
-    if isinstance(changes, dict) and not what.startswith("no "):
+    if isinstance(changes, dict) and not case.startswith("no "):
         changes = (
-            {**VALID, **changes} if "joint" in what or "lengths" in what else {**VALID, "bone_lengths_m": [], **changes}
+            {**VALID, **changes} if "joint" in case or "lengths" in case else {**VALID, "bone_lengths_m": [], **changes}
         )
         if len(changes["joint_names"]) > 4:
             changes["bone_lengths_m"] = []
-    elif what == "no root":
+    elif case == "no root":
         changes = {**VALID, **changes}
     path.write_text(json.dumps(changes))
     with pytest.raises(ValueError, match=message):
         Skeleton.from_json(path)
-    assert told(Skeleton.from_json, path)
+    assert error_message(Skeleton.from_json, path)
     save(tmp_path / "a.npz", MotionSet([Clip("a", "b", np.random.default_rng(0).uniform(-1, 1, (3, 17, 3)))], WALKER))
     path.write_text(json.dumps(changes))
-    assert told(lambda _: read_motion(tmp_path / "a.npz"), path)
+    assert error_message(lambda _: read_motion(tmp_path / "a.npz"), path)
 
 
 @pytest.mark.parametrize(
@@ -142,22 +142,22 @@ def test_what_is_no_skeleton_is_told_in_a_sentence_that_names_the_file(tmp_path,
     ],
     ids=["empty", "utf-16", "cut", "lists", "objects", "digits", "fps", "large", "text"],
 )
-def test_files_that_are_no_json_are_told_too(tmp_path, content, message):
+def test_files_without_json_are_an_error_that_names_them(tmp_path, content, message):
     path = tmp_path / "skeleton.json"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=rf"skeleton\.json:? .*{message}"):
         Skeleton.from_json(path)
-    assert told(Skeleton.from_json, path)
+    assert error_message(Skeleton.from_json, path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
 @pytest.mark.timeout(30)
-@pytest.mark.parametrize("read", [Skeleton.from_json, read_paths, read_motion])
-def test_what_is_no_file_is_not_waited_for(tmp_path, read):
+@pytest.mark.parametrize("reader", [Skeleton.from_json, read_paths, read_motion])
+def test_a_pipe_is_an_error_at_once(tmp_path, reader):
     for name in ("pipe.csv", "pipe.npz"):
         os.mkfifo(tmp_path / name)
         with pytest.raises((FileNotFoundError, ValueError), match=name):
-            read(tmp_path / name)
+            reader(tmp_path / name)
 
 
 def test_a_long_chain_of_joints_is_a_skeleton(tmp_path):
@@ -168,7 +168,7 @@ def test_a_long_chain_of_joints_is_a_skeleton(tmp_path):
     assert Skeleton.from_json(tmp_path / "chain.json") == Skeleton(chain.names, chain.parents, name="")
 
 
-def test_the_order_is_the_same_for_joints_of_one_generation():
+def test_the_order_sorts_joints_by_depth_and_index():
     assert HUMAN36M.order == sorted(range(17), key=lambda j: (depth(HUMAN36M, j), j))
 
 
@@ -186,8 +186,8 @@ LABELS = "split,clip,style\ntrain,walk,happy\ntrain,sit,\n"
 def labels(path):
     archive = path.with_name("motion.npz")
     if not archive.exists():
-        there = np.random.default_rng(0).uniform(-0.8, 0.8, (3, 17, 3)).astype(np.float32)
-        np.savez(archive, **{"train/walk": there, "train/sit": there})
+        positions = np.random.default_rng(0).uniform(-0.8, 0.8, (3, 17, 3)).astype(np.float32)
+        np.savez(archive, **{"train/walk": positions, "train/sit": positions})
     return read_motion(archive, WALKER, labels=path)
 
 
@@ -203,13 +203,13 @@ def labels(path):
         (b"", "expected a column named clip"),
     ],
 )
-def test_labels_that_are_no_table_are_told(tmp_path, content, message):
+def test_invalid_files_of_labels_are_an_error(tmp_path, content, message):
     (tmp_path / "labels.csv").write_bytes(content)
     with pytest.raises(ValueError, match=rf"labels\.csv: .*{message}"):
         labels(tmp_path / "labels.csv")
 
 
-def test_labels_are_read_with_a_mark_of_their_encoding_and_quotes(tmp_path):
+def test_labels_with_a_byte_order_mark_and_quotes_are_read(tmp_path):
     text = '\ufeffsplit,clip,style\n\ntrain,walk,"a, ""b"""\n'
     (tmp_path / "labels.csv").write_text(text, encoding="utf-8")
     assert labels(tmp_path / "labels.csv")["train", "walk"].labels["style"] == 'a, "b"'
@@ -228,15 +228,15 @@ def test_labels_are_read_with_a_mark_of_their_encoding_and_quotes(tmp_path):
         (b"x" * 100_000 + b",a_y,a_z\n1,2,3\n", "expected a header of columns|column 1 is .* expected a name"),
     ],
 )
-def test_paths_that_are_none_are_told(tmp_path, content, message):
+def test_invalid_files_of_paths_are_an_error(tmp_path, content, message):
     (tmp_path / "paths.csv").write_bytes(content)
     with pytest.raises(ValueError, match=rf"paths\.csv: .*({message})"):
         read_paths(tmp_path / "paths.csv")
-    assert told(read_paths, tmp_path / "paths.csv")
+    assert error_message(read_paths, tmp_path / "paths.csv")
 
 
 @pytest.mark.parametrize("value", [np.inf, 1e300, -np.inf])
-def test_paths_of_an_archive_are_numbers_that_models_can_hold(tmp_path, value):
+def test_paths_of_an_archive_are_finite_in_float32(tmp_path, value):
     path = np.zeros((4, 3))
     path[1] = np.nan
     np.savez(tmp_path / "paths.npz", LWrist=path)
@@ -255,7 +255,7 @@ def write_path(path, columns, rows, blank=0):
 
 
 def lines_executed(function):
-    """Count the lines of Python that a call executes, which is the same on every machine."""
+    """Return the number of Python lines that a call executes, which is equal on all machines."""
     count = 0
 
     def trace(frame, event, argument):
@@ -273,14 +273,14 @@ def lines_executed(function):
 
 
 @pytest.mark.parametrize("size", [(300, 1, 0), (3, 200, 0), (3, 1, 200), (60, 60, 0)])
-def test_work_grows_in_proportion_to_a_file_of_paths(tmp_path, size):
+def test_work_is_linear_in_the_size_of_a_file_of_paths(tmp_path, size):
     path, (columns, rows, blank) = tmp_path / "paths.csv", size
     larger = (2 * columns, rows, blank) if columns > 3 else (columns, 2 * rows, 2 * blank)
     work = [lines_executed(lambda each=each: read_paths(write_path(path, *each))) for each in (size, larger)]
     assert work[1] < 2.1 * work[0]
 
 
-def test_empty_rows_count_as_numbers_of_every_column(tmp_path):
+def test_empty_rows_count_in_the_limit_of_numbers(tmp_path):
     path = write_path(tmp_path / "paths.csv", 60, 2, 100)
     with pytest.raises(ValueError, match="it has more than 6,000 numbers"):
         _read_columns(path, 6000)
@@ -310,10 +310,10 @@ edits = st.lists(
 
 
 def edited(content, changes):
-    """Some bytes taken out, and others put in."""
-    for place, cut, put in changes:
-        at = int(place * len(content))
-        content = content[:at] + put + content[at + cut :]
+    """Return the content with some bytes removed and others inserted."""
+    for place, cut, inserted in changes:
+        start = int(place * len(content))
+        content = content[:start] + inserted + content[start + cut :]
     return content
 
 
@@ -322,18 +322,18 @@ def read_skeleton(example, directory):
     path = directory / "skeleton.json"
     fields = {key: value for key, value in {**VALID, **changes}.items() if key not in removed}
     path.write_bytes(edited(json.dumps(fields).encode(), edits))
-    if told(Skeleton.from_json, path) is None:
-        read = Skeleton.from_json(path)
-        assert sorted(read.order) == list(range(read.joints))
-        assert len(read.edges) == read.joints - 1
-        read.to_json(directory / "again.json")
-        assert Skeleton.from_json(directory / "again.json") == read
-        assert read.find(read.names[0]) == 0
-        hash(read)
+    if error_message(Skeleton.from_json, path) is None:
+        skeleton_read = Skeleton.from_json(path)
+        assert sorted(skeleton_read.order) == list(range(skeleton_read.joints))
+        assert len(skeleton_read.edges) == skeleton_read.joints - 1
+        skeleton_read.to_json(directory / "again.json")
+        assert Skeleton.from_json(directory / "again.json") == skeleton_read
+        assert skeleton_read.find(skeleton_read.names[0]) == 0
+        hash(skeleton_read)
 
 
 @limited(OF_SKELETONS)
-def test_changed_skeletons_are_read_or_refused(tmp_path):
+def test_changed_skeletons_are_read_or_an_error(tmp_path):
     examples = st.tuples(changes, st.sets(st.sampled_from(list(VALID)), max_size=1), edits)
     with Isolated(read_skeleton, tmp_path) as isolated:
         fuzz(isolated, examples, OF_SKELETONS)
@@ -347,7 +347,7 @@ def read_table(example, directory):
         file.write(base)
         csv.writer(file).writerows(rows)
     path.write_bytes(edited(path.read_bytes(), edits))
-    told(read_paths if kind == "paths" else labels, path)
+    error_message(read_paths if kind == "paths" else labels, path)
 
 
 cells = st.sampled_from(["1", "-2.5", "", "nan", "inf", "1e300", "1_0", "x", '"', "\x00", "\r", "٣", "walk", "train"])
@@ -355,7 +355,7 @@ rows = st.lists(st.lists(cells, max_size=7), max_size=4)
 
 
 @limited(OF_TABLES)
-def test_changed_tables_are_read_or_refused(tmp_path):
+def test_changed_tables_are_read_or_an_error(tmp_path):
     examples = st.tuples(st.sampled_from(["paths", "labels"]), rows, edits)
     with Isolated(read_table, tmp_path) as isolated:
         fuzz(isolated, examples, OF_TABLES)

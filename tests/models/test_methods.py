@@ -1,4 +1,4 @@
-"""Every method keeps the contract of its factorizations; the registry finds it; it trains on real motion."""
+"""Every method satisfies the contract of its factorization, survives its configuration and trains on real motion."""
 
 import copy
 import json
@@ -60,7 +60,7 @@ class TestDKF(Contract):
     missing: ClassVar = {}
 
 
-class TestGatedTransitionThatReadsWhatIsGiven(FactorizationContract):
+class TestGatedTransitionWithCovariates(FactorizationContract):
     missing: ClassVar = {}
 
     def build(self, size):
@@ -109,14 +109,14 @@ class TestHiTDVAE(Contract):
     missing: ClassVar = {"z": ("z_{<t}",)}
 
 
-class TestHiTDVAEThatReadsItsPast(Contract):
+class TestHiTDVAEWithPastInTheGuide(Contract):
     name = "hit-dvae"
     options: ClassVar = {"guide_past": True, "nearest": False}
     missing: ClassVar = {}
 
 
 class TestStandardised(Contract):
-    """Networks without unit, in a loop and out of it; the distributions are those of the variable in its own."""
+    """Standardised variables, inside and outside of loops; distributions keep the unit of the variable."""
 
     name = "hit-dvae"
     options: ClassVar = {"residual": 0.7}
@@ -144,14 +144,14 @@ class TestEquationsWithAttention(Contract):
     }
 
 
-class TestHiTDVAEWithPosteriorsAsPrior(Contract):
+class TestHiTDVAEWithVampPrior(Contract):
     name = "hit-dvae"
     options: ClassVar = {"prior": "vamp", "prior_components": 3, "prior_steps": 4}
 
 
 class TestEquationsWithFlow(Contract):
     name = "equations"
-    waits = 21  # Pyro's splines look up by a mask what lies within their bounds
+    waits = 21  # Pyro's splines select values within their bounds by a mask
     options: ClassVar = {"generative": "p(w) p(x_t | x_{t-1}, w)", "inference": "q(w | x_{1:T})", "prior": "flow"}
 
 
@@ -165,13 +165,13 @@ class TestContext(FactorizationContract):
         )
 
 
-def test_every_method_is_held_to_the_contract():
+def test_every_latent_method_has_a_contract_test():
     family = {name for name, kind in dvae.methods().items() if issubclass(kind, LatentMethod)}
-    assert {cls.name for cls in Contract.__subclasses__()} == family == set(SMALL)  # others: see their own tests
+    assert {cls.name for cls in Contract.__subclasses__()} == family == set(SMALL)  # other methods have their own tests
 
 
 class Peeking(dvae.networks.Dense):
-    """Reads every parent at t, whatever its relation."""
+    """A network that reads every parent at t and ignores its relation."""
 
     def build(self, inputs, local, size):
         now = dvae.factorization.relations.Relation.parse("t")
@@ -185,14 +185,14 @@ class Broken(FactorizationContract):
         return dvae.DynamicalVAE(*pair, {"z": size, "x": size}, networks)
 
 
-def test_a_network_that_reads_what_it_should_not_breaks_the_contract():
+def test_reading_undeclared_parents_fails_the_contract():
     with pytest.raises(AssertionError, match="reads"):
         Broken().test_networks_read_the_declared_parents_and_nothing_else()
     with pytest.raises(AssertionError, match="joint differs by"):
         Broken().test_the_log_joint_is_that_of_the_per_step_program()
 
 
-# ---------------------------------------------------------------------------------- options that every method has
+# -------------------------------------------------------------------------------------- options of every method
 
 OPTIONS = [
     {"emission": "fixed"},
@@ -210,8 +210,8 @@ OPTIONS = [
 ]
 
 
-def refusal(name, option):
-    """The sentence with which a method's equations refuse an option, if they do."""
+def expected_error(name, option):
+    """Return the error of an option that the equations of a method do not support, or None."""
     generative = dvae.Factorization.parse(dvae.method(name).generative)
     if "prior" in option and all(factor.local for factor in generative.factors):
         return f"prior='{option['prior']}' needs a static latent without parents"
@@ -224,9 +224,9 @@ def refusal(name, option):
     ("name", "option"),
     [(name, option) for m, name in enumerate(SMALL) for n, option in enumerate(OPTIONS) if (m + n) % 4 == 0],
 )
-def test_a_method_takes_an_option_or_says_why_not(name, option):
+def test_a_method_trains_with_an_option_or_raises_the_expected_error(name, option):
     method = small(name, **{"warm_up": 2, "scheduled_sampling": 0.0, **option})
-    if expected := refusal(name, option):
+    if expected := expected_error(name, option):
         with pytest.raises(ValueError, match=expected):
             method.build({"x": 3})
         return
@@ -252,7 +252,7 @@ def test_a_method_takes_an_option_or_says_why_not(name, option):
         ),
     ],
 )
-def test_options_that_are_none(name, options, message):
+def test_invalid_options_are_an_error(name, options, message):
     with pytest.raises(ValueError, match=message):
         dvae.method(name, **options).build({"x": 3})
 
@@ -275,14 +275,16 @@ PUBLISHED = {  # parameters of the public implementation at its sizes for motion
 def test_the_default_networks_have_the_published_size(name):
     statics = {"static": 10} if name == "dsae" else {}
     model = dvae.method(name, latent=10, **statics).build({"x": 96})
-    scales = model.generator["x"].head.log_scale.numel()  # one a coordinate: the public code has no likelihood of x
+    scales = model.generator[
+        "x"
+    ].head.log_scale.numel()  # one for each coordinate: the public code has no likelihood of x
     assert sum(parameter.numel() for parameter in model.parameters()) - scales == PUBLISHED[name]
 
 
 @pytest.mark.parametrize("batch_and_steps", [(3, 6), (1, 1)])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("name", ["dkf", "vrnn", "srnn", "rvae-causal", "rvae-noncausal"])
-def test_the_fused_loop_of_a_guide_is_its_plain_loop(name, activation, batch_and_steps):
+def test_the_fused_loop_of_a_guide_equals_its_plain_loop(name, activation, batch_and_steps):
     model = small(name, 3).build({"x": 5}).double()
     for module in model.modules():
         for key, child in module.named_children():
@@ -295,17 +297,17 @@ def test_the_fused_loop_of_a_guide_is_its_plain_loop(name, activation, batch_and
     chain = model.encoder["z"].chain
     model.encoder["z"].chain = lambda *args: calls.append(chain(*args)) or calls[-1]
     x = torch.randn(*batch_and_steps, 5, dtype=torch.float64)
-    found = []
-    for each in (model, plain):
+    results = []
+    for variant in (model, plain):
         torch.manual_seed(1)
-        bound = dvae.SequenceELBO().terms(each, x).bound
-        found.append((bound, torch.autograd.grad(bound.sum(), list(each.parameters()), materialize_grads=True)))
+        bound = dvae.SequenceELBO().terms(variant, x).bound
+        results.append((bound, torch.autograd.grad(bound.sum(), list(variant.parameters()), materialize_grads=True)))
     assert calls[0] is not None
-    torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-10)
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-10)
 
 
 def later(values):
-    """Values one step later, 0 at the first."""
+    """Return the values shifted one step later, with 0 at the first."""
     return torch.cat([torch.zeros_like(values[:, :1]), values[:, :-1]], dim=1)
 
 
@@ -313,8 +315,8 @@ def backward(lstm, values):
     return lstm(values.flip(1))[0].flip(1)
 
 
-def test_the_networks_are_wired_as_in_the_papers():
-    """Features of the factors that share or stack states, written out from the same layers."""
+def test_networks_are_connected_as_in_the_papers():
+    """Features of factors with shared or stacked states are recomputed from the same layers."""
     x, z = (torch.randn(2, 6, size, dtype=torch.float64) for size in (5, 3))
     parents = {"x": x, "z": z}
 
@@ -345,8 +347,8 @@ def test_the_networks_are_wired_as_in_the_papers():
     (_, guide), model = networks("storn")
     torch.testing.assert_close(guide(parents, 6), guide.join([guide.past.layers[0](guide.extractors["x"](x))[0]]))
     decoder = model.generator["x"].network
-    read = torch.cat([later(decoder.extractors["x"](x)), decoder.extractors["z"](z)], -1)
-    torch.testing.assert_close(decoder(parents, 6), decoder.past.layers[0](read)[0])
+    inputs = torch.cat([later(decoder.extractors["x"](x)), decoder.extractors["z"](z)], -1)
+    torch.testing.assert_close(decoder(parents, 6), decoder.past.layers[0](inputs)[0])
 
     for name in ("rvae-causal", "rvae-noncausal"):
         (_, guide), model = networks(name)
@@ -363,7 +365,7 @@ def test_the_networks_are_wired_as_in_the_papers():
     torch.testing.assert_close(static({"x": x}, 6), expected)
 
 
-def test_the_documented_method_is_one_and_is_not_there_already():
+def test_the_example_method_of_the_docs_works_and_has_a_new_name():
     page = (DOCS / "methods.md").read_text()
     space = {}
     exec(compile(page.split("```\n")[1], "docs/methods.md", "exec", dont_inherit=True), space)
@@ -379,12 +381,12 @@ def test_the_documented_method_is_one_and_is_not_there_already():
 @pytest.mark.parametrize("name", SMALL)
 def test_a_method_survives_its_configuration(name):
     for method in (dvae.method(name), small(name)):
-        again = configured(json.loads(json.dumps(method.config())))
-        assert again == method
+        copy_of_method = configured(json.loads(json.dumps(method.config())))
+        assert copy_of_method == method
         torch.manual_seed(0)
         first = method.build({"x": 4}).state_dict()
         torch.manual_seed(0)
-        second = again.build({"x": 4}).state_dict()
+        second = copy_of_method.build({"x": 4}).state_dict()
         assert all(torch.equal(value, second[key]) for key, value in first.items())
 
 
@@ -397,7 +399,7 @@ def test_a_method_survives_its_configuration(name):
         (lambda: configured({"latent": 3}), "configuration has no key 'method'"),
     ],
 )
-def test_methods_that_are_not(run, message):
+def test_unknown_methods_and_options_are_an_error(run, message):
     with pytest.raises(ValueError, match=message):
         run()
 
@@ -406,19 +408,19 @@ NEEDS = r"missing 1 required positional argument|sizes missing for|needs the des
 
 
 @pytest.mark.parametrize("name", dvae.methods())
-def test_a_method_built_from_sizes_works_or_says_what_it_needs(name):
+def test_a_method_built_from_sizes_works_or_names_what_is_missing(name):
     for data in ([], [{}], [{"x": 7}]):
-        refusal = None
+        message = None
         try:
             model = dvae.method(name).build(*data)
             x = torch.randn(2, 4, model.sizes["x"])
             loss, future = dvae.SequenceELBO().loss(model, model.guide, x), model.forecast(x, 2)["x"]
         except (TypeError, ValueError) as error:
-            refusal = str(error)
-        assert math.isfinite(loss) and torch.isfinite(future).all() if refusal is None else re.search(NEEDS, refusal)
+            message = str(error)
+        assert math.isfinite(loss) and torch.isfinite(future).all() if message is None else re.search(NEEDS, message)
 
 
-def test_entry_points_add_methods_and_cannot_replace_any(monkeypatch):
+def test_entry_points_add_methods_but_cannot_replace_one(monkeypatch):
     def points(value, name):
         return lambda group: [EntryPoint(name, value, group)] if group == "dvae.methods" else []
 

@@ -1,4 +1,4 @@
-"""The graph convolutional generator: the transform against scipy, the layers against the published definition."""
+"""The graph convolutional generator equals its published definition, and its transform equals scipy's."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def parents(batch=3):
     return {name: torch.randn(shape, dtype=torch.float64) for name, shape in sizes.items()}
 
 
-def test_the_basis_is_scipys_orthonormal_transform():
+def test_the_basis_equals_scipys_orthonormal_transform():
     values = np.random.default_rng(0).normal(size=(7, 3))
     assert np.allclose(cosine_basis(7, 7).numpy() @ values, dct(values, axis=0, norm="ortho"), atol=1e-14, rtol=0)
     rows = cosine_basis(7, 4)
@@ -38,7 +38,7 @@ def test_the_basis_is_scipys_orthonormal_transform():
 
 
 def published(net, values):
-    """The card's definition, step by step: padded history, transformed, with the earlier part in its place."""
+    """Return the published output, step by step: padded history, transformed, with the earlier part inserted."""
     batch, C = len(values["b"]), net.spec.coefficients
     padded = values["h"].clone()
     padded[:, OBSERVED:] = padded[:, OBSERVED - 1 : OBSERVED]
@@ -69,13 +69,13 @@ def published(net, values):
     return time
 
 
-def test_the_network_is_the_published_one():
+def test_the_network_equals_its_published_definition():
     net, values = network().train(), parents()
     assert torch.allclose(net(values, LENGTH), published(net, values), atol=1e-10, rtol=0)
 
 
 def generator(**options):
-    """GSPS's form with a likelihood, for sequences that stand for parts and history at once."""
+    """Return GSPS's equations with a likelihood, for sequences that contain parts and history."""
     equations = "p(a) p(lower_t | h_{1:O}, a) p(upper_t | h_{1:O}, lower_{1:T}, a)"
     return dvae.DynamicalVAE(
         equations,
@@ -89,20 +89,20 @@ def generator(**options):
     ).double()
 
 
-def test_a_history_hides_what_its_data_hide():
+def test_missing_values_are_hidden_in_the_history_too():
     model, x = generator().eval(), torch.randn(3, LENGTH, 15, dtype=torch.float64)
-    seen = torch.rand(x.shape) < 0.7
+    mask = torch.rand(x.shape) < 0.7
     bounds = []
     for hidden in (0.0, 77.0, torch.nan):
         torch.manual_seed(0)
-        batch = {"x": torch.where(seen, x, hidden), "mask": seen}
+        batch = {"x": torch.where(mask, x, hidden), "mask": mask}
         bounds.append(dvae.SequenceELBO().terms(model, batch).bound)
     assert torch.isfinite(bounds[0]).all()
     assert torch.equal(bounds[0], bounds[1])
     assert torch.equal(bounds[0], bounds[2])
 
 
-def test_draws_come_in_one_order():
+def test_draws_of_latents_must_follow_the_order_of_the_guide():
     model = dvae.DynamicalVAE("p(a) p(b) p(x_t | a, b)", "q(b | x_{1:T}) q(a | b, x_{1:T})", {"a": 1, "b": 1, "x": 2})
     for draws in ({"a": 2, "b": 3}, {"b": 3}):
         with pytest.raises(ValueError, match="order"):

@@ -1,4 +1,4 @@
-"""Noise of a known scale: the likelihood is that of the scale that is given, whatever the networks."""
+"""Noise of a known scale: the likelihood has the given scale for any network."""
 
 import pytest
 import torch
@@ -17,8 +17,8 @@ class TestKnownNoise(FactorizationContract):
         return dvae.DynamicalVAE(*PAIR, dict.fromkeys("zxs", size), networks, {"p(x)": KnownNoise()})
 
     def _data(self, *args, **kwargs):
-        found = super()._data(*args, **kwargs)
-        return found | ({"s": found["s"].abs() + 0.1} if "s" in found else {})
+        values = super()._data(*args, **kwargs)
+        return values | ({"s": values["s"].abs() + 0.1} if "s" in values else {})
 
 
 def built():
@@ -36,7 +36,7 @@ def test_the_likelihood_has_the_given_noise():
     torch.testing.assert_close(model.log_joint({"x": x, "s": s}, {"z": z})["x"], expected)
 
 
-def test_scales_are_above_zero_where_there_is_a_step():
+def test_scales_of_observed_steps_must_be_positive():
     model = built()
     x, s = torch.randn(2, 4, 3).double(), torch.ones(2, 4, 3).double()
     s[1, 2:] = 0

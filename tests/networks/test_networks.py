@@ -1,4 +1,4 @@
-"""The contract of every network: masks are true, one step at a time is all steps at once, padding is unseen."""
+"""The contract of every network: masks hold, single steps equal all steps at once, and padding changes nothing."""
 
 import copy
 import itertools
@@ -69,7 +69,7 @@ def supports(kind, relation):
 
 
 def draw(inputs, batch, steps=T, dtype=torch.float64, lengths=None):
-    """Random parents, zero at padding."""
+    """Return random parents, with zeros at padding."""
     shapes = {p.name: (batch, p.size) if p.relation is None else (batch, steps, p.size) for p in inputs}
     values = {name: torch.randn(shape, dtype=dtype) for name, shape in shapes.items()}
     if lengths is not None:
@@ -79,11 +79,11 @@ def draw(inputs, batch, steps=T, dtype=torch.float64, lengths=None):
 
 
 def reads(network, parents, name):
-    """Which steps of a parent the features at each step depend on: (T, T), or (1, T) of a static child."""
+    """Return which steps of a parent the features of each step depend on: (T, T), or (1, T) for a static child."""
 
     def features(value):
         out = network({**parents, name: value}, T)
-        return (out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)).flatten()  # one number a step
+        return (out @ torch.linspace(1.0, 2.0, out.shape[-1], dtype=out.dtype)).flatten()  # one number for each step
 
     jacobian = torch.autograd.functional.jacobian(features, parents[name])
     return (jacobian != 0).any(-1)[:, 0].numpy()
@@ -97,7 +97,7 @@ EVERY = {text: Relation.parse(text) for text in RELATIONS} | COMPOSED | CUSTOM
 @pytest.mark.parametrize(
     ("kind", "relation"), [(k, r) for m, k in enumerate(NETWORKS) for n, r in enumerate(EVERY) if (m + n) % 6 == 0]
 )
-def test_features_depend_on_what_the_mask_shows_and_on_nothing_else(kind, relation):
+def test_features_depend_exactly_on_the_steps_of_the_mask(kind, relation):
     relation = EVERY[relation]
     if not supports(kind, relation):
         with pytest.raises(ValueError, match=r"use networks\.(Recurrent or networks\.)?Attention"):
@@ -124,7 +124,7 @@ def encoder_inputs(pair):
 
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("pair", ENCODERS)
-def test_an_encoder_obeys_its_masks_step_by_step_and_in_ragged_batches(pair, layers):
+def test_an_encoder_respects_its_masks_in_single_steps_and_ragged_batches(pair, layers):
     inputs, live = encoder_inputs(pair), ENCODERS[pair][1]
     network = SelfAttention(8, heads=4, layers=layers, extract={"x": NodeGraph(2)}).build(inputs, True, 2).double()
     parents = draw(inputs, 1)
@@ -137,45 +137,47 @@ def test_an_encoder_obeys_its_masks_step_by_step_and_in_ragged_batches(pair, lay
     for ragged in (None, lengths):
         parents = draw(inputs, 3, lengths=ragged)
         together = network(parents, T, ragged)
-        counted = torch.ones(3, T, 1) if ragged is None else (torch.arange(T) < lengths[:, None])[..., None]
-        alone = by_steps(network, parents, live, 1, ragged)
-        torch.testing.assert_close(alone * counted, together * counted, rtol=0, atol=1e-10)
+        is_step = torch.ones(3, T, 1) if ragged is None else (torch.arange(T) < lengths[:, None])[..., None]
+        stepwise = by_steps(network, parents, live, 1, ragged)
+        torch.testing.assert_close(stepwise * is_step, together * is_step, rtol=0, atol=1e-10)
     for i, n in enumerate(lengths.tolist()):
         single = network({k: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for k, v in parents.items()}, n)
         torch.testing.assert_close(together[i : i + 1, :n], single, rtol=0, atol=1e-10)
 
 
-def test_attention_can_be_looked_at():
-    """Shares sum to one, nothing hidden has one, and the values they mix are what the layers go on with."""
+def test_attention_weights_are_those_of_the_layers():
+    """Weights sum to one and are zero at hidden steps, and the layers use the values that they mix."""
     inputs = [Input("z", 2, Relation.parse("<t")), Input("x", 3, Relation.parse("1:T")), Input("w", 2)]
     network = Attention(8, heads=2, layers=2, extract={"x": NodeGraph(2)}).build(inputs, True, 2).double()
     parents = draw(inputs, 3)
-    mixed = []
+    outputs = []
     for layer in network.layers:
-        layer.out.register_forward_pre_hook(lambda _, given: mixed.append(given[0]))
+        layer.out.register_forward_pre_hook(lambda _, arguments: outputs.append(arguments[0]))
     network(parents, T)
-    found = network.attention(parents, T)
+    attention = network.attention(parents, T)
     values = network.extractors.of(parents, None)
     tokens, _ = network.tokens(network.ranged, values, 3, T, None)
     hidden = ~torch.cat([torch.ones(T, 1, dtype=torch.bool), torch.tril(torch.ones(T, T), -1).bool()], 1)
-    for layer, shares, seen in zip(network.layers, found, mixed, strict=False):
-        torch.testing.assert_close(shares.sum(-1), torch.ones(3, 2, T, dtype=torch.float64))
-        assert (shares[..., : T + 1].masked_select(hidden) == 0).all()
-        torch.testing.assert_close((shares @ layer.project(tokens)[1]).transpose(1, 2).flatten(2), seen)
+    for layer, weights, output in zip(network.layers, attention, outputs, strict=False):
+        torch.testing.assert_close(weights.sum(-1), torch.ones(3, 2, T, dtype=torch.float64))
+        assert (weights[..., : T + 1].masked_select(hidden) == 0).all()
+        torch.testing.assert_close((weights @ layer.project(tokens)[1]).transpose(1, 2).flatten(2), output)
 
 
 @pytest.mark.parametrize("steps", [1, 6])
-def test_a_frame_graph_reads_the_first_frames_and_in_training_a_window_anywhere(steps):
+def test_a_frame_graph_reads_the_first_frames_and_random_windows_in_training(steps):
     network = FrameGraph(4, width=5, blocks=2, extract={"x": NodeGraph(2)})
     network = network.build([Input("x", 3, Relation.parse("1:T"))], False, 2).double()
     x = torch.randn(64, steps, 3, dtype=torch.float64)
-    read = torch.autograd.functional.jacobian(lambda x: network.eval()({"x": x}, steps), x[:1])[0, :, 0]
-    assert read.abs().amax((0, 2)).bool().tolist() == [t < 4 for t in range(steps)]
+    jacobian = torch.autograd.functional.jacobian(lambda x: network.eval()({"x": x}, steps), x[:1])[0, :, 0]
+    assert jacobian.abs().amax((0, 2)).bool().tolist() == [t < 4 for t in range(steps)]
     starts = {s: network.eval()({"x": x[:, s:]}, steps - s) for s in range(max(1, steps - 3))}
     trained = network.train()({"x": x}, steps)
-    chosen = [{s for s, found in starts.items() if torch.equal(found[i], row)} for i, row in enumerate(trained)]
-    assert set.union(*chosen) == set(starts)
-    assert all(chosen)
+    matching_starts = [
+        {s for s, features in starts.items() if torch.equal(features[i], row)} for i, row in enumerate(trained)
+    ]
+    assert set.union(*matching_starts) == set(starts)
+    assert all(matching_starts)
     lengths = torch.randint(1, steps + 1, (64,))
     ragged = network.eval()({"x": x}, steps, lengths)
     for i, n in enumerate(lengths.tolist()):
@@ -183,13 +185,13 @@ def test_a_frame_graph_reads_the_first_frames_and_in_training_a_window_anywhere(
 
 
 @pytest.mark.parametrize(("size", "features"), [(6, 4)])
-def test_node_features_are_the_published_convolutions_frame_by_frame(size, features):
+def test_node_features_equal_the_published_convolutions_of_each_frame(size, features):
     module = NodeGraph(2, coordinates=3).build(size).double()
     poses = torch.randn(3, 5, size, dtype=torch.float64)
 
     def convolution(layer, nodes):
-        mixed = torch.einsum("ij,...jf,of->...io", layer.adjacency, nodes, layer.weight)
-        return torch.tanh(mixed + layer.bias)
+        products = torch.einsum("ij,...jf,of->...io", layer.adjacency, nodes, layer.weight)
+        return torch.tanh(products + layer.bias)
 
     nodes = convolution(module.first, poses.unflatten(-1, (features // 2, -1)))
     for block in module.blocks:
@@ -206,19 +208,19 @@ SPLITS = [set(split) for n in range(1, 4) for split in itertools.combinations("z
 
 
 def by_steps(network, parents, live, direction, lengths=None):
-    """Features from `start` and `step`. A value that the loop has not drawn yet is None, and so cannot be read."""
+    """Return the features by `start` and `step`. Values that are not drawn yet are None, so reading them fails."""
     batch, steps = parents["x"].shape[:2]
-    given = {name: value for name, value in parents.items() if name not in live}
-    state = network.start(given, batch, steps, lengths)
-    drawn = {name: [None] * steps for name in live}
+    fixed = {name: value for name, value in parents.items() if name not in live}
+    state = network.start(fixed, batch, steps, lengths)
+    draws = {name: [None] * steps for name in live}
     now = [p.name for p in network.inputs if p.name in live and p.relation.mask(1)[0, 0]]
     features = [None] * steps
     for t in range(steps)[::direction]:
         for name in now:
-            drawn[name][t] = parents[name][:, t]
-        features[t], state = network.step(state, t, drawn)
+            draws[name][t] = parents[name][:, t]
+        features[t], state = network.step(state, t, draws)
         for name in live - set(now):
-            drawn[name][t] = parents[name][:, t]
+            draws[name][t] = parents[name][:, t]
     return torch.stack(features, 1)
 
 
@@ -236,19 +238,19 @@ def loop_inputs(kind, direction):
 
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("kind", NETWORKS)
-def test_steps_agree_with_all_at_once(kind, direction):
+def test_single_steps_equal_all_steps_at_once(kind, direction):
     inputs = loop_inputs(kind, direction)
     network = build(kind, inputs)
     lengths = torch.tensor([T, 1, 4])
     for ragged in (None, lengths):
         parents = draw(inputs, 3, lengths=ragged)
         together = network(parents, T, ragged)
-        counted = torch.ones(3, T, 1) if ragged is None else (torch.arange(T) < lengths[:, None])[..., None]
+        is_step = torch.ones(3, T, 1) if ragged is None else (torch.arange(T) < lengths[:, None])[..., None]
         for live in SPLITS:
             for grad in (True, False):
                 with torch.set_grad_enabled(grad):
-                    alone = by_steps(network, parents, live, direction, ragged)
-                torch.testing.assert_close(alone * counted, together * counted, rtol=0, atol=1e-10)
+                    stepwise = by_steps(network, parents, live, direction, ragged)
+                torch.testing.assert_close(stepwise * is_step, together * is_step, rtol=0, atol=1e-10)
 
 
 # ---------------------------------------------------------------------------------------------------- padding
@@ -263,8 +265,8 @@ def test_padding_changes_nothing(kind):
     parents = draw(inputs, 3, lengths=lengths)
     padded = network(parents, T, lengths)
     for i, n in enumerate(lengths.tolist()):
-        alone = network({name: v[i : i + 1, :n] for name, v in parents.items()}, n)
-        torch.testing.assert_close(padded[i : i + 1, :n], alone, rtol=0, atol=1e-10)
+        single = network({name: v[i : i + 1, :n] for name, v in parents.items()}, n)
+        torch.testing.assert_close(padded[i : i + 1, :n], single, rtol=0, atol=1e-10)
 
 
 # ------------------------------------------------------------------------------------------------ shared work
@@ -277,10 +279,10 @@ def recurrent_pair():
     return first, second, draw(second.inputs, 3)
 
 
-def test_a_tied_past_is_evaluated_once_and_learns_from_every_use():
+def test_a_tied_past_is_evaluated_once_and_has_the_gradients_of_all_uses():
     first, second, parents = recurrent_pair()
     tie(first, second)
-    untied = copy.deepcopy(second)  # has a copy of the memory
+    untied = copy.deepcopy(second)  # this one copies the memory
     calls = []
     first.past.layers[0].register_forward_hook(lambda *_: calls.append(1))
 
@@ -289,18 +291,20 @@ def test_a_tied_past_is_evaluated_once_and_learns_from_every_use():
 
     memory = list(first.past.parameters())
     with memoizing():
-        together = torch.autograd.grad(outputs(second), memory)
+        gradients = torch.autograd.grad(outputs(second), memory)
     assert len(calls) == 1
-    apart = outputs(untied)
+    untied_output = outputs(untied)
     assert len(calls) == 2
     copied = list(untied.past.parameters())
     expected = [
         a + b
         for a, b in zip(
-            torch.autograd.grad(apart, memory, retain_graph=True), torch.autograd.grad(apart, copied), strict=True
+            torch.autograd.grad(untied_output, memory, retain_graph=True),
+            torch.autograd.grad(untied_output, copied),
+            strict=True,
         )
     ]
-    torch.testing.assert_close(together, tuple(expected), rtol=0, atol=1e-12)
+    torch.testing.assert_close(gradients, tuple(expected), rtol=0, atol=1e-12)
 
 
 @given(steps=st.integers(1, 6), lag=st.integers(-8, 8))

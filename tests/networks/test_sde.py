@@ -1,4 +1,4 @@
-"""The linear SDE: its transitions are those of the equation, over the shortest and the longest gaps."""
+"""The linear SDE: its transitions solve the equation, over the shortest and the longest gaps."""
 
 import math
 from itertools import pairwise
@@ -27,9 +27,9 @@ def double(*shape):
 
 
 def stable(size=4):
-    """Some stable A and L L', in no particular coordinates."""
-    turning, root = double(size, size), double(size, size)
-    return turning - turning.mT - 0.2 * root @ root.mT - 0.05 * torch.eye(size), double(size, size - 1)
+    """Return a random stable A and the factor L of its noise."""
+    skew, root = double(size, size), double(size, size)
+    return skew - skew.mT - 0.2 * root @ root.mT - 0.05 * torch.eye(size), double(size, size - 1)
 
 
 def network(size=3, dtype=torch.float64):
@@ -39,35 +39,35 @@ def network(size=3, dtype=torch.float64):
 
 def model(guide=PAIR[1], scale=0.3):
     networks = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense(()), "q": Recurrent(4)}
-    given = {"p(z)": distributions.Triangular(), "p(x)": distributions.FixedNormal(scale)}
-    return DynamicalVAE(PAIR[0], guide, {"z": 2, "x": 3, "d": 1}, networks, given).double()
+    heads = {"p(z)": distributions.Triangular(), "p(x)": distributions.FixedNormal(scale)}
+    return DynamicalVAE(PAIR[0], guide, {"z": 2, "x": 3, "d": 1}, networks, heads).double()
 
 
 # ------------------------------------------------------------------------------------------------- the transition
 
 
-def test_it_is_the_exponential_and_the_integral():
+def test_a_transition_is_the_matrix_exponential_and_the_noise_integral():
     drift, root = stable()
     noise, gaps = root @ root.mT, torch.tensor(GAPS[:-1], dtype=torch.float64)
     matrix = drift.numpy()
     size = len(matrix)
-    for gap, moved, spread in zip(GAPS[:-1], *transition(drift, noise, gaps), strict=True):
-        np.testing.assert_allclose(moved, linalg.expm(matrix * gap), rtol=1e-8, atol=1e-12)
+    for gap, decay, spread in zip(GAPS[:-1], *transition(drift, noise, gaps), strict=True):
+        np.testing.assert_allclose(decay, linalg.expm(matrix * gap), rtol=1e-8, atol=1e-12)
 
         def rate(s):
-            moved = linalg.expm(matrix * s)
-            return moved @ noise.numpy() @ moved.T
+            decay = linalg.expm(matrix * s)
+            return decay @ noise.numpy() @ decay.T
 
         pieces = np.linspace(0, gap, 1 + math.ceil(gap))
-        summed = sum(integrate.quad_vec(rate, a, b, epsabs=1e-13)[0] for a, b in pairwise(pieces))
-        np.testing.assert_allclose(spread, summed, rtol=1e-8, atol=1e-8 * spread.abs().max().item())
-        if gap <= 3:  # Van Loan's exponential of both holds e^{-A d} too
-            both = linalg.expm(np.block([[-matrix, noise.numpy()], [np.zeros((size, size)), matrix.T]]) * gap)
-            together = both[size:, size:].T @ both[:size, size:]
-            np.testing.assert_allclose(spread, together, rtol=1e-8, atol=1e-8 * spread.abs().max().item())
+        integral = sum(integrate.quad_vec(rate, a, b, epsabs=1e-13)[0] for a, b in pairwise(pieces))
+        np.testing.assert_allclose(spread, integral, rtol=1e-8, atol=1e-8 * spread.abs().max().item())
+        if gap <= 3:  # Van Loan's exponential contains e^{-A d}, which overflows over long gaps
+            exponential = linalg.expm(np.block([[-matrix, noise.numpy()], [np.zeros((size, size)), matrix.T]]) * gap)
+            van_loan = exponential[size:, size:].T @ exponential[:size, size:]
+            np.testing.assert_allclose(spread, van_loan, rtol=1e-8, atol=1e-8 * spread.abs().max().item())
 
 
-def test_its_gradient_is_that_of_finite_differences():
+def test_its_gradient_equals_finite_differences():
     gaps = torch.tensor([1e-4, 0.3, 2.0, 30.0], dtype=torch.float64)
     drift, root = stable(3)
     assert gradcheck(lambda a, r: transition(a, r @ r.mT, gaps), [drift.requires_grad_(), root.requires_grad_()])
@@ -78,32 +78,32 @@ def test_its_gradient_is_that_of_finite_differences():
 
 
 @pytest.mark.parametrize("size", [1, 8])
-def test_single_precision_holds_from_the_shortest_gaps_to_the_longest(size):
-    """Whether its coordinates forget at once or hardly ever: a covariance has a root, and both have their digits."""
+def test_float32_is_accurate_from_the_shortest_to_the_longest_gaps(size):
+    """Coordinates decay at once or hardly at all; in both cases covariances have accurate Cholesky factors."""
     inputs = [Input("z", size, Relation.parse("t-1")), Input("d", 1, Relation.parse("t"))]
     exact = LinearSDE((0.1, 1000.0)).build(inputs, True, size).equation.double()
     with torch.no_grad():
         exact.turning.mul_(3)
-    rough = LinearSDE().build(inputs, True, size).equation
-    rough.load_state_dict(exact.state_dict())
+    single = LinearSDE().build(inputs, True, size).equation
+    single.load_state_dict(exact.state_dict())
     gaps = 10.0 ** torch.arange(-8, 9)
-    there = torch.ones(len(gaps), dtype=torch.bool)
-    decay, whitening = (part[0] for part in rough.over(gaps[None], there[None], "d"))
-    expected, root = (part[0] for part in exact.over(gaps[None].double(), there[None], "d"))
+    is_present = torch.ones(len(gaps), dtype=torch.bool)
+    decay, whitening = (part[0] for part in single.over(gaps[None], is_present[None], "d"))
+    expected, root = (part[0] for part in exact.over(gaps[None].double(), is_present[None], "d"))
     torch.testing.assert_close(decay.double(), expected, rtol=0, atol=2e-6)
-    # of what the exact distribution makes white, so that a direction of little noise counts as any other
+    # compared after whitening by the exact distribution, so directions of little noise count equally
     white = whitening.double() @ torch.linalg.inv(root)
     torch.testing.assert_close(white, torch.eye(size).double().expand_as(white), rtol=0, atol=1e-5)
     assert decay[-1].abs().max() < 1e-6
     torch.testing.assert_close(whitening[-1], torch.eye(size), rtol=0, atol=1e-5)
     whitening.log1p().sum().backward()
-    assert all(p.grad.isfinite().all() for p in rough.parameters())
+    assert all(p.grad.isfinite().all() for p in single.parameters())
 
 
 # ---------------------------------------------------------------------------------------------------- as a network
 
 
-def test_steps_without_a_gap_are_refused():
+def test_steps_without_a_positive_gap_are_an_error():
     d = torch.rand(2, 5, 1, dtype=torch.float64) + 0.1
     d[1, 2:] = 0
     with pytest.raises(ValueError, match="sequence"):
@@ -114,7 +114,7 @@ def test_steps_without_a_gap_are_refused():
 
 
 class TestModel(FactorizationContract):
-    """All distributions of the engine; gaps are positive, and that of the first step is read by no transition."""
+    """The contract. Gaps are positive, and no transition reads the first one."""
 
     missing: ClassVar = {}
     networks: ClassVar = {"p(z)": LinearSDE((0.5, 8.0)), "p(x)": Dense((4,)), "q": Recurrent(4)}
@@ -128,39 +128,39 @@ class TestModel(FactorizationContract):
         return {**data, "d": data["d"].exp()}
 
     def _reads(self, conditional, values, name):
-        read = super()._reads(conditional, values, name)
+        mask = super()._reads(conditional, values, name)
         if name == "d" and conditional.factor.kind == "p":
-            assert not read[0].any()
-            read[0, 0] = True
-        return read
+            assert not mask[0].any()
+            mask[0, 0] = True
+        return mask
 
 
 class TestShared(TestModel):
-    """With a guide that has a transition too, which is the prior's own."""
+    """The guide shares the transition of the prior."""
 
     networks: ClassVar = {**TestModel.networks, "q": LinearSDEGuide(Recurrent(4), (0.5, 8.0))}
     given: ClassVar = {"p(z)": distributions.Triangular(), "q": distributions.Triangular()}
 
     def build(self, size):
-        built = super().build(size)
-        share_modules([built.generator["z"].network, built.encoder["z"].network], "equation")
-        return built
+        shared_model = super().build(size)
+        share_modules([shared_model.generator["z"].network, shared_model.encoder["z"].network], "equation")
+        return shared_model
 
 
-def kernel(built, times):
-    """Covariance (T D, T D) of the stationary solution at these times (T,)."""
-    sde = built.generator["z"].network.equation
+def kernel(sde_model, times):
+    """Return the covariance (T D, T D) of the stationary solution at some times (T,)."""
+    sde = sde_model.generator["z"].network.equation
     size, steps = len(sde.drift), len(times)
-    found = torch.zeros(steps, size, steps, size, dtype=torch.float64)
+    covariance = torch.zeros(steps, size, steps, size, dtype=torch.float64)
     for t in range(steps):
         for s in range(t + 1):
-            moved = torch.as_tensor(linalg.expm((sde.drift.detach() * (times[t] - times[s])).numpy()))
-            found[t, :, s], found[s, :, t] = moved, moved.mT
-    return found.view(steps * size, -1)
+            decay = torch.as_tensor(linalg.expm((sde.drift.detach() * (times[t] - times[s])).numpy()))
+            covariance[t, :, s], covariance[s, :, t] = decay, decay.mT
+    return covariance.view(steps * size, -1)
 
 
 def gaps_of(times, n=1):
-    """(n, T, 1)."""
+    """Return the gaps (n, T, 1) between times (T,)."""
     return times.diff(prepend=times[:1])[None, :, None].expand(n, -1, -1)
 
 
@@ -168,25 +168,25 @@ def irregular(steps=7):
     return torch.cumsum(torch.rand(steps, dtype=torch.float64) * 10.0 ** torch.randint(-2, 2, (steps,)), 0)
 
 
-def test_the_log_joint_is_that_of_the_equation_s_kernel():
-    built, times, z, x = model(), irregular(), double(1, 7, 2), double(1, 7, 3)
-    found = built.log_joint({"x": x, "d": gaps_of(times)}, {"z": z})["z"]
-    distribution = MultivariateNormal(torch.zeros(14).double(), kernel(built, times))
-    assert found.item() == pytest.approx(distribution.log_prob(z.flatten()).item(), abs=1e-8)
+def test_the_log_joint_is_the_density_of_the_stationary_kernel():
+    sde_model, times, z, x = model(), irregular(), double(1, 7, 2), double(1, 7, 3)
+    log_density = sde_model.log_joint({"x": x, "d": gaps_of(times)}, {"z": z})["z"]
+    distribution = MultivariateNormal(torch.zeros(14).double(), kernel(sde_model, times))
+    assert log_density.item() == pytest.approx(distribution.log_prob(z.flatten()).item(), abs=1e-8)
 
 
-def test_a_forecast_goes_over_the_gaps_that_it_is_given():
-    built, x, d = model(), double(3, 5, 3), torch.ones(3, 7, 1).double()
+def test_a_forecast_uses_the_given_gaps():
+    sde_model, x, d = model(), double(3, 5, 3), torch.ones(3, 7, 1).double()
     d[:, 5], d[:, 6] = 1e-8, 1e6
-    z = built.forecast({"x": x, "d": d}, horizon=2, samples=2000)["z"]
-    torch.testing.assert_close(z[:, :, 5], z[:, :, 4], rtol=0, atol=2e-3)  # nothing happens in no time
+    z = sde_model.forecast({"x": x, "d": d}, horizon=2, samples=2000)["z"]
+    torch.testing.assert_close(z[:, :, 5], z[:, :, 4], rtol=0, atol=2e-3)  # nothing changes over a gap of almost zero
     assert z[:, :, 6].mean(0).abs().max() < 5 / 2000**0.5
     assert (z[:, :, 6].var(0) - 1).abs().max() < 5 * (2 / 2000) ** 0.5
     with pytest.raises(ValueError, match="expected 7 steps"):
-        built.forecast({"x": x, "d": d[:, :5]}, horizon=2)
+        sde_model.forecast({"x": x, "d": d[:, :5]}, horizon=2)
 
 
-# ----------------------------------------------------------------------------------------------------- of the guide
+# -------------------------------------------------------------------------------------------------------- the guide
 
 
 def guide(**options):
@@ -196,23 +196,25 @@ def guide(**options):
         Input("y", 2, Relation.parse("<=t")),
         Input("d", 1, Relation.parse("<=t")),
     ]
-    built = LinearSDEGuide(Recurrent(4, hidden=(5,)), (0.5, 8.0), **options).build(inputs, True, 3).double()
+    network = LinearSDEGuide(Recurrent(4, hidden=(5,)), (0.5, 8.0), **options).build(inputs, True, 3).double()
     with torch.no_grad():
-        built.out.weight.add_(0.2 * torch.randn_like(built.out.weight))
-    return built
+        network.out.weight.add_(0.2 * torch.randn_like(network.out.weight))
+    return network
 
 
-@pytest.mark.parametrize("given", ["xyd", "x"])
-def test_one_step_at_a_time_is_all_steps_at_once_in_the_guide(given):
+@pytest.mark.parametrize("given_names", ["xyd", "x"])
+def test_single_steps_of_the_guide_equal_all_steps_at_once(given_names):
     sde = guide()
     values = {name: double(4, 6, parent.size) for name, parent in zip("zxyd", sde.inputs, strict=True)}
     values["d"] = values["d"].exp()
     expected, rows = sde(values, 6), torch.tensor([2, 2, 0])
-    known = {name: values[name] for name in given}
-    state, moved = sde.start(known, 4, 6), sde.select(sde.start(known, 4, 6), rows)
-    drawn = {name: values[name].unbind(1) for name in values if name not in given}
+    given_values = {name: values[name] for name in given_names}
+    state, selected = sde.start(given_values, 4, 6), sde.select(sde.start(given_values, 4, 6), rows)
+    draws = {name: values[name].unbind(1) for name in values if name not in given_names}
     for t in range(6):
-        features, state = sde.step(state, t, drawn)
+        features, state = sde.step(state, t, draws)
         torch.testing.assert_close(features, expected[:, t], rtol=1e-10, atol=1e-10)
-        chosen, moved = sde.step(moved, t, {name: [v[rows] for v in value] for name, value in drawn.items()})
-        torch.testing.assert_close(chosen, features[rows])
+        selected_features, selected = sde.step(
+            selected, t, {name: [v[rows] for v in value] for name, value in draws.items()}
+        )
+        torch.testing.assert_close(selected_features, features[rows])

@@ -1,4 +1,4 @@
-"""Perceptrons over whole sequences: properties of every model, shared evaluations, refused settings."""
+"""Perceptrons over whole sequences: their contract, shared evaluations and errors."""
 
 import pytest
 import torch
@@ -15,12 +15,12 @@ NAMES = ("a", "b", "c")
 
 def build(size, inference="q(z | a_{1:T}, b_{1:T}, c_{1:T})", length=10):
     sizes = dict.fromkeys(NAMES, size)
-    made = {f"p({name})": WholeDecoder(length, (8,), "tanh", sizes=sizes, name=name) for name in NAMES}
+    networks = {f"p({name})": WholeDecoder(length, (8,), "tanh", sizes=sizes, name=name) for name in NAMES}
     model = dvae.DynamicalVAE(
         "p(z) p(a_t | z, s) p(b_t | z, s) p(c_t | z, s)",
         inference,
         {**sizes, "z": 3, "s": 2},
-        network={**made, "q(z)": WholeEncoder(length, (8,), "tanh")},
+        network={**networks, "q(z)": WholeEncoder(length, (8,), "tanh")},
         distributions={f"p({name})": FixedNormal(0.1, project=False) for name in NAMES},
         observed=NAMES,
     )
@@ -33,7 +33,7 @@ class TestWhole(FactorizationContract):
         return build(size)
 
 
-def test_all_that_is_made_of_one_latent_is_made_once():
+def test_a_shared_trunk_is_evaluated_once_for_a_latent():
     model, calls = build(2), []
     model.generator["a"].network.trunk.register_forward_hook(lambda *_: calls.append(1))
     data = {**{name: torch.randn(4, 10, 2) for name in NAMES}, "s": torch.randn(4, 2)}
@@ -43,7 +43,7 @@ def test_all_that_is_made_of_one_latent_is_made_once():
     assert model.generator["b"].network.trunk is model.generator["a"].network.trunk
 
 
-def test_longer_sequences_than_it_is_made_for_are_refused():
+def test_sequences_longer_than_the_network_are_an_error():
     model = build(2, length=5)
     data = {**{name: torch.randn(4, 6, 2) for name in NAMES}, "s": torch.randn(4, 2)}
     with pytest.raises(ValueError, match="steps"):

@@ -1,4 +1,4 @@
-"""Discrete latents, summed out: the sum is that over every course of the states, and what follows from it."""
+"""Discrete latents are summed out over all state sequences; bounds, forecasts, oracle and audits follow."""
 
 import math
 from typing import ClassVar
@@ -45,20 +45,20 @@ def data_of(model, batch=BATCH, steps=STEPS):
 
 
 def joints(model, data, latents):
-    """(C, B) the log joint of every course of the states, by the program that runs step by step."""
-    courses = model.sums.state_sequences(STEPS)
-    found = []
-    for place in range(len(next(iter(courses.values())))):
-        told = {name: value[place].expand(BATCH, *value[place].shape) for name, value in courses.items()}
+    """Return the log joint (C, B) of every state sequence, by the per-step program."""
+    state_sequences = model.sums.state_sequences(STEPS)
+    log_joints = []
+    for index in range(len(next(iter(state_sequences.values())))):
+        states = {name: value[index].expand(BATCH, *value[index].shape) for name, value in state_sequences.items()}
         sites = {}
-        for name, value in (latents | told).items():
+        for name, value in (latents | states).items():
             steps = {f"{name}_{t + 1}": v for t, v in enumerate(value.unbind(1))}
             sites |= {name: value} if value.dim() == 2 else steps
         with torch.no_grad():
             trace = poutine.trace(poutine.condition(reference, data=sites)).get_trace(model, data)
             trace.compute_log_prob(site_filter=lambda name, site: name != "sequences")
-        found.append(sum(s["log_prob"] for s in trace.nodes.values() if "log_prob" in s))
-    return torch.stack(found)
+        log_joints.append(sum(s["log_prob"] for s in trace.nodes.values() if "log_prob" in s))
+    return torch.stack(log_joints)
 
 
 class TestSwitching(FactorizationContract):
@@ -72,7 +72,7 @@ class TestSwitching(FactorizationContract):
 
 
 class TestMixture(FactorizationContract):
-    """A state of the sequence, of which a static latent and the data are told."""
+    """A state of the sequence, read by a static latent and the data."""
 
     def build(self, size):
         equations = "p(m) p(w | m) p(x_t | m, w)", "q(w | x_{1:T})"
@@ -80,25 +80,25 @@ class TestMixture(FactorizationContract):
 
 
 @pytest.mark.parametrize(("equations", "states"), CASES, ids=[equations[0] for equations, _ in CASES])
-def test_the_sum_is_that_over_all_courses(equations, states):
+def test_the_sum_is_over_all_state_sequences(equations, states):
     model = build(equations, states)
     data = data_of(model)
     latents = model.guide(data)
-    every = joints(model, data, latents)
+    log_joints = joints(model, data, latents)
     summed = torch.stack(list(model.log_joint(data, latents).values())).sum(0)
-    torch.testing.assert_close(summed, every.logsumexp(0), rtol=0, atol=1e-10)
-    posterior = every.softmax(0)
-    courses, run = model.sums.state_sequences(STEPS), model.rollout(data)
+    torch.testing.assert_close(summed, log_joints.logsumexp(0), rtol=0, atol=1e-10)
+    posterior = log_joints.softmax(0)
+    state_sequences, run = model.sums.state_sequences(STEPS), model.rollout(data)
     run.values.update(latents)
-    for name, found in run.summation.probabilities().items():
+    for name, probabilities in run.summation.probabilities().items():
         torch.testing.assert_close(
-            found, torch.einsum("cb,c...->b...", posterior, courses[name]), rtol=0, atol=1e-10, msg=name
+            probabilities, torch.einsum("cb,c...->b...", posterior, state_sequences[name]), rtol=0, atol=1e-10, msg=name
         )
-        assert found.shape == (BATCH, *([STEPS] * model.generative.local(name)), states[name])
+        assert probabilities.shape == (BATCH, *([STEPS] * model.generative.local(name)), states[name])
 
 
 def test_every_bound_agrees():
-    """Pyro's own, and that of terms, whose shares are of data given what came before them."""
+    """Pyro's bound equals the one of terms. The terms of a step are conditional on the past."""
     model = build(SWITCHING, {"k": 3})
     data = data_of(model)
     pyro.set_rng_seed(1)
@@ -109,14 +109,14 @@ def test_every_bound_agrees():
     assert terms.steps["x"].shape == terms.steps["z"].shape == (BATCH, STEPS)
     hmm = build(HMM, {"k": 3})
     data = data_of(hmm)
-    whole = dvae.SequenceELBO().terms(hmm, data).steps["x"]
+    all_steps = dvae.SequenceELBO().terms(hmm, data).steps["x"]
     past = dvae.SequenceELBO().terms(hmm, {"x": data["x"][:, :2]}).steps["x"]
-    torch.testing.assert_close(whole[:, :2], past)
+    torch.testing.assert_close(all_steps[:, :2], past)
     assert torch.equal(dvae.iwae_bound(hmm, data, 3).bound, dvae.iwae_bound(hmm, data, 3).bound)
 
 
-def test_a_forecast_goes_on_from_the_states_of_the_past():
-    """Of a chain that stays where it is, and of data that tell its state."""
+def test_a_forecast_continues_from_the_states_of_the_past():
+    """The states of the chain are constant, and the data determine them."""
     model = build(HMM, {"k": 2}, network=Dense(()))
     with torch.no_grad():
         for name, parameter in model.generator.named_parameters():
@@ -126,18 +126,18 @@ def test_a_forecast_goes_on_from_the_states_of_the_past():
             if name == "x.head.out.weight":
                 parameter[0] = torch.tensor([-8.0, 8.0])
     past = torch.tensor([[-8.0], [8.0]])[:, None].expand(-1, 4, 2).double()
-    found = model.forecast(past, 5, 50)
-    assert (found["k"][:, 0, :, 0] == 1).all()
-    assert (found["k"][:, 1, :, 1] == 1).all()
-    assert (found["x"][..., 0].sign() == torch.tensor([-1.0, 1.0])[:, None]).all()
+    forecast = model.forecast(past, 5, 50)
+    assert (forecast["k"][:, 0, :, 0] == 1).all()
+    assert (forecast["k"][:, 1, :, 1] == 1).all()
+    assert (forecast["x"][..., 0].sign() == torch.tensor([-1.0, 1.0])[:, None]).all()
     assert model.states(past)["k"][0, 0, :, 0] == pytest.approx(torch.ones(4).double())
     assert (model.reconstruct(past)["x"][0, :, :, 0].sign() == torch.tensor([-1.0, 1.0])[:, None]).all()
     static = build(("p(m) p(x_t | m)", ""), {"m": 2}, network=Dense(()))
     assert (static.forecast(past, 2, 7)["m"].sum(-1) == 1).all()
 
 
-def test_the_oracle_counts_all_courses():
-    """Evidence and moments of a mixture of normals, by quadrature where nothing else is latent."""
+def test_the_oracle_sums_over_all_state_sequences():
+    """Evidence and moments of a mixture of normals equal quadrature."""
     sizes = {"m": Discrete(2), "k": Discrete(3), "x": 1}
     pair = dvae.linear_gaussian_surrogate("p(m) p(k_t | k_{t-1}, m) p(x_t | k_t, m, x_{t-1})", "", sizes, 3, scale=1.0)
     x = pair.sample(4, 3)["x"]
@@ -172,32 +172,32 @@ def test_the_oracle_counts_all_courses():
         build(HMM, {"k": 2}).sums.state_sequences(40)
 
 
-def test_what_a_chain_of_states_leaves_to_depend_on():
-    """Summed out, it is a path through time: the posterior of z_t reads all of the past, not its last step."""
-    found = dvae.audit(*SWITCHING, summed=("k",))
-    assert found.missing == {"z": ("z_{<=t-2}",)}
-    assert found.repaired.text == "q(z_t | z_{<t}, x_{>=t})"
-    assert dvae.audit(SWITCHING[0], found.repaired, summed=("k",)).exact
+def test_summing_out_a_chain_adds_dependencies_to_the_exact_guide():
+    """A summed chain connects all steps, so the posterior of z_t reads the whole past, not only the last step."""
+    audit = dvae.audit(*SWITCHING, summed=("k",))
+    assert audit.missing == {"z": ("z_{<=t-2}",)}
+    assert audit.repaired.text == "q(z_t | z_{<t}, x_{>=t})"
+    assert dvae.audit(SWITCHING[0], audit.repaired, summed=("k",)).exact
     single = dvae.faithful_inverse("p(k_t) p(z_t | z_{t-1}, k_t) p(x_t | z_t)", summed=("k",))
     assert single.text == "q(z_t | z_{t-1}, x_{>=t})"
     assert [each.sampled for each in dvae.alternatives(SWITCHING[0], summed=("k",)).guides] == [("z",), ("z",)]
     assert build((SWITCHING[0], "faithful"), {"k": 2}).inference.text == "q(z_t | z_{<t}, x_{>=t})"
 
 
-@pytest.mark.parametrize(("steps", "kept", "states", "lag"), [(64, 2, 3, 1), (99, 1, 2, 3), (1100, 1, 2, 1)])
-def test_blocks_of_a_long_chain_change_neither_its_sums_nor_their_slopes(steps, kept, states, lag, monkeypatch):
-    """Some transitions never happen; 1,100 steps take two levels. Values are of the size of the sum, as rounding is."""
-    logs = torch.randn(2, steps, kept, states**lag, states, dtype=torch.float64).log_softmax(-1) - 0.5
+@pytest.mark.parametrize(("steps", "n_kept", "states", "lag"), [(64, 2, 3, 1), (99, 1, 2, 3), (1100, 1, 2, 1)])
+def test_blocks_of_a_long_chain_change_neither_its_sums_nor_their_gradients(steps, n_kept, states, lag, monkeypatch):
+    """Some transitions are impossible, and 1,100 steps take two levels. The tolerance grows with the sums."""
+    logs = torch.randn(2, steps, n_kept, states**lag, states, dtype=torch.float64).log_softmax(-1) - 0.5
     logs[..., 0, -1] = -math.inf
-    start = torch.randn(2, kept, states**lag, dtype=torch.float64)
-    found, whole = [], enumeration.forward_sums
+    start = torch.randn(2, n_kept, states**lag, dtype=torch.float64)
+    results, forward_sums = [], enumeration.forward_sums
     for widest in (enumeration.WIDE, 0):
-        again = mock.Mock(wraps=whole)
-        monkeypatch.setattr(enumeration, "forward_sums", again)
+        recursion = mock.Mock(wraps=forward_sums)
+        monkeypatch.setattr(enumeration, "forward_sums", recursion)
         monkeypatch.setattr(enumeration, "WIDE", widest)
         leaves = [v.clone().requires_grad_() for v in (start, logs)]
-        values = whole(*leaves)
-        assert again.called == (steps >= 64 and widest > 0)
-        found.append([values, *torch.autograd.grad(values[:, -1].flatten(1).logsumexp(1).sum(), leaves)])
-    for one, other in zip(*found, strict=True):
+        values = forward_sums(*leaves)
+        assert recursion.called == (steps >= 64 and widest > 0)
+        results.append([values, *torch.autograd.grad(values[:, -1].flatten(1).logsumexp(1).sum(), leaves)])
+    for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12 * steps)

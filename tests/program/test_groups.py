@@ -1,4 +1,4 @@
-"""Latents that groups share: one value for a group, its density once, and the evidence of the group as a whole."""
+"""Latents of groups: one value and one density for each group, and the evidence of the group."""
 
 import pyro
 import torch
@@ -28,14 +28,14 @@ def data(**more):
 
 
 class TestGrouped(FactorizationContract):
-    """Without groups in the batch every sequence is one, and the contract is that of any model."""
+    """The contract, where each sequence is a group because the batch has no groups."""
 
     def build(self, size):
         sizes = dict.fromkeys(SIZES, size)
         return dvae.DynamicalVAE(*EQUATIONS, sizes, Recurrent(4, hidden=(4,)), grouped=("g",))
 
 
-def test_a_group_has_one_value_and_its_density_once():
+def test_a_group_has_one_value_whose_density_counts_once():
     model, batch = build(), data()
     trace = poutine.trace(model.guide).get_trace(batch)
     g = trace.nodes["g"]["value"]
@@ -48,26 +48,26 @@ def test_a_group_has_one_value_and_its_density_once():
     assert not torch.equal(model.guide(batch)["w"][0], model.guide(batch)["w"][2])
 
 
-def test_a_group_of_one_is_a_sequence():
+def test_a_group_of_one_equals_a_sequence():
     model, batch = build(), data()
     torch.manual_seed(0)
-    alone = dvae.SequenceELBO().terms(model, {**batch, "group": torch.arange(6)})
+    single_groups = dvae.SequenceELBO().terms(model, {**batch, "group": torch.arange(6)})
     torch.manual_seed(0)
     without = dvae.SequenceELBO().terms(model, {"x": batch["x"]})
-    torch.testing.assert_close(alone.bound, without.bound)
+    torch.testing.assert_close(single_groups.bound, without.bound)
 
 
-def test_pyros_own_bound_is_ours():
+def test_the_bound_equals_pyros():
     model, batch = build(), data()
     torch.manual_seed(0)
-    ours = dvae.SequenceELBO(num_particles=300).terms(model, batch).bound.sum()
-    theirs = -torch.tensor([Trace_ELBO().loss(model.model, model.guide, batch) for _ in range(100)])
-    assert abs(theirs.mean() - ours) < 5 * theirs.std() / 100**0.5 + 0.2
+    bound = dvae.SequenceELBO(num_particles=300).terms(model, batch).bound.sum()
+    pyro_bounds = -torch.tensor([Trace_ELBO().loss(model.model, model.guide, batch) for _ in range(100)])
+    assert abs(pyro_bounds.mean() - bound) < 5 * pyro_bounds.std() / 100**0.5 + 0.2
     pyro.clear_param_store()
 
 
 def linear(count, steps, exact=True):
-    """A linear-Gaussian panel of one group, and its evidence as one dense normal."""
+    """Return a linear-Gaussian model, data of one group, and their evidence by a dense normal."""
     distributions = {
         "default": FixedNormal(0.7, project=False),
         "p(g)": dvae.distributions.StandardNormal(),
@@ -88,15 +88,17 @@ def linear(count, steps, exact=True):
 
     zero, one = torch.zeros(1, 1).double(), torch.ones(1, 1).double()
     bias = mean(zero, zero).flatten()
-    of_g, of_w = mean(one, zero).flatten() - bias, mean(zero, one).flatten() - bias
-    own = 0.49 * torch.outer(of_w, of_w) + 0.49 * torch.eye(steps).double()
-    whole = torch.block_diag(*[own] * count) + torch.outer(of_g.repeat(count), of_g.repeat(count))
-    evidence = torch.distributions.MultivariateNormal(bias.repeat(count), whole.detach()).log_prob(x.flatten())
+    effect_of_g, effect_of_w = mean(one, zero).flatten() - bias, mean(zero, one).flatten() - bias
+    sequence_covariance = 0.49 * torch.outer(effect_of_w, effect_of_w) + 0.49 * torch.eye(steps).double()
+    covariance = torch.block_diag(*[sequence_covariance] * count) + torch.outer(
+        effect_of_g.repeat(count), effect_of_g.repeat(count)
+    )
+    evidence = torch.distributions.MultivariateNormal(bias.repeat(count), covariance.detach()).log_prob(x.flatten())
     return model, x, evidence.detach()
 
 
-def test_the_bound_of_a_group_arrives_at_its_evidence():
-    """The guide reads the mean of a group's sequences, which tells all that they say of g."""
+def test_the_bound_of_a_group_reaches_its_evidence():
+    """The guide reads the mean of a group's sequences, a sufficient statistic of g."""
     model, x, evidence = linear(3, 4)
     batch = {"x": x, "group": torch.zeros(3, dtype=torch.long)}
     optimiser = torch.optim.LBFGS(
@@ -122,7 +124,7 @@ def test_the_bound_of_a_group_arrives_at_its_evidence():
     torch.testing.assert_close(weighted, (weighted.sum() / 3).expand(3))
 
 
-def test_forecasts_of_a_group_share_a_draw_in_each_sample():
+def test_forecasts_of_a_group_share_one_draw_for_each_sample():
     model, batch = build(), data()
     out = model.forecast(batch, 2, samples=5, chunk=2)
     g = out["g"]

@@ -1,4 +1,4 @@
-"""Missing entries are drawn from what the model says of them, one after the other."""
+"""Imputation of missing entries by draws from the model."""
 
 import torch
 
@@ -12,8 +12,8 @@ def test_missing_counts_are_filled_with_counts():
     model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, Recurrent(4), {"p(x)": Family("Poisson")})
     x = model.sample(3, 5)["x"]
     mask = torch.rand_like(x) < 0.5
-    filled = model.impute({"x": x, "mask": mask}, samples=7)["x"]
-    assert not filled.frac().any()
-    assert torch.equal(filled[:, mask], x[mask].expand(7, -1))
-    assert filled[:, ~mask].std(0).max() > 0
+    imputed = model.impute({"x": x, "mask": mask}, samples=7)["x"]
+    assert not imputed.frac().any()
+    assert torch.equal(imputed[:, mask], x[mask].expand(7, -1))
+    assert imputed[:, ~mask].std(0).max() > 0
     assert model.impute({"x": x, "mask": mask}, draw=False)["x"].frac().any()

@@ -1,4 +1,4 @@
-"""Networks, distributions and programs refuse what they cannot be or do."""
+"""Invalid networks, distributions and programs are an error."""
 
 import math
 
@@ -202,7 +202,7 @@ PROGRAMS = [
 
 
 @pytest.mark.parametrize("table", [NETWORKS, DISTRIBUTIONS, PROGRAMS], ids=["networks", "distributions", "programs"])
-def test_misuse_is_refused(table):
+def test_misuse_is_an_error(table):
     for call, word in table:
         with pytest.raises((TypeError, ValueError), match=word):
             call()

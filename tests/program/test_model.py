@@ -1,4 +1,4 @@
-"""The Pyro program: one declaration of a factorization, and every way of running it agrees with every other."""
+"""The Pyro program of a factorization: all ways of running it agree."""
 
 import itertools
 from functools import partial
@@ -60,7 +60,7 @@ def build(pair, network="recurrent", **options):
 
 
 def draw(model, batch=B, steps=T):
-    """Data and context at random."""
+    """Return random data and context."""
     local = {
         n: model.generative.local(n) if n in model.observed else n != "pose" for n in (*model.observed, *model.context)
     }
@@ -71,7 +71,7 @@ def draw(model, batch=B, steps=T):
 
 
 def log_probs(program, *args, **kwargs):
-    """Site to log density (B,)."""
+    """Return the values and log densities (B,) of all sites."""
     trace = poutine.trace(program).get_trace(*args, **kwargs)
     trace.compute_log_prob()
     sites = {n: s for n, s in trace.nodes.items() if s["type"] == "sample" and n != "sequences"}
@@ -92,7 +92,7 @@ def close(got, expected, tolerance=1e-9):
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_the_program_is_an_ordinary_pyro_program(pair):
+def test_the_program_works_with_pyros_tools(pair):
     model = build(pair)
     data = draw(model)
     posterior = Predictive(model.model, guide=model.guide, num_samples=4)(data)
@@ -109,11 +109,11 @@ def test_the_program_is_an_ordinary_pyro_program(pair):
         assert torch.isfinite(loss)
 
 
-# --------------------------------------------------------------------------------- one joint, many ways to it
+# ------------------------------------------------------------------------------------------- the log joint
 
 
 def per_step(model, data, latents):
-    """The log joint of the reference program, by variable."""
+    """Return the log joint of the reference program for each variable."""
     locals_ = {n: v for n, v in latents.items() if v.dim() == 3}
     given_values = {n: v for n, v in latents.items() if v.dim() == 2}
     given_values |= {f"{n}_{t + 1}": v[:, t] for n, v in locals_.items() for t in range(v.shape[1])}
@@ -126,7 +126,7 @@ def per_step(model, data, latents):
 
 
 @pytest.mark.parametrize(("pair", "network"), CASES)
-def test_the_vectorised_joint_is_that_of_the_per_step_program(pair, network):
+def test_the_vectorised_joint_equals_the_per_step_program(pair, network):
     model = build(
         pair, network, distributions={"p(w)": distributions.FixedNormal(learned=True)} if pair == "dsae" else None
     )
@@ -137,15 +137,15 @@ def test_the_vectorised_joint_is_that_of_the_per_step_program(pair, network):
 
 @settings(max_examples=25)
 @given(factorizations(), st.sampled_from(["linear", *NETWORKS]), st.integers(0, 99))
-def test_random_factorizations_run_alike_in_every_way(pair, network, seed):
+def test_all_programs_of_random_factorizations_agree(pair, network, seed):
     torch.manual_seed(seed)
     model = build(pair, Linear(steps=T) if network == "linear" else network)
     free, logs = log_probs(model.model, length=T, size=2)
     data, latents = {"x": free["x"]}, {name: free[name] for name in model.latents}
     close(logs, model.log_joint(data, latents))
     close(logs, per_step(model, data, latents))
-    drawn, guide_logs = log_probs(model.guide, data)
-    close(guide_logs, log_guide(model, data, drawn))
+    latents_of_guide, guide_logs = log_probs(model.guide, data)
+    close(guide_logs, log_guide(model, data, latents_of_guide))
 
 
 # -------------------------------------------------------------------------- ragged batches and missing entries
@@ -166,9 +166,9 @@ def test_padding_changes_nothing(pair, network):
         def cut(values, i=i, n=n):
             return {k: v[i : i + 1, :n] if v.dim() == 3 else v[i : i + 1] for k, v in values.items()}
 
-        alone, drawn = cut(clean), cut(latents)
-        close({k: v[i : i + 1] for k, v in logs.items()}, model.log_joint(alone, drawn))
-        close({k: v[i : i + 1] for k, v in guide_logs.items()}, log_guide(model, alone, drawn))
+        single, single_latents = cut(clean), cut(latents)
+        close({k: v[i : i + 1] for k, v in logs.items()}, model.log_joint(single, single_latents))
+        close({k: v[i : i + 1] for k, v in guide_logs.items()}, log_guide(model, single, single_latents))
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -176,17 +176,17 @@ def test_padding_changes_nothing(pair, network):
 def test_the_value_of_a_missing_entry_changes_nothing(pair, network):
     model = build(pair, network)
     data = draw(model)
-    seen = {name: torch.rand_like(data[name]) < 0.7 for name in model.observed}
-    holes = {name: data[name].masked_fill(~seen[name], float("nan")) for name in model.observed}
-    zeros = {name: data[name].masked_fill(~seen[name], 0.0) for name in model.observed}
-    latents = {name: value.detach() for name, value in model.guide({**holes, "mask": seen}).items()}
-    missing = {**holes, "mask": seen}
+    masks = {name: torch.rand_like(data[name]) < 0.7 for name in model.observed}
+    holes = {name: data[name].masked_fill(~masks[name], float("nan")) for name in model.observed}
+    zeros = {name: data[name].masked_fill(~masks[name], 0.0) for name in model.observed}
+    latents = {name: value.detach() for name, value in model.guide({**holes, "mask": masks}).items()}
+    missing = {**holes, "mask": masks}
     close(log_guide(model, missing, latents), log_guide(model, zeros, latents))
-    others = {name: data[name].masked_fill(~seen[name], 17.0) for name in model.observed}
-    close(model.log_joint(missing, latents), model.log_joint({**others, "mask": seen}, latents))
-    everything = {name: torch.ones_like(mask) for name, mask in seen.items()}
+    others = {name: data[name].masked_fill(~masks[name], 17.0) for name in model.observed}
+    close(model.log_joint(missing, latents), model.log_joint({**others, "mask": masks}, latents))
+    everything = {name: torch.ones_like(mask) for name, mask in masks.items()}
     close(model.log_joint({**data, "mask": everything}, latents), model.log_joint(data, latents))
-    nothing = {name: torch.zeros_like(mask) for name, mask in seen.items()}
+    nothing = {name: torch.zeros_like(mask) for name, mask in masks.items()}
     assert all((model.log_joint({**data, "mask": nothing}, latents)[name] == 0).all() for name in model.observed)
 
 
@@ -194,7 +194,7 @@ def test_the_value_of_a_missing_entry_changes_nothing(pair, network):
 
 
 def means(model, values):
-    """The means of all data variables at every step, teacher-forced."""
+    """Return the teacher-forced means of all data variables at every step."""
     return {
         n: model.generator[n](values, next(iter(values.values())).shape[0], values["x"].shape[1])[0]
         for n in model.observed
@@ -202,10 +202,10 @@ def means(model, values):
 
 
 @pytest.mark.parametrize(
-    ("pair", "network", "chunk"),  # chunks are less than the sequences, or more than all there is
+    ("pair", "network", "chunk"),  # chunks are smaller than the batch, or larger than all samples
     [(pair, network, (2, 2048)[n % 3 // 2]) for n, (pair, network) in enumerate(CASES) if pair != "rvae"],
 )
-def test_a_forecast_continues_the_past_by_the_models_own_means(pair, network, chunk):
+def test_a_forecast_continues_the_past_with_the_means_of_the_model(pair, network, chunk):
     model = build(pair, network)
     past, horizon, samples = 3, 4, 2
     data = draw(model, B, past + horizon)
@@ -223,19 +223,19 @@ def test_a_forecast_continues_the_past_by_the_models_own_means(pair, network, ch
 
 
 @given(size=st.integers(1, 7), samples=st.integers(1, 7), chunk=st.integers(1, 50))
-def test_chunks_make_every_sample_of_every_sequence_once_and_no_more_at_once(size, samples, chunk):
-    made = itertools.count()
+def test_chunks_cover_every_sample_of_every_sequence_once_within_their_size(size, samples, chunk):
+    counter = itertools.count()
 
     def make(part, count):
         sequences = torch.arange(size)[part].expand(count, -1)
         assert 1 <= sequences.numel() <= chunk
-        calls = torch.tensor([next(made) for _ in range(count)])[:, None].expand_as(sequences)
+        calls = torch.tensor([next(counter) for _ in range(count)])[:, None].expand_as(sequences)
         return {"sequence": sequences, "draw": torch.stack([calls, -calls], -1)}
 
-    found = in_chunks(make, size, samples, chunk)
-    assert torch.equal(found["sequence"], torch.arange(size).expand(samples, -1))
-    assert torch.equal(found["draw"][..., 0], -found["draw"][..., 1])
-    assert all(len(set(draws.tolist())) == samples for draws in found["draw"][..., 0].T)
+    samples_made = in_chunks(make, size, samples, chunk)
+    assert torch.equal(samples_made["sequence"], torch.arange(size).expand(samples, -1))
+    assert torch.equal(samples_made["draw"][..., 0], -samples_made["draw"][..., 1])
+    assert all(len(set(draws.tolist())) == samples for draws in samples_made["draw"][..., 0].T)
 
 
 # ------------------------------------------------------------------------------------------------ scheduled sampling
@@ -244,7 +244,7 @@ def test_chunks_make_every_sample_of_every_sequence_once_and_no_more_at_once(siz
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("pair", ["srnn", "body parts", "context"])
 @pytest.mark.parametrize("residual", [False, True])
-def test_feeding_on_ones_own_means(pair, network, residual):
+def test_scheduled_sampling_reads_the_means_of_the_model(pair, network, residual):
     model = build(pair, network, distributions={"p(x)": distributions.Normal(residual=residual)})
     data = draw(model)
     latents = {name: value.detach() for name, value in model.guide(data).items()}
@@ -256,30 +256,30 @@ def test_feeding_on_ones_own_means(pair, network, residual):
 
     close(logs(0.0), model.log_joint(data, latents))
     exact = logs(1.0)
-    # By hand: means one step after another, each from the means before it.
-    fed = {name: torch.zeros_like(data[name]) for name in model.observed}
+    # The expected means are computed step by step, each from the previous means.
+    inputs = {name: torch.zeros_like(data[name]) for name in model.observed}
     for t in range(T):
         for name in model.observed:
-            fed[name][:, t] = means(model, {**data, **latents, **fed})[name][:, t].detach()
+            inputs[name][:, t] = means(model, {**data, **latents, **inputs})[name][:, t].detach()
     expected = {}
     for name in model.generative.variables:
         conditional = model.generator[name]
         if not model.generative.local(name):
             expected[name] = exact[name]
             continue
-        distribution = conditional.head.distribution(conditional({**data, **latents, **fed}, B, T))
+        distribution = conditional.head.distribution(conditional({**data, **latents, **inputs}, B, T))
         expected[name] = distribution.log_prob({**data, **latents}[name]).sum((1, 2)).detach()
     close(exact, expected)
     close(logs(ScheduledSampling(1.0, passes=T)), exact)
-    some = logs(0.5)
-    close(logs(ScheduledSampling(0.5, passes=T)), some)
-    assert not torch.allclose(some["x"], exact["x"])
+    half = logs(0.5)
+    close(logs(ScheduledSampling(0.5, passes=T)), half)
+    assert not torch.allclose(half["x"], exact["x"])
 
 
-# ------------------------------------------------------------------------------------------ parameters of one's own
+# ------------------------------------------------------------------------------------------------ choice by factor
 
 
-def test_networks_and_laws_are_chosen_by_factor():
+def test_networks_and_distributions_are_chosen_by_factor():
     model = build(
         "dkf",
         {"p": Dense((3,)), "q(z)": Attention(8, heads=2), "default": Recurrent(4)},

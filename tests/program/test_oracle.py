@@ -1,4 +1,4 @@
-"""The oracle against brute force, and every bound of the library against the oracle."""
+"""The oracle equals brute force, and every bound of the library agrees with the oracle."""
 
 import math
 
@@ -44,7 +44,7 @@ PAIRS = {
     "dsae, with z": ("p(w) p(z_t | z_{<t}) p(x_t | w, z_t)", "q(w | x_{1:T}) q(z_t | z_{<t}, w, x_{1:T})"),
     "hit-dvae": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | x_{1:T}, w)"),
     "hit-dvae, with z": (HIT_DVAE, "q(w | x_{1:T}) q(z_t | z_{<t}, x_{1:T}, w)"),
-    # w tells of the u_{>t} through which later data tell of z_t.
+    # w depends on the u_{>t} that connect later data with z_t.
     "two layers": (
         TWO_LAYERS,
         "q(w | x_{1:T}) q(u_t | u_{t-1}, z_{t-1}, x_{1:T}, w) q(z_t | z_{t-1}, u_t, x_{1:T}, w)",
@@ -67,7 +67,7 @@ def data(model, n, steps=T):
 
 
 def z_score(draws, expected):
-    """How many standard errors the mean of draws (N, ...) lies from what is expected."""
+    """Return the distance of the mean of draws (N, ...) from its expectation, in standard errors."""
     error = draws.std(0) / len(draws) ** 0.5
     return ((draws.mean(0) - expected).abs() / (error + 1e-9)).max().item()
 
@@ -76,7 +76,7 @@ def z_score(draws, expected):
 
 
 def kalman(A, C, b, d, Q, R, x):
-    """log p(x) and smoothed moments for z_t = A_t z_{t-1} + b_t + N(0, Q_t), x_t = C_t z_t + d_t + N(0, R_t)."""
+    """Return log p(x) and smoothed moments of z_t = A_t z_{t-1} + b_t + N(0, Q_t), x_t = C_t z_t + d_t + N(0, R_t)."""
     steps, n = len(A), A.shape[1]
     mean, cov, log_evidence, filtered = np.zeros(n), np.zeros((n, n)), 0.0, []
     for t in range(steps):
@@ -97,7 +97,7 @@ def kalman(A, C, b, d, Q, R, x):
     return log_evidence, np.array(means), np.array(covs)
 
 
-def test_evidence_and_posterior_are_the_kalman_filters_and_smoothers():
+def test_evidence_and_posterior_equal_kalman_filter_and_smoother():
     model = linear_gaussian_surrogate(*PAIRS["dkf"], {"z": 2, "x": 3}, T)
     x = data(model, 3)
     oracle = Oracle(model, T)
@@ -117,7 +117,7 @@ def test_evidence_and_posterior_are_the_kalman_filters_and_smoothers():
 
 
 def partly_observed(model, x):
-    """The data with missing entries and lengths, of a model with units for all variables."""
+    """Return the data with missing entries and lengths, and standardise all variables of the model."""
     for name, size in model.sizes.items():
         model.standardise(name).double().fit(1 + 2 * torch.randn(50, size, dtype=torch.float64))
     mask = torch.rand_like(x) < 0.6
@@ -126,7 +126,7 @@ def partly_observed(model, x):
 
 @pytest.mark.parametrize("partial", [True])
 @pytest.mark.parametrize("pair", PAIRS)
-def test_log_joint_is_evidence_plus_log_posterior(pair, partial):
+def test_the_log_joint_is_evidence_plus_log_posterior(pair, partial):
     model = build(pair, size=2)
     x = data(model, 4)
     batch = partly_observed(model, x) if partial else x
@@ -135,17 +135,17 @@ def test_log_joint_is_evidence_plus_log_posterior(pair, partial):
     means, covariances = (part.detach() for part in oracle.posterior(batch))
     values, log_posterior = oracle._stack(latents, model.latents), []
     for mean, covariance, value in zip(means, covariances.expand(4, -1, -1), values, strict=True):
-        there = covariance.diagonal() > 0
-        assert (value[~there] == 0).all()
-        posterior = dist.MultivariateNormal(mean[there], covariance[there][:, there])
-        log_posterior.append(posterior.log_prob(value[there]))
+        is_step = covariance.diagonal() > 0
+        assert (value[~is_step] == 0).all()
+        posterior = dist.MultivariateNormal(mean[is_step], covariance[is_step][:, is_step])
+        log_posterior.append(posterior.log_prob(value[is_step]))
     joint = sum(model.log_joint(batch, latents).values())
     torch.testing.assert_close(joint, oracle.evidence(batch).detach() + torch.stack(log_posterior), rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("indicators", [(), ("x",)])
 @pytest.mark.parametrize("pair", ["dkf, backward", "two layers", "statics"])
-def test_the_bound_of_partly_observed_data_is_the_mean_of_the_programs(pair, indicators):
+def test_the_exact_bound_of_partly_observed_data_equals_the_dense_one(pair, indicators):
     distributions = {"default": FixedNormal(0.7, learned=True, project=False)}
     distributions |= {f"p({name})": StandardNormal() for name in ("w", "v") if f"p({name})" in PAIRS[pair][0]}
     sizes = dict.fromkeys(Factorization.parse(PAIRS[pair][0]).variables, 1)
@@ -159,7 +159,7 @@ def test_the_bound_of_partly_observed_data_is_the_mean_of_the_programs(pair, ind
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_the_sequence_elbo_is_the_exact_bound(pair):
+def test_the_sequence_elbo_estimates_the_exact_bound(pair):
     model = build(pair)
     x = data(model, 2)
     oracle = Oracle(model, T)
@@ -181,7 +181,7 @@ def test_the_gap_is_the_mean_of_evidence_minus_bound(pair):
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_the_gap_closes_exactly_where_the_audit_says_so(pair):
+def test_the_gap_closes_if_and_only_if_the_audit_is_exact(pair):
     oracle = Oracle(build(pair), T)
     assert audit(*PAIRS[pair]).exact == (pair in EXACT)
     gap = oracle.fit_guide()
@@ -205,7 +205,7 @@ def test_bounds_of_random_factorizations_lie_below_the_evidence(pair, seed):
 
 @settings(max_examples=10)
 @given(factorizations(), st.integers(0, 999))
-def test_random_guides_are_tight_exactly_where_the_audit_says_so(pair, seed):
+def test_random_guides_are_tight_if_and_only_if_the_audit_is_exact(pair, seed):
     verdict = audit(*pair)
     gap = Oracle(build(pair, seed=seed, scale=0.6), T).fit_guide()
     assert gap > -1e-9
@@ -214,7 +214,7 @@ def test_random_guides_are_tight_exactly_where_the_audit_says_so(pair, seed):
 
 @settings(max_examples=10)
 @given(factorizations(), st.integers(0, 999))
-def test_with_masks_of_ones_own_too(pair, seed):
+def test_guides_with_custom_masks_are_tight_if_and_only_if_the_audit_is_exact(pair, seed):
     rng = np.random.default_rng(seed)
     pair = [masked(text, rng, 0.6) for text in pair]
     verdict = audit(*pair, steps=T)
@@ -223,31 +223,32 @@ def test_with_masks_of_ones_own_too(pair, seed):
 
 
 def exact_guide(model):
-    """The posterior as a Pyro guide, one dense normal per latent given those before it."""
+    """Return the posterior as a Pyro guide: a dense normal of each latent given the earlier ones."""
     oracle = Oracle(model, T)
 
     def guide(x):
         mean, covariance = (m.detach() for m in oracle.posterior(x))
-        drawn = x.new_zeros(len(x), 0)
+        draws = x.new_zeros(len(x), 0)
         with pyro.plate("sequences", len(x), dim=-1):
             for name in model.latents:
-                past = slice(0, drawn.shape[1])
+                past = slice(0, draws.shape[1])
                 shape = (*([T] if model.generative.local(name) else []), model.sizes[name])
-                here = slice(past.stop, past.stop + math.prod(shape))
-                gain = torch.linalg.solve(covariance[past, past], covariance[past, here])
-                left = covariance[here, here] - covariance[here, past] @ gain
+                columns = slice(past.stop, past.stop + math.prod(shape))
+                gain = torch.linalg.solve(covariance[past, past], covariance[past, columns])
+                conditional_covariance = covariance[columns, columns] - covariance[columns, past] @ gain
                 distribution = dist.MultivariateNormal(
-                    mean[:, here] + (drawn - mean[:, past]) @ gain, (left + left.t()) / 2
+                    mean[:, columns] + (draws - mean[:, past]) @ gain,
+                    (conditional_covariance + conditional_covariance.t()) / 2,
                 )
                 reshape = ReshapeTransform(distribution.event_shape, shape)
                 value = pyro.sample(name, dist.TransformedDistribution(distribution, [reshape]))
-                drawn = torch.cat([drawn, value.flatten(1)], dim=1)
+                draws = torch.cat([draws, value.flatten(1)], dim=1)
 
     return guide
 
 
 def assert_tight(model, x):
-    """Every draw from the exact posterior gives the evidence: the bound has no variance."""
+    """Check that every draw from the exact posterior gives the evidence, so the bound has no variance."""
     guide, evidence = exact_guide(model), Oracle(model, T).evidence(x).detach()
     for _ in range(3):
         bounds = [-Trace_ELBO().loss(model.model, guide, sequence[None]) for sequence in x]
@@ -281,18 +282,18 @@ AGAINST = {
 
 
 @pytest.mark.parametrize("pair", AGAINST)
-def test_a_latent_that_the_guide_draws_against_the_edges_has_no_analytic_kl(pair, monkeypatch):
+def test_a_latent_drawn_against_the_edges_has_no_analytic_kl(pair, monkeypatch):
     *equations, child, parent = AGAINST[pair]
     model = build(tuple(equations))
     with torch.no_grad():
         model.generator[child].network.weights[parent].fill_(1.0)  # a strong edge between latents
     oracle = Oracle(model, T)
-    assert oracle.fit_guide() < 1e-6  # so the exact bound is the evidence, and draws vary little about it
+    assert oracle.fit_guide() < 1e-6  # the exact bound is the evidence, and draws vary little
     x = data(model, 1).repeat(4000, 1, 1)
     with torch.no_grad():
         exact = oracle.bound(x[:1])
-        ours = SequenceELBO().terms(model, x).bound
-        assert z_score(ours, exact) < 5
+        bounds = SequenceELBO().terms(model, x).bound
+        assert z_score(bounds, exact) < 5
         monkeypatch.setattr("dvae.inference.bounds.elbo._closed_forms", lambda *sites: set(model.latents))
         forced = SequenceELBO().terms(model, x).bound
     assert z_score(forced, exact) > 20
@@ -301,7 +302,7 @@ def test_a_latent_that_the_guide_draws_against_the_edges_has_no_analytic_kl(pair
 # ----------------------------------------------------------------------------------------------- cost and errors
 
 
-def test_the_price_of_a_dropped_edge():
+def test_a_dropped_edge_opens_a_gap():
     sizes = {"z": 1, "x": 1}
     full = kl_gap(DKF, "q(z_t | z_{t-1}, x_{t:T})", sizes, steps=T, seeds=2)
     dropped = kl_gap(DKF, "q(z_t | x_{t:T})", sizes, steps=T, seeds=2)
@@ -310,15 +311,15 @@ def test_the_price_of_a_dropped_edge():
     assert dropped.min() > 1e-3
 
 
-def spread(generative, sizes, seed, steps):
-    """The covariance of the data under the model that costs of a seed have."""
+def data_covariance(generative, sizes, seed, steps):
+    """Return the covariance of the data under the random model of a seed."""
     oracle = Oracle(linear_gaussian_surrogate(generative, None, sizes, steps, seed), steps)
     n = sum(map(oracle._size, oracle.model.latents))
     return torch.linalg.inv(oracle._joint()[1].detach())[n:, n:]
 
 
 def dependence(covariance, size):
-    """How far blocks of so many normal coordinates are from independent, in nats: their total correlation."""
+    """Return the total correlation of blocks of normal coordinates, in nats."""
     blocks = [covariance[k : k + size, k : k + size] for k in range(0, len(covariance), size)]
     return float(sum(map(torch.logdet, blocks)) - torch.logdet(covariance)) / 2
 
@@ -333,18 +334,18 @@ INDEPENDENT = {
 
 
 @pytest.mark.parametrize("case", INDEPENDENT)
-def test_a_model_without_dependence_loses_all_of_it(case):
+def test_a_model_without_dependence_loses_the_total_correlation(case):
     generative, reduced, sizes, steps, size = INDEPENDENT[case]
-    found = model_kl_gap(generative, reduced, sizes, steps, seeds=3)
-    expected = [dependence(spread(generative, sizes, seed, steps), size) for seed in range(3)]
+    gaps = model_kl_gap(generative, reduced, sizes, steps, seeds=3)
+    expected = [dependence(data_covariance(generative, sizes, seed, steps), size) for seed in range(3)]
     assert min(expected) > 1e-6
-    assert found.tolist() == pytest.approx(expected, abs=1e-9)
+    assert gaps.tolist() == pytest.approx(expected, abs=1e-9)
 
 
-def test_what_another_edge_can_carry_costs_nothing():
-    found = model_edge_costs("p(z_t | z_{t-1}, x_{<t}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2)
-    assert {edge for edge, cost in found.items() if cost.max() < 1e-8} == {"z_{t-1} to z_t", "x_{<t} to z_t"}
-    assert found["x_{<t} to x_t"].min() > 1e-3
+def test_a_redundant_edge_costs_nothing():
+    costs = model_edge_costs("p(z_t | z_{t-1}, x_{<t}) p(x_t | x_{<t}, z_t)", steps=3, seeds=2)
+    assert {edge for edge, cost in costs.items() if cost.max() < 1e-8} == {"z_{t-1} to z_t", "x_{<t} to z_t"}
+    assert costs["x_{<t} to x_t"].min() > 1e-3
 
 
 def with_prior(distribution):

@@ -1,4 +1,4 @@
-"""What the program does with what is not there, not in order, or not a tensor."""
+"""The program with missing entries, custom masks, threads, other engines and arrays."""
 
 import os
 import subprocess
@@ -32,22 +32,22 @@ def srnn(**options) -> DynamicalVAE:
 # ------------------------------------------------------------------------------------------------- missing entries
 
 
-def gap(x: torch.Tensor, *steps: int) -> dict[str, torch.Tensor]:
+def with_gap(x: torch.Tensor, *steps: int) -> dict[str, torch.Tensor]:
     mask = torch.ones_like(x, dtype=torch.bool)
     mask[:, list(steps)] = False
     return {"x": x.masked_fill(~mask, torch.nan), "mask": mask}
 
 
-def test_the_model_reads_its_own_mean_in_place_of_a_missing_entry():
+def test_the_model_reads_its_own_mean_instead_of_a_missing_entry():
     model = srnn()
     x, z = torch.randn(4, 6, 3).double(), torch.randn(4, 6, 2).double()
-    batch = gap(x, 2)
+    batch = with_gap(x, 2)
     with torch.no_grad():
         conditional = model.generator["x"]
         mean = conditional({"x": x, "z": z}, 4, 6)[0][:, 2]
-        filled = x.clone()
-        filled[:, 2] = mean
-        loc, scale = conditional({"x": filled, "z": z}, 4, 6)
+        completed = x.clone()
+        completed[:, 2] = mean
+        loc, scale = conditional({"x": completed, "z": z}, 4, 6)
         log_prob = torch.distributions.Normal(loc, scale).log_prob(x)
         expected = log_prob.sum((1, 2)) - log_prob[:, 2].sum(-1)
     torch.testing.assert_close(model.log_joint(batch, {"z": z})["x"], expected)
@@ -56,7 +56,7 @@ def test_the_model_reads_its_own_mean_in_place_of_a_missing_entry():
 # ------------------------------------------------------------------------------------------------------ custom masks
 
 
-def test_a_custom_mask_that_turns_ahead_at_some_length_is_refused_there():
+def test_a_custom_mask_that_reads_the_future_at_a_length_is_an_error_there():
     def leak(length: int) -> np.ndarray:
         mask = np.tri(length, k=-1, dtype=bool)
         if length == 12:
@@ -74,19 +74,19 @@ def test_a_custom_mask_that_turns_ahead_at_some_length_is_refused_there():
 
 
 def first(length: int) -> np.ndarray:
-    """The same row for every t."""
+    """Return a mask with the same row for every t."""
     return np.arange(length)[None] < 1
 
 
 class TestRowMaskOfAttention(FactorizationContract):
-    """x_t reads z_1 from everywhere, and z_t the x before it: a loop over a mask of one row."""
+    """x_t reads z_1 at every t, and z_t reads x_{t-1}: a loop with a mask of one row."""
 
     def build(self, size: int) -> DynamicalVAE:
         equations = "p(z_t | x_{t-1}) p(x_t | x_{t-1}, z_{first})", "q(z_t | z_{<t}, x_{1:T})"
         return DynamicalVAE(*equations, {"z": size, "x": size}, Attention(8, 2), masks={"first": first})
 
     def test_particles_move_through_the_loop(self) -> None:
-        """Each of them is weighed as the programs score it."""
+        """Their weights equal the densities of the programs."""
         model = self._model()
         data = self._data(model)
         particles = Filter(model, data, 1)
@@ -102,8 +102,8 @@ class TestRowMaskOfAttention(FactorizationContract):
 # ------------------------------------------------------------------------------------------------------------ threads
 
 
-class _Waiting(Callback):
-    """Holds a fit between two steps until another thread has forecast."""
+class _PauseUntilForecast(Callback):
+    """Pause a fit between two steps until another thread has forecast."""
 
     def __init__(self) -> None:
         self.began, self.forecast = threading.Event(), threading.Event()
@@ -113,41 +113,41 @@ class _Waiting(Callback):
         assert self.forecast.wait(60), "the fit has kept the lock between its steps"
 
 
-def test_forecasts_are_made_while_a_fit_goes_on_and_change_nothing_of_it():
+def test_a_forecast_during_a_fit_does_not_change_the_fit():
     x = torch.randn(8, 6, 3).double()
     torch.manual_seed(0)
-    alone_, beside, other = srnn(), srnn(), srnn()
-    beside.load_state_dict(alone_.state_dict())
-    dvae.fit(alone_, x, steps=2, batch_size=4, progress=False)
-    waiting, quiet = _Waiting(), {"steps": 2, "batch_size": 4, "progress": False}
-    fit = threading.Thread(target=lambda: dvae.fit(beside, x, callbacks=[waiting], **quiet))
+    undisturbed, concurrent, other = srnn(), srnn(), srnn()
+    concurrent.load_state_dict(undisturbed.state_dict())
+    dvae.fit(undisturbed, x, steps=2, batch_size=4, progress=False)
+    waiting, quiet = _PauseUntilForecast(), {"steps": 2, "batch_size": 4, "progress": False}
+    fit = threading.Thread(target=lambda: dvae.fit(concurrent, x, callbacks=[waiting], **quiet))
     fit.start()
     assert waiting.began.wait(60)
     assert other.forecast(x[:, :4], 2, 3)["x"].shape == (3, 8, 2, 3)
     waiting.forecast.set()
     fit.join()
-    for name, value in alone_.state_dict().items():
-        torch.testing.assert_close(beside.state_dict()[name], value, rtol=0, atol=0)
+    for name, value in undisturbed.state_dict().items():
+        torch.testing.assert_close(concurrent.state_dict()[name], value, rtol=0, atol=0)
 
 
-def test_a_bound_and_the_building_of_a_model_wait_for_their_turn():
+def test_bounds_and_the_construction_of_models_wait_for_the_lock():
     model, x = srnn(), torch.randn(4, 6, 3).double()
-    done: list[float] = []
+    results: list[float] = []
 
     def work() -> None:
-        done.append(SequenceELBO().loss_and_grads(model, model.guide, x))
+        results.append(SequenceELBO().loss_and_grads(model, model.guide, x))
         srnn()
-        done.append(0.0)
+        results.append(0.0)
 
     threads = [threading.Thread(target=work) for _ in range(4)]
     with serialized:
         for thread in threads:
             thread.start()
         time.sleep(0.2)
-        assert not done
+        assert not results
     for thread in threads:
         thread.join()
-    assert len(done) == 8
+    assert len(results) == 8
 
 
 FORK_DURING_A_FIT = """
@@ -175,14 +175,14 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
-def test_a_process_that_is_forked_amid_the_first_fit_of_another_thread_fits():
+def test_a_process_forked_during_a_fit_of_another_thread_can_fit():
     subprocess.run([sys.executable, "-W", "ignore", "-c", FORK_DURING_A_FIT], check=True, timeout=120)
 
 
 # ---------------------------------------------------------------------------------------------------------- engines
 
 
-def test_pyros_svi_trains_every_parameter_and_keeps_models_apart():
+def test_pyros_svi_trains_all_parameters_of_separate_models():
     models = [srnn(), srnn()]
     x = torch.randn(4, 6, 3).double()
     before = [[p.detach().clone() for p in model.parameters()] for model in models]
@@ -210,7 +210,7 @@ def test_mixed_precision_trains(name):
 # ------------------------------------------------------------------------------------------------------------ inputs
 
 
-def test_arrays_are_taken_in_the_models_precision():
+def test_arrays_are_converted_to_the_precision_of_the_model():
     model = srnn()
     x = np.random.default_rng(0).normal(size=(2, 4, 3))
     assert model.forecast(x, 2)["x"].dtype == torch.float64

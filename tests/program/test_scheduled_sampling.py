@@ -1,4 +1,4 @@
-"""What stands in for the data's history in training: which steps read the truth, and what noise they read it with."""
+"""Scheduled sampling and input noise: which steps read the truth in training, and with which noise."""
 
 import pytest
 import torch
@@ -36,65 +36,65 @@ def draw(model):
 
 
 def run(model, batch, feeding):
-    """The rollout of a scored batch."""
+    """Return the rollout of a scored batch."""
     return poutine.trace(model.model).get_trace(batch, scheduled_sampling=feeding).nodes["x"]["fn"].rollout
 
 
 # ------------------------------------------------------------------------------------------------------------- blocks
 
 
-@pytest.mark.parametrize(("start", "kept", "own"), [(0, 1, 1), (3, 2, 3), (0, 20, 1)])
-def test_blocks_of_the_truth_are_read_and_blocks_of_own_means_are_not(start, kept, own):
-    """The mean at t has a Jacobian of zero to every frame that was replaced, and to none before t that was not."""
-    model, feeding = build(), ScheduledSampling(1.0, start=start, blocks=(kept, own))
+@pytest.mark.parametrize(("start", "n_true", "n_generated"), [(0, 1, 1), (3, 2, 3), (0, 20, 1)])
+def test_blocks_alternate_between_the_truth_and_generated_means(start, n_true, n_generated):
+    """The Jacobian of the mean at t is zero for replaced frames, and nonzero for all other earlier frames."""
+    model, feeding = build(), ScheduledSampling(1.0, start=start, blocks=(n_true, n_generated))
     x = torch.randn(1, T, D, dtype=torch.float64)
 
     def means(x):
         rollout = run(model, {"x": x}, feeding)
         return rollout.parameters("x", rollout.values["x"])[0].sum((0, 2))
 
-    read = torch.autograd.functional.jacobian(means, x)[:, 0].abs().sum(-1) > 0
-    shown = torch.tensor([t < start or (t - start) % (kept + own) < kept for t in range(T)])
-    assert torch.equal(read, torch.ones(T, T, dtype=torch.bool).tril(-1) & shown)
+    is_read = torch.autograd.functional.jacobian(means, x)[:, 0].abs().sum(-1) > 0
+    is_true = torch.tensor([t < start or (t - start) % (n_true + n_generated) < n_true for t in range(T)])
+    assert torch.equal(is_read, torch.ones(T, T, dtype=torch.bool).tril(-1) & is_true)
 
 
 @pytest.mark.parametrize(("pair", "network"), PAIRWISE)
-def test_blocks_are_what_as_many_passes_as_steps_make_of_them(pair, network):
-    """The loop, some of whose steps are taken at once, has the values and the gradients of the parallel way."""
+def test_blocks_equal_parallel_passes_over_all_steps(pair, network):
+    """The loop, which runs some steps at once, has the values and gradients of parallel passes."""
     model = build(pair, network)
     data = draw(model)
-    found = []
+    results = []
     for passes in (None, T):
         torch.manual_seed(0)
         bound = (
             SequenceELBO().terms(model, data, scheduled_sampling=ScheduledSampling(1.0, passes, blocks=(3, 2))).bound
         )
         gradient = torch.autograd.grad(bound.sum(), list(model.parameters()), allow_unused=True)
-        found.append((bound, gradient))
-    torch.testing.assert_close(*found, rtol=0, atol=1e-9)
+        results.append((bound, gradient))
+    torch.testing.assert_close(*results, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("pair", "network"), [pair for pair in PAIRWISE if pair[1] != "attention"])
-def test_a_forecast_takes_what_was_observed_at_once(pair, network, monkeypatch):
-    """And is the same as step by step, where frames lack entries too."""
+def test_a_forecast_reads_observed_steps_at_once(pair, network, monkeypatch):
+    """The forecast equals the one step by step, also with missing frames."""
     model = build(pair, network).eval()
     data = draw(model)
     past = {name: value if name == "c" else value[:, :7] for name, value in data.items()}
     mask = torch.ones(B, 7, D, dtype=torch.bool)
     mask[1, 3] = False
-    found = []
+    results = []
     for _ in range(2):
         torch.manual_seed(0)
-        whole = model.forecast(past, T - 7, samples=2, draw_emission=True)["x"]
-        found.append((whole, model.forecast({**past, "mask": mask}, T - 7, samples=2, draw_emission=True)["x"]))
+        complete = model.forecast(past, T - 7, samples=2, draw_emission=True)["x"]
+        results.append((complete, model.forecast({**past, "mask": mask}, T - 7, samples=2, draw_emission=True)["x"]))
         monkeypatch.setattr(RecurrentNetwork, "forward_chunk", Network.forward_chunk)  # step by step
-    torch.testing.assert_close(*found, rtol=0, atol=1e-10)
+    torch.testing.assert_close(*results, rtol=0, atol=1e-10)
 
 
 # -------------------------------------------------------------------------------------------------------------- noise
 
 
-def test_what_is_read_has_noise_in_its_unit_and_what_is_scored_has_none():
+def test_inputs_have_noise_in_their_unit_and_scored_values_have_none():
     model = build("srnn")
     model.standardise("x").fit(3 + 4 * torch.randn(500, D, dtype=torch.float64))
     x = 3 + 4 * torch.randn(4000, T, D, dtype=torch.float64)
@@ -106,12 +106,12 @@ def test_what_is_read_has_noise_in_its_unit_and_what_is_scored_has_none():
     )
     assert noise.mean().abs() < 0.01
     assert torch.corrcoef(noise[:, :2].flatten(1).mT)[0, 1:].abs().max() < 0.06  # each entry has its own
-    known = {**rollout.values, "x": x + noise}
-    expected = model.generator["x"].head.distribution(model.generator["x"](known, len(x), T)).log_prob(x)
+    values = {**rollout.values, "x": x + noise}
+    expected = model.generator["x"].head.distribution(model.generator["x"](values, len(x), T)).log_prob(x)
     torch.testing.assert_close(rollout.evaluate("x", x).log_prob(x), expected, rtol=0, atol=1e-12)
 
 
-def test_a_number_is_a_level_of_how_the_model_is_fed():
+def test_a_number_scales_the_scheduled_sampling_or_noise_of_the_model():
     model = build()
     model.feeding = InputNoise(0.8)
     x = torch.randn(4000, T, D, dtype=torch.float64)

@@ -31,9 +31,9 @@ def test_the_future_begins_after_the_last_target():
     schema = PanelSchema.from_data(panel, CUT)
     windows = ahead(panel, schema)
     batch = windows.all()
-    for n, one in enumerate(panel):
-        np.testing.assert_array_equal(batch["x"][n, :4, 0], one.values[-4:, 0])
-        assert windows.keys[n][1:] == (one.name, len(one) - 4)
+    for n, series in enumerate(panel):
+        np.testing.assert_array_equal(batch["x"][n, :4, 0], series.values[-4:, 0])
+        assert windows.keys[n][1:] == (series.name, len(series) - 4)
     assert batch["mask"][:, :4].all()
     assert not batch["mask"][:, 4:].any()
     for horizon in (1, 7):

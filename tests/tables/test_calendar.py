@@ -1,4 +1,4 @@
-"""Times continue by the calendar step and in the time zone of the table, whatever holds them."""
+"""Future times follow the calendar step and the time zone of a table, in every form of its times."""
 
 from dataclasses import replace
 
@@ -23,9 +23,9 @@ def frame_of(index, **columns):
     return pd.DataFrame({"time": index, "y": values, **columns})
 
 
-def future(frame, steps=8, **told):
+def future(frame, steps=8, **hints):
     """The times after the end of a table."""
-    data = PanelData.of(frame, ColumnHints(("y",), time="time", **told), Cut(2, 1, split="time"))
+    data = PanelData.of(frame, ColumnHints(("y",), time="time", **hints), Cut(2, 1, split="time"))
     windows = data.ahead(steps)
     times, calendar = windows.times(2 + steps)
     return calendar.to_pandas(times[0, 2:])
@@ -35,15 +35,15 @@ def future(frame, steps=8, **told):
     ("step", "zone"), [(step, ZONES[(n + k) % 4]) for n, step in enumerate(STEPS) for k in (n % 2,)]
 )
 def test_times_continue_by_the_calendar(step, zone):
-    """Over both changes of clocks, from the frame and from what it is as a CSV."""
+    """Across both clock changes, from timestamps and from their texts."""
     index = pd.date_range("2023-08-01 00:00", periods=40, freq=step, tz=zone)
     assert future(frame_of(index[:-8])).equals(index[-8:].as_unit("us"))
-    written = index.astype(str)
-    assert future(frame_of(written[:-8]), zone=zone).equals(index[-8:].as_unit("us"))
+    texts = index.astype(str)
+    assert future(frame_of(texts[:-8]), zone=zone).equals(index[-8:].as_unit("us"))
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("times", "expected"),
     [
         (pd.period_range("2023-01", periods=12, freq="M"), "2024-01-01"),
         (pd.date_range("2023-01-01", periods=12, freq="MS") + pd.Timedelta("14D 12h"), "2024-01-15 12:00"),
@@ -55,8 +55,8 @@ def test_times_continue_by_the_calendar(step, zone):
     ],
     ids=["periods", "15th", "30th with a gap", "holidays", "irregular", "new clocks"],
 )  # fmt: skip
-def test_steps_are_found_from_any_day_and_with_missing_rows(given, expected):
-    assert future(frame_of(given))[0] == pd.Timestamp(expected)
+def test_steps_are_inferred_from_any_day_and_with_missing_rows(times, expected):
+    assert future(frame_of(times))[0] == pd.Timestamp(expected)
 
 
 WORKDAYS = [seconds(pd.bdate_range("2024-01-01", periods=count)) for count in (12, 12, 1)]
@@ -70,24 +70,24 @@ WORKDAYS = [seconds(pd.bdate_range("2024-01-01", periods=count)) for count in (1
     ],
     ids=["dates", "numbers"],
 )
-def test_a_short_sequence_continues_as_the_others_or_as_the_training_data(times, calendar, following):
-    series = [Series(f"s{n}", np.zeros((len(own), 1)), own) for n, own in enumerate(times)]
+def test_a_short_sequence_takes_its_step_from_the_others_or_the_training_data(times, calendar, following):
+    series = [Series(f"s{n}", np.zeros((len(steps), 1)), steps) for n, steps in enumerate(times)]
     panel = Panel(series, Columns((Column("y"),)), calendar=calendar.stepping(times))
     schema = PanelSchema.from_data(panel, Cut(1, 1, split="time"))
-    for some in (panel, Panel(series[-1:], panel.columns, calendar=calendar)):
-        np.testing.assert_array_equal(ahead(some, schema, 2).times(3)[0][-1, 1:], following)
+    for table in (panel, Panel(series[-1:], panel.columns, calendar=calendar)):
+        np.testing.assert_array_equal(ahead(table, schema, 2).times(3)[0][-1, 1:], following)
 
 
 BERLIN = pd.date_range("2024-10-26", periods=60, freq="h", tz="Europe/Berlin")
 
 
 @pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
-def test_an_hour_that_clocks_show_twice_is_two_hours(order):
+def test_the_repeated_hour_of_a_clock_change_is_two_hours(order):
     local = BERLIN.tz_localize(None)
     two = frame_of([*BERLIN.astype(str)[order]] * 2, s=np.repeat(["a", "b"], 60))
-    told = {"id": ("s",), "time": "time"}
-    panel = Panel.of(two, ColumnHints(("y",), **told))
-    naive = Panel.of(two.assign(time=[*local[order]] * 2), ColumnHints(("y",), zone="Europe/Berlin", **told))
+    hints = {"id": ("s",), "time": "time"}
+    panel = Panel.of(two, ColumnHints(("y",), **hints))
+    naive = Panel.of(two.assign(time=[*local[order]] * 2), ColumnHints(("y",), zone="Europe/Berlin", **hints))
     for one, other in zip(panel, naive, strict=True):
         np.testing.assert_array_equal(one.times, seconds(BERLIN))
         np.testing.assert_array_equal(other.times, one.times)
@@ -95,7 +95,7 @@ def test_an_hour_that_clocks_show_twice_is_two_hours(order):
 
 
 @pytest.mark.parametrize(
-    ("local", "zone", "said"),
+    ("local", "zone", "message"),
     [
         (BERLIN.tz_localize(None), None, "two rows at time 2024-10-27 02:00:00, 26 and 27; .* clocks were set back"),
         (BERLIN.tz_localize(None).delete(26), "Europe/Berlin", r"row 26 of column 'time' is 2024-10-27 02:00:00, .* "
@@ -105,16 +105,16 @@ def test_an_hour_that_clocks_show_twice_is_two_hours(order):
         (range(9), "Europe/Berln", "zone is 'Europe/Berln'; expected a name such as"),
     ],
 )  # fmt: skip
-def test_what_a_zone_does_not_settle_is_named(local, zone, said):
-    with pytest.raises(ValueError, match=said):
+def test_ambiguous_and_nonexistent_times_are_named(local, zone, message):
+    with pytest.raises(ValueError, match=message):
         future(frame_of(local), zone=zone)
 
 
-def test_days_of_a_zone_that_is_not_named_continue_with_a_warning():
+def test_days_of_an_unnamed_time_zone_cause_a_warning():
     days = pd.date_range("2024-10-20", periods=20, tz="Europe/Berlin")
-    for written in (days.astype(str), days.tz_convert("UTC"), days.tz_convert("UTC").tz_localize(None)):
+    for times in (days.astype(str), days.tz_convert("UTC"), days.tz_convert("UTC").tz_localize(None)):
         with pytest.warns(UserWarning, match="seem to be days of a time zone whose clocks change, .* name the zone"):
-            assert future(frame_of(written))[0].time() == pd.Timestamp("23:00").time()
+            assert future(frame_of(times))[0].time() == pd.Timestamp("23:00").time()
 
 
 SPANS = pd.timedelta_range("0h", periods=30, freq="90min")
@@ -134,10 +134,12 @@ def test_durations_are_times(spans, tmp_path):
 
 
 @pytest.mark.parametrize(("first", "second", "ends"), [(1, 1, "0.5 in row 20"), (1, -1, "18.5 in row 21"), (-1, 1, "")])
-def test_recordings_whose_clocks_overlap_are_not_mingled(first, second, ends):
+def test_recordings_with_overlapping_times_are_an_error(first, second, ends):
     clock = np.concatenate([np.arange(20.0)[::first], 0.5 + np.arange(20)[::second]])
-    said = f"goes back from time .* to {ends}.*; name the id columns that distinguish sequences, or, .* sort its rows"
-    with pytest.raises(ValueError, match=said):
+    message = (
+        f"goes back from time .* to {ends}.*; name the id columns that distinguish sequences, or, .* sort its rows"
+    )
+    with pytest.raises(ValueError, match=message):
         Panel.of(frame_of(clock))
     with pytest.raises(ValueError, match="the table panel goes back from time"):
         Panel.wide(frame_of(clock).set_index("time"))
@@ -149,12 +151,12 @@ def test_recordings_whose_clocks_overlap_are_not_mingled(first, second, ends):
     [np.arange(40)[::-1], np.random.default_rng(0).permutation(40), np.r_[0:9, 12:40, 9:12]],
     ids=["reversed", "shuffled", "late"],
 )
-def test_rows_in_disorder_are_put_in_order(order):
+def test_rows_are_sorted_by_time(order):
     panel = Panel.of(frame_of(np.arange(40.0)).iloc[order])
     np.testing.assert_array_equal(panel.series[0].times, np.arange(40))
 
 
-def test_a_calendar_is_kept_with_a_run_and_checked():
+def test_a_calendar_is_saved_with_a_run_and_validated():
     data = PanelData.of(
         frame_of(pd.date_range("2020", periods=40, freq="MS", tz="Europe/Berlin")), cut=Cut(4, 3, split="time")
     )

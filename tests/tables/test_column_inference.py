@@ -1,4 +1,4 @@
-"""What a table that nobody described is taken for."""
+"""Inference of columns, roles and families for tables without a schema."""
 
 import re
 from decimal import Decimal
@@ -17,7 +17,7 @@ def families(frame):
     return {column.name: (column.role, column.family) for column in infer_columns(frame).columns}
 
 
-def test_families_are_those_that_the_values_have():
+def test_families_are_inferred_from_the_values():
     rng = np.random.default_rng(0)
     frame = pd.DataFrame(
         {
@@ -36,15 +36,15 @@ def test_families_are_those_that_the_values_have():
             "nan": np.nan,
         }
     )
-    with pytest.warns(UserWarning, match="columns left out of the proposed schema") as said:
-        found = {name: family for name, (_, family) in families(frame).items()}
-    (left_out,) = said
-    assert str(left_out.message).endswith(
+    with pytest.warns(UserWarning, match="columns left out of the proposed schema") as warnings:
+        inferred = {name: family for name, (_, family) in families(frame).items()}
+    (warning,) = warnings
+    assert str(warning.message).endswith(
         "'text' (neither numbers nor 2 to 20 classes, such as 'text 0'), 'one' (constant: 'same'), "
         "'level' (constant: '3.5'), 'empty' (empty: all its values are missing), "
         "'nan' (empty: all its values are missing)"
     )
-    assert found == {
+    assert inferred == {
         "real": "real",
         "few": "count",
         "many": "overdispersed",
@@ -54,7 +54,7 @@ def test_families_are_those_that_the_values_have():
         "skewed": "positive",
         "narrow": "real",
     }
-    Panel.of(frame[[*found]])  # and all that is proposed can be read
+    Panel.of(frame[[*inferred]])  # all proposed columns can be read
 
 
 def panel(**more):
@@ -66,36 +66,36 @@ def panel(**more):
 
 
 @pytest.mark.parametrize("ids", [[7, 8, 9], ["a", "b", "c"], [7.0, 8.0, 9.0]])
-def test_ids_are_what_leaves_one_row_at_a_time(ids):
-    found = infer_columns(panel(station=np.repeat(ids, 7), height=np.repeat([1.5, 2.5, 3.5], 7)))
-    assert (found.id, found.time) == (("station",), "day")
-    assert [column.role for column in found.columns] == ["target", "static"]
+def test_ids_leave_one_row_for_each_time(ids):
+    columns = infer_columns(panel(station=np.repeat(ids, 7), height=np.repeat([1.5, 2.5, 3.5], 7)))
+    assert (columns.id, columns.time) == (("station",), "day")
+    assert [target_or_static.role for target_or_static in columns.columns] == ["target", "static"]
 
 
-def test_what_repeats_but_is_not_needed_to_tell_rows_apart_is_no_id():
+def test_a_repeating_column_that_is_not_needed_is_no_id():
     weather = np.random.default_rng(1).choice(["rain", "sun", "fog"], 21)
     frame = panel(weather=weather, place=np.repeat(["a", "b", "c"], 7))
     assert frame.duplicated(["day", "weather"]).any()
-    found = infer_columns(frame)
-    assert found.id == ("place",)
-    assert [column.name for column in found.columns] == ["riders", "weather"]
+    columns = infer_columns(frame)
+    assert columns.id == ("place",)
+    assert [column.name for column in columns.columns] == ["riders", "weather"]
 
 
-def test_two_columns_are_the_id_where_one_is_not_enough():
+def test_two_columns_are_the_id_if_one_is_not_enough():
     frame = panel(region=np.repeat(["n", "n", "s"], 7), line=np.repeat(["a", "b", "a"], 7))
     assert set(infer_columns(frame).id) == {"region", "line"}
 
 
-def test_a_table_of_one_sequence_has_its_id_too():
+def test_a_table_of_one_sequence_has_an_id():
     frame = panel(station_id=5).iloc[:7]
-    found = infer_columns(frame)
-    assert found.id == ("station_id",)
-    assert [column.name for column in found.columns] == ["riders"]
+    columns = infer_columns(frame)
+    assert columns.id == ("station_id",)
+    assert [column.name for column in columns.columns] == ["riders"]
     assert Panel.of(frame).series[0].name == "5"
 
 
 def shops(days, format):
-    """Shops and their cities, a row for each day."""
+    """Daily sales of shops in two cities."""
     frame = pd.DataFrame({"date": np.tile(days.strftime(format), 6), "shop": np.repeat(list("abcdef"), len(days))})
     return frame.assign(
         city=np.repeat(["n", "s"], 3 * len(days)), sold=np.random.default_rng(0).normal(size=len(frame))
@@ -103,7 +103,7 @@ def shops(days, format):
 
 
 @pytest.mark.parametrize("format", ["%d/%m/%Y", "%d.%m.%Y", "%m/%d/%Y", "%d-%m-%Y"])
-def test_one_day_above_12_tells_days_from_months(format):
+def test_one_day_above_12_distinguishes_days_from_months(format):
     for first in ("2024-01-01", "2024-01-15"):
         days = pd.date_range(first, periods=13)
         panel = Panel.of(shops(days, format))
@@ -114,22 +114,22 @@ def test_one_day_above_12_tells_days_from_months(format):
 
 @pytest.mark.parametrize("format", ["%d/%m/%Y", "%m.%d.%Y", "%d/%m/%y"])
 @pytest.mark.parametrize("freq", ["D", "MS"])
-def test_dates_whose_day_and_month_cannot_be_told_apart_are_said_to_be(format, freq):
+def test_ambiguous_days_and_months_cause_a_warning_or_an_error(format, freq):
     frame = shops(pd.date_range("2024-01-01", periods=12, freq=freq), format)
     with pytest.warns(UserWarning, match=r"'date' \(perhaps the time: dates such as '01.01.(20)?24' .* as 2024-12-31"):
-        found = infer_columns(frame)
-    assert (found.id, found.time) == (("shop",), None)  # and they tell rows apart
-    assert "date" not in found.names
+        columns = infer_columns(frame)
+    assert (columns.id, columns.time) == (("shop",), None)  # the dates distinguish rows
+    assert "date" not in columns.names
     with pytest.warns(UserWarning, match="perhaps the time"):
         ColumnHints(columns=("sold",)).of(frame)
     with pytest.raises(ValueError, match=r"column 'date': dates such as '01.01.(20)?24'"):
         Panel.of(frame, ColumnHints(time="date"))
     with pytest.raises(ValueError, match=r"dates such as '01.01.(20)?24'"):
         Panel.wide(frame.pivot(index="date", columns="shop", values="sold"))
-    ColumnHints(columns=("sold",), past=("date:category",), id=("shop",)).of(frame)  # what is named is not left out
+    ColumnHints(columns=("sold",), past=("date:category",), id=("shop",)).of(frame)  # a named column is not left out
 
 
-def test_a_constant_column_is_a_target_only_where_it_is_named():
+def test_a_constant_column_is_a_target_only_if_named():
     frame = pd.DataFrame({"y": [1.5, 2.5, -1.0], "rate": [3.5, 3.5, 3.5]})
     with pytest.warns(UserWarning, match=r"columns left out of the proposed schema: 'rate' \(constant: '3.5'\)"):
         assert infer_columns(frame).names == ["y"]
@@ -143,17 +143,17 @@ def test_periods_are_the_time(freq):
     assert Panel.of(frame).calendar.kind == "dates"
 
 
-def test_the_numbers_of_rows_that_pandas_writes_are_left_out():
+def test_row_numbers_of_pandas_are_left_out():
     frame = panel(station=np.repeat(["a", "b", "c"], 7))
-    written = frame.reset_index(names="Unnamed: 0")
+    numbered = frame.reset_index(names="Unnamed: 0")
     with pytest.warns(UserWarning, match=r"'Unnamed: 0' \(row numbers without a name\)"):
-        assert infer_columns(written) == infer_columns(frame)
-    measured = written.assign(**{"Unnamed: 0": frame.riders})
+        assert infer_columns(numbered) == infer_columns(frame)
+    measured = numbered.assign(**{"Unnamed: 0": frame.riders})
     assert "Unnamed: 0" in infer_columns(measured).names
-    assert ColumnHints(columns=("riders",), past=("Unnamed: 0",)).of(written).names == ["riders", "Unnamed: 0"]
+    assert ColumnHints(columns=("riders",), past=("Unnamed: 0",)).of(numbered).names == ["riders", "Unnamed: 0"]
 
 
-def test_numbers_that_are_written_as_texts_are_named():
+def test_numbers_with_a_unit_sign_are_named():
     prices = [f"{n},234.50 €" for n in range(10, 31)]
     with pytest.warns(
         UserWarning, match="columns left out of the proposed schema: 'price' .*, such as '10,234.50 €'; remove '€'"
@@ -161,39 +161,39 @@ def test_numbers_that_are_written_as_texts_are_named():
         assert "price" not in infer_columns(panel(price=prices)).names
 
 
-def test_texts_of_which_one_is_a_date_are_no_dates():
+def test_texts_with_a_single_date_are_no_dates():
     frame = panel(said=["1/2/2024", *(f"{n}th of them" for n in range(20))])
     with pytest.warns(UserWarning, match=r"'said' \(neither numbers nor 2 to 20 classes, such as '1/2/2024'\)"):
         infer_columns(frame.drop(columns="day"))
 
 
-def test_dates_with_offsets_that_change_are_a_time():
+def test_dates_with_changing_utc_offsets_are_a_time():
     frame = pd.DataFrame({"when": ["2020-03-28T00:00+01:00", "2020-03-30T00:00+02:00"], "y": [1.5, 2.5]})
     assert infer_columns(frame).time == "when"
 
 
-def test_numbers_with_the_name_of_a_time_are_one():
+def test_numbers_named_as_a_time_are_a_time():
     frame = pd.DataFrame({"y": [0.5, 1.5, 2.5], "year": [2001, 2002, 2003]})
     assert infer_columns(frame).time == "year"
     assert infer_columns(frame.rename(columns={"year": "yearly"})).time is None
 
 
-def test_what_is_told_goes_before_what_is_proposed():
+def test_hints_override_inference():
     frame = panel(
         station=np.repeat([7, 8, 9], 7), plan=np.arange(21.0), temp=np.arange(21) % 5, mood=["u", "v", "w"] * 7
     )
-    found = ColumnHints(covariates=("plan",), past=("temp", "mood:category")).of(frame)
-    assert [(c.name, c.role, c.family) for c in found.columns] == [
+    columns = ColumnHints(covariates=("plan",), past=("temp", "mood:category")).of(frame)
+    assert [(c.name, c.role, c.family) for c in columns.columns] == [
         ("riders", "target", "count"),
         ("plan", "known", "real"),
         ("temp", "past", "real"),
         ("mood", "past", "category"),
     ]
-    named = ColumnHints(columns=("riders:overdispersed:people",), static=("station",)).of(
+    hinted = ColumnHints(columns=("riders:overdispersed:people",), static=("station",)).of(
         frame.assign(a=np.repeat([1, 2, 3], 7))
     )
-    assert next((c.name, c.family, c.unit) for c in named.columns) == ("riders", "overdispersed", "people")
-    assert [c.name for c in named.targets] == ["riders"]
+    assert next((c.name, c.family, c.unit) for c in hinted.columns) == ("riders", "overdispersed", "people")
+    assert [c.name for c in hinted.targets] == ["riders"]
 
 
 def test_a_name_may_have_colons():
@@ -204,7 +204,7 @@ def test_a_name_may_have_colons():
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("hints", "message"),
     [
         ({"columns": ("ridrs",)}, r"no column 'ridrs' \(did you mean 'riders'\?\)"),
         ({"id": ("dy",)}, r"no column 'dy' \(did you mean 'day'\?\)"),
@@ -216,62 +216,62 @@ def test_a_name_may_have_colons():
         ({"covariates": ("riders",)}, "no column is a target"),
     ],
 )
-def test_what_is_told_wrongly_is_refused(told, said):
-    with pytest.raises(ValueError, match=said):
-        ColumnHints(**told).of(panel().iloc[:7])
+def test_wrong_hints_are_an_error(hints, message):
+    with pytest.raises(ValueError, match=message):
+        ColumnHints(**hints).of(panel().iloc[:7])
 
 
 def hourly(days=14):
-    """A load on every hour."""
+    """An hourly load."""
     return pd.DataFrame(
         {"when": pd.date_range("2024-01-01", periods=24 * days, freq="h"), "load": np.arange(24.0 * days)}
     )
 
 
 SPLIT_TIMES = {
-    "date and clock": lambda when: {"Date": when.dt.strftime("%Y-%m-%d"), "Time": when.dt.strftime("%H:%M:%S")},
-    "clock first": lambda when: {"Time": when.dt.strftime("%H:%M"), "Date": when.dt.strftime("%d.%m.%Y")},
-    "half days": lambda when: {"Date": when.dt.strftime("%Y-%m-%d"), "Time": when.dt.strftime("%I:%M %p")},
-    "objects": lambda when: {"Date": when.dt.normalize(), "Time": when.dt.time},
-    "hour": lambda when: {"date": when.dt.strftime("%Y-%m-%d"), "hour": when.dt.hour},
-    "compact": lambda when: {"date": when.dt.strftime("%Y%m%d").astype(int), "time": when.dt.hour * 100},
-    "hundreds": lambda when: {"date": when.dt.strftime("%Y-%m-%d"), "time": when.dt.strftime("%H%M")},
-    "parts": lambda when: {name: getattr(when.dt, name) for name in ("year", "month", "day", "hour")},
-    "parts in text": lambda when: (
-        {"DAY": when.dt.strftime("%d"), "MONTH": when.dt.strftime("%b"), "YEAR": "2024"}
-        | {"HOUR": when.dt.strftime("%H")}
+    "date and clock": lambda times: {"Date": times.dt.strftime("%Y-%m-%d"), "Time": times.dt.strftime("%H:%M:%S")},
+    "clock first": lambda times: {"Time": times.dt.strftime("%H:%M"), "Date": times.dt.strftime("%d.%m.%Y")},
+    "half days": lambda times: {"Date": times.dt.strftime("%Y-%m-%d"), "Time": times.dt.strftime("%I:%M %p")},
+    "objects": lambda times: {"Date": times.dt.normalize(), "Time": times.dt.time},
+    "hour": lambda times: {"date": times.dt.strftime("%Y-%m-%d"), "hour": times.dt.hour},
+    "compact": lambda times: {"date": times.dt.strftime("%Y%m%d").astype(int), "time": times.dt.hour * 100},
+    "hundreds": lambda times: {"date": times.dt.strftime("%Y-%m-%d"), "time": times.dt.strftime("%H%M")},
+    "parts": lambda times: {name: getattr(times.dt, name) for name in ("year", "month", "day", "hour")},
+    "parts in text": lambda times: (
+        {"DAY": times.dt.strftime("%d"), "MONTH": times.dt.strftime("%b"), "YEAR": "2024"}
+        | {"HOUR": times.dt.strftime("%H")}
     ),
-    "day of the year": lambda when: {"Year": when.dt.year, "doy": when.dt.day_of_year, "Hour": when.dt.hour},
+    "day of the year": lambda times: {"Year": times.dt.year, "doy": times.dt.day_of_year, "Hour": times.dt.hour},
 }
 
 
-@pytest.mark.parametrize("how", SPLIT_TIMES)
+@pytest.mark.parametrize("form", SPLIT_TIMES)
 @pytest.mark.parametrize("shops", [1, 2])
-def test_columns_that_are_one_time_are_joined(how, shops):
+def test_columns_of_one_time_are_joined(form, shops):
     frame = hourly()
-    parts = pd.DataFrame({**SPLIT_TIMES[how](frame.when), "sky": np.where(frame.load % 5, "sun", "rain")})
+    parts = pd.DataFrame({**SPLIT_TIMES[form](frame.when), "sky": np.where(frame.load % 5, "sun", "rain")})
     parts = parts.assign(No=np.arange(1, len(frame) + 1), load=frame.load)
     if shops > 1:
         parts = pd.concat([parts.assign(shop="b"), parts.assign(shop="a")]).sort_index(kind="stable").drop(columns="No")
     else:
         with pytest.warns(UserWarning, match=r"'No' \(row numbers\)"):
             infer_columns(parts)
-    found = infer_columns(parts.drop(columns="No", errors="ignore"))
-    assert len(found.times) > 1
-    assert found.id == (("shop",) if shops > 1 else ())
-    assert found.names == ["sky", "load"]
-    assert Columns.from_toml(found.to_toml()) == Columns.from_config(found.config()) == found
-    panel = Panel.of(parts, found)
+    columns = infer_columns(parts.drop(columns="No", errors="ignore"))
+    assert len(columns.times) > 1
+    assert columns.id == (("shop",) if shops > 1 else ())
+    assert columns.names == ["sky", "load"]
+    assert Columns.from_toml(columns.to_toml()) == Columns.from_config(columns.config()) == columns
+    panel = Panel.of(parts, columns)
     assert panel.calendar.kind == "dates"
     for one in panel:
         np.testing.assert_array_equal(one.times, frame.when.astype("datetime64[s]").astype(int))
         np.testing.assert_array_equal(one.values[:, 1], frame.load)
 
 
-def test_a_clock_is_not_joined_where_the_date_suffices():
+def test_a_clock_is_not_joined_if_the_date_suffices():
     frame = panel(station=np.repeat(["a", "b", "c"], 7), opened=["09:30"] * 20 + ["10:00"])
-    found = infer_columns(frame)
-    assert (found.id, found.time) == (("station",), "day")
+    columns = infer_columns(frame)
+    assert (columns.id, columns.time) == (("station",), "day")
     days = pd.DataFrame({"day": np.repeat([1, 2], 24), "hour": np.tile(np.arange(24), 2), "y": np.arange(48) / 8})
     assert infer_columns(days).time == ("day", "hour")
     np.testing.assert_array_equal(Panel.of(days).series[0].times, np.arange(24, 72))
@@ -285,20 +285,20 @@ def test_a_clock_is_not_joined_where_the_date_suffices():
     assert Panel.of(quarters).series[0].times[4] == pd.Timestamp("2021").timestamp()
 
 
-def test_parts_that_are_no_time_are_named():
+def test_invalid_parts_of_a_time_are_named():
     frame = pd.DataFrame({"year": [2023, 2023], "month": [2, 2], "day": [28, 29], "hour": [0, 25], "y": [0.5, 1.5]})
     frame["minute"] = [0, 30]
-    for parts, said in [
+    for parts, message in [
         (("year", "month", "day"), "row 1 of year month day is not a date: 2023-02 has no day 29"),
         (("year", "month", "hour"), "row 0 of column 'hour' is 0; expected days from 1"),
         (("year", "month", "minute"), "year month minute have a minute without the next larger unit"),
         (("year", "y"), "row 0 of column 'y' is 0.5; expected months from 1 to 12"),
     ]:
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             Panel.of(frame, ColumnHints(columns=("y",) if "y" not in parts else ("hour",), time=parts))
 
 
-def test_what_merely_makes_rows_unique_is_no_id():
+def test_a_column_that_only_makes_rows_unique_is_no_id():
     days = pd.date_range("2024-01-01", periods=40).strftime("%Y-%m-%d")
     frame = pd.DataFrame({"day": [*days, days[5], days[20]], "sky": ["sun", "rain"] * 20 + ["sun", "rain"]})
     frame = frame.assign(
@@ -314,23 +314,23 @@ def test_what_merely_makes_rows_unique_is_no_id():
 def test_levels_of_an_index_are_ids_and_time(names):
     index = pd.MultiIndex.from_product([[11, 12, 13], [2000, 2001, 2002, 2003]], names=names)
     frame = pd.DataFrame({"y": np.arange(12) / 8}, index=index)
-    read = Panel.of(frame)
-    assert [one.name for one in read] == ["11", "12", "13"]
-    assert read.columns.names == ["y"]
-    np.testing.assert_array_equal(read.series[1].times, [2000, 2001, 2002, 2003])
+    panel = Panel.of(frame)
+    assert [one.name for one in panel] == ["11", "12", "13"]
+    assert panel.columns.names == ["y"]
+    np.testing.assert_array_equal(panel.series[1].times, [2000, 2001, 2002, 2003])
     stacked = pd.concat({1: frame.iloc[:4].reset_index(drop=True), 2: frame.iloc[4:8].reset_index(drop=True)})
     assert [len(one) for one in Panel.of(stacked)] == [4, 4]
 
 
 @pytest.mark.parametrize("ids", [["07", "7"], ["1E5", "100000"], ["NA", "None"], ["0x10", "16"]])
 def test_ids_and_classes_are_text(tmp_path, ids):
-    rows = [f"{one},{t},{t}.5,{ids[t % 2]}" for one in ids for t in range(4)]
+    rows = [f"{sequence},{t},{t}.5,{ids[t % 2]}" for sequence in ids for t in range(4)]
     (tmp_path / "a.csv").write_text("\n".join(["station,t,y,sky", *rows]) + "\n")
-    read = read_panel(tmp_path / "a.csv", ColumnHints(columns=("y", "sky:category")))
-    assert {one.name for one in read} == {*ids}
-    assert read.columns.columns[1].classes == tuple(sorted(ids))
-    for one in read:
-        np.testing.assert_array_equal(one.values[:, 1], [sorted(ids).index(ids[t % 2]) for t in range(4)])
+    panel = read_panel(tmp_path / "a.csv", ColumnHints(columns=("y", "sky:category")))
+    assert {sequence.name for sequence in panel} == {*ids}
+    assert panel.columns.columns[1].classes == tuple(sorted(ids))
+    for sequence in panel:
+        np.testing.assert_array_equal(sequence.values[:, 1], [sorted(ids).index(ids[t % 2]) for t in range(4)])
 
 
 @pytest.mark.parametrize(
@@ -346,14 +346,14 @@ def test_ids_and_classes_are_text(tmp_path, ids):
     ],
     ids=["comma", "point", "spaces", "signs", "decimals", "booleans", "digits"],
 )
-def test_numbers_are_read_however_they_are_written(cells, values):
-    read = Panel.of(pd.DataFrame({"t": [1, 2, 3], "y": cells}))
-    assert read.columns.columns[0].family != "category"
-    np.testing.assert_array_equal(read.series[0].values[:, 0], values)
+def test_numbers_are_read_in_every_notation(cells, values):
+    panel = Panel.of(pd.DataFrame({"t": [1, 2, 3], "y": cells}))
+    assert panel.columns.columns[0].family != "category"
+    np.testing.assert_array_equal(panel.series[0].values[:, 0], values)
 
 
 def texted(*odd, count=60):
-    """A column of numbers in text, with some other cells."""
+    """A column of numbers as text, with some other cells."""
     cells = [f"{n}.25" for n in range(count)]
     cells[20 : 20 + len(odd)] = odd
     return pd.DataFrame({"day": pd.date_range("2024-01-01", periods=count), "power": cells})
@@ -363,18 +363,18 @@ def texted(*odd, count=60):
 def test_marks_among_numbers_are_missing_and_named(mark):
     with pytest.warns(
         UserWarning, match=f"'power' holds {re.escape(repr(mark))} .row 20, 2 in all. among numbers"
-    ) as said:
-        read = Panel.of(texted(mark, mark))
-    assert len(said) == 1
-    assert read.columns.na_values == (mark,)
-    assert np.isnan(read.series[0].values[20:22, 0]).all()
-    np.testing.assert_array_equal(np.delete(read.series[0].values[:, 0], [20, 21]) % 1, 0.25)
-    Panel.of(texted(mark), read.columns)  # and again without a warning
+    ) as warnings:
+        panel = Panel.of(texted(mark, mark))
+    assert len(warnings) == 1
+    assert panel.columns.na_values == (mark,)
+    assert np.isnan(panel.series[0].values[20:22, 0]).all()
+    np.testing.assert_array_equal(np.delete(panel.series[0].values[:, 0], [20, 21]) % 1, 0.25)
+    Panel.of(texted(mark), panel.columns)  # the second read does not warn
     with pytest.warns(UserWarning, match="read as missing"):
         Panel.of(texted(mark), Columns((Column("power"),), time="day"))
 
 
-def test_cells_that_are_no_numbers_are_named_with_what_settles_them():
+def test_cells_that_are_no_numbers_are_named_with_a_remedy():
     for columns in (None, Columns((Column("power"),), time="day"), ["power"]):
         with pytest.raises(ValueError, match=r"'power': 58 of 60 values are numbers; row 20 is 'off', .* na_values"):
             Panel.of(texted("off", "on"), columns)
@@ -384,50 +384,50 @@ def test_cells_that_are_no_numbers_are_named_with_what_settles_them():
     assert Panel.of(texted("off"), ColumnHints(columns=("power:category",))).columns.columns[0].family == "category"
 
 
-def test_declared_marks_and_signs_are_read(tmp_path):
+def test_declared_missing_marks_and_decimal_signs_are_read(tmp_path):
     rows = [f'{3 * n},"1,234",?\n{3 * n + 1},-999,sun\n{3 * n + 2},"5,678",rain\n' for n in range(9)]
     (tmp_path / "a.csv").write_text("t,y,sky\n" + "".join(rows))
     (tmp_path / "a.toml").write_text('time = "t"\nna_values = ["-999", "?"]\ndecimal = ","\n')
     with pytest.raises(ValueError, match="'y' holds '1,234', which may be 1234 or a fraction; give the decimal sign"):
         read_panel(tmp_path / "a.csv", ColumnHints(na_values=("-999",)))
-    data = PanelData.open(tmp_path / "a.csv")  # a schema without columns: they are proposed
+    data = PanelData.open(tmp_path / "a.csv")  # a schema without columns: they are inferred
     assert data.panel.columns.columns[1].classes == ("rain", "sun")
     np.testing.assert_array_equal(data.panel.series[0].values[:3], [[1.234, np.nan], [np.nan, 1], [5.678, 0]])
-    again = PanelData.reopened(data.recorded(), data.schema)
-    assert again.fingerprint == data.fingerprint
+    reopened = PanelData.reopened(data.recorded(), data.schema)
+    assert reopened.fingerprint == data.fingerprint
 
 
 @pytest.mark.parametrize("sign", [",", "."])
 @pytest.mark.parametrize("separator", [";", "\t", "|"])
-def test_thousands_are_not_divided(tmp_path, sign, separator):
+def test_thousands_are_not_read_as_fractions(tmp_path, sign, separator):
     other = {",": ".", ".": ","}[sign]
     grouped = [f"{n:,}".replace(",", sign) for n in range(700, 2500, 30)]
     days = pd.date_range("2024-01-01", periods=60).strftime("%Y-%m-%d")
 
-    def read(told=None, **columns):
+    def read_columns(columns_or_hints=None, **columns):
         names = ["day", *columns]
         lines = [separator.join(row) for row in zip(days, *columns.values(), strict=True)]
         (tmp_path / "a.csv").write_text("\n".join([separator.join(names), *lines]) + "\n")
-        return read_panel(tmp_path / "a.csv", told)
+        return read_panel(tmp_path / "a.csv", columns_or_hints)
 
-    said = f"'{{}}' holds '1{sign}000', which may be 1000 or a fraction; give the decimal sign"
-    for told in (None, ColumnHints(columns=("sales:real",))):
-        with pytest.raises(ValueError, match=said.format("sales")):
-            read(told, sales=grouped)
-    with pytest.raises(ValueError, match=said.format("step")):
-        read(Columns((Column("y"),), time="step"), step=[f"1{sign}{n:03}" for n in range(60)], y=["1"] * 60)
+    message = f"'{{}}' holds '1{sign}000', which may be 1000 or a fraction; give the decimal sign"
+    for columns_or_hints in (None, ColumnHints(columns=("sales:real",))):
+        with pytest.raises(ValueError, match=message.format("sales")):
+            read_columns(columns_or_hints, sales=grouped)
+    with pytest.raises(ValueError, match=message.format("step")):
+        read_columns(Columns((Column("y"),), time="step"), step=[f"1{sign}{n:03}" for n in range(60)], y=["1"] * 60)
     prices = [f"1{sign}000{other}5", *(f"{n}{other}25" for n in range(59))]
-    for told in (ColumnHints(decimal=other), None) if sign == "," else (ColumnHints(decimal=other),):
-        panel = read(told, sales=grouped, price=prices)
+    for columns_or_hints in (ColumnHints(decimal=other), None) if sign == "," else (ColumnHints(decimal=other),):
+        panel = read_columns(columns_or_hints, sales=grouped, price=prices)
         np.testing.assert_array_equal(panel.series[0].values[:, 0], np.arange(700, 2500, 30))
 
 
-@pytest.mark.parametrize("bad", ["2024-02-30", "2024-13-01", "2024-01-xx", "soon"])
-def test_one_cell_that_is_no_date_is_named(bad):
-    days = [*pd.date_range("2024-01-01", periods=30).strftime("%Y-%m-%d"), bad]
+@pytest.mark.parametrize("cell", ["2024-02-30", "2024-13-01", "2024-01-xx", "soon"])
+def test_a_single_cell_that_is_no_date_is_named(cell):
+    days = [*pd.date_range("2024-01-01", periods=30).strftime("%Y-%m-%d"), cell]
     for order in (1, -1):
         frame = pd.DataFrame({"day": days[::order], "y": np.arange(31) / 8})
-        with pytest.raises(ValueError, match=f"'day': 30 of 31 values are dates; row {days[::order].index(bad)} is"):
+        with pytest.raises(ValueError, match=f"'day': 30 of 31 values are dates; row {days[::order].index(cell)} is"):
             Panel.of(frame)
 
 
@@ -446,11 +446,11 @@ def test_classes_that_may_be_numbers_are_named(cells):
     frame = pd.DataFrame({"t": range(24), "y": (cells * 24)[:24]})
     with pytest.warns(
         UserWarning, match="'y' is proposed as a category, and some of its classes may be numbers"
-    ) as said:
+    ) as warnings:
         assert infer_columns(frame).columns[0].family == "category"
     unit = next((unit for unit in ("kg", "%", "$") if unit in cells[0]), None)
-    assert (f"remove '{unit}'" in str(said[0].message)) == (unit is not None)
-    Panel.of(frame, ColumnHints(columns=("y:category",)))  # what is declared is not named
+    assert (f"remove '{unit}'" in str(warnings[0].message)) == (unit is not None)
+    Panel.of(frame, ColumnHints(columns=("y:category",)))  # a declared category does not warn
 
 
 def test_classes_that_only_contain_digits_are_no_numbers():
@@ -459,7 +459,7 @@ def test_classes_that_only_contain_digits_are_no_numbers():
 
 
 @pytest.mark.parametrize(
-    ("cells", "said"),
+    ("cells", "message"),
     [
         ([f"{n // 60:02}:{n % 60:02}" for n in range(90)], r"perhaps a time, such as '00:00'; write it with its date"),
         ([f"{n:02}:05.{n % 10}" for n in range(90)], "perhaps a time, such as '00:05.0'"),
@@ -469,15 +469,15 @@ def test_classes_that_only_contain_digits_are_no_numbers():
         ([None] * 90, "empty: all its values are missing"),
     ],
 )
-def test_every_column_has_the_reason_why_it_is_no_target(cells, said):
+def test_each_column_left_out_has_a_reason(cells, message):
     frame = pd.DataFrame({"t": cells, "y": np.arange(90) / 8})
-    with pytest.warns(UserWarning, match=rf"left out .*'t' \(.*{said}"):
+    with pytest.warns(UserWarning, match=rf"left out .*'t' \(.*{message}"):
         infer_columns(frame)
-    with pytest.raises(ValueError, match=rf"no column can be a target: 't' \(.*{said}.*, 'u' \(constant"):
+    with pytest.raises(ValueError, match=rf"no column can be a target: 't' \(.*{message}.*, 'u' \(constant"):
         infer_columns(pd.DataFrame({"t": cells, "u": "same"}))
 
 
-def test_separators_that_are_not_found_are_named(tmp_path):
+def test_an_unknown_separator_is_an_error(tmp_path):
     (tmp_path / "a.csv").write_text("day x y\n" + "".join(f"{n} {n}.5 3\n" for n in range(30)))
     with pytest.raises(
         ValueError, match=r"'day x y' \(neither .*; separators are , ; tab and [|], others are named by"
@@ -485,7 +485,7 @@ def test_separators_that_are_not_found_are_named(tmp_path):
         read_panel(tmp_path / "a.csv")
 
 
-def test_steps_in_columns_are_named():
+def test_steps_in_columns_cause_a_warning():
     wide = pd.DataFrame({f"d_{n}": np.arange(5) + n / 8 for n in range(60)})
     with pytest.warns(UserWarning, match=r"60 columns, 'd_0' to 'd_59', are numbered; .* frame.melt\(\[\], var_name"):
         infer_columns(wide)
@@ -526,10 +526,10 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_another_layout_is_refused_with_what_was_seen(tmp_path, layout):
-    content, said = LAYOUTS[layout]
+def test_another_layout_is_an_error_that_describes_it(tmp_path, layout):
+    content, message = LAYOUTS[layout]
     (tmp_path / "a.csv").write_text(content)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_panel(tmp_path / "a.csv")
 
 
@@ -542,7 +542,7 @@ def test_empty_rows_at_the_end_are_left_out_and_empty_lines_are_named(tmp_path):
         assert len(read_frame(tmp_path / "a.csv")) == 2
 
 
-def test_ids_count_where_no_time_repeats():
+def test_ids_separate_sequences_even_if_no_time_repeats():
     firms = pd.DataFrame({"year": [2000, 2001] * 2, "y": [0.5, 1.5, 2.5, 3.5]}, pd.Index([7, 7, 9, 9], name="firm"))
     assert [one.name for one in Panel.of(firms)] == ["7", "9"]
     frame = pd.DataFrame({"patient": [7, 7, 7, 3, 3], "t": [0.5, 2.0, 3.5, 1.0, 7.0], "y": np.arange(5) / 4})

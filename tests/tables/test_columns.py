@@ -1,4 +1,4 @@
-"""What columns are told to be comes back as it was written, and what is no schema is refused in a sentence."""
+"""A schema of columns survives writing and reading, and an invalid one is an error of one sentence."""
 
 import json
 import tomllib
@@ -28,11 +28,11 @@ def column(draw, name, role):
 @st.composite
 def schemas(draw):
     names = iter(draw(st.lists(NAMES.filter(bool), min_size=7, max_size=9, unique=True)))
-    told = {"id": (next(names), next(names))[: draw(st.integers(0, 2))]}
-    told |= {name: draw(st.none() | st.just(next(names))) for name in ("time", "group", "split")}
-    told |= {"zone": draw(st.sampled_from([None, "Europe/Berlin", "+02:00"]))} if told["time"] else {}
+    special = {"id": (next(names), next(names))[: draw(st.integers(0, 2))]}
+    special |= {name: draw(st.none() | st.just(next(names))) for name in ("time", "group", "split")}
+    special |= {"zone": draw(st.sampled_from([None, "Europe/Berlin", "+02:00"]))} if special["time"] else {}
     roles = ["target", *draw(st.lists(st.sampled_from(["target", "known", "past", "static"]), max_size=3))]
-    return Columns(tuple(draw(column(name, role)) for name, role in zip(names, roles, strict=False)), **told)
+    return Columns(tuple(draw(column(name, role)) for name, role in zip(names, roles, strict=False)), **special)
 
 
 @given(
@@ -49,14 +49,14 @@ def schemas(draw):
     )
     | st.just(Cut()),
 )
-def test_a_schema_comes_back_from_toml_with_its_cut_and_from_json(columns, cut):
+def test_a_schema_survives_toml_with_its_cut_and_json(columns, cut):
     assert Columns.from_toml(columns.to_toml()) == columns
     assert read_schema(written_schema(columns, cut)) == (columns, cut)
     assert Columns.from_config(json.loads(json.dumps(columns.config()))) == columns
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("tme = 'x'\n[columns.a]", r"entry 'tme' \(did you mean 'time'\?\)"),
         ("[columns.a]\nfamly = 'count'", r"column 'a' has an entry 'famly' \(did you mean 'family'\?\)"),
@@ -78,12 +78,12 @@ def test_a_schema_comes_back_from_toml_with_its_cut_and_from_json(columns, cut):
         ("\n".join(f"[columns.a{n}]" for n in range(MOST + 1)), f"at most {MOST} are read"),
     ],
 )
-def test_what_is_no_schema_is_refused_in_a_sentence(text, said):
-    with pytest.raises(ValueError, match=said):
+def test_an_invalid_schema_is_an_error_of_one_sentence(text, message):
+    with pytest.raises(ValueError, match=message):
         read_schema(text)
 
 
-def test_a_category_has_so_many_classes_at_most_and_dots_in_them_are_none_of_keys():
+def test_a_category_has_a_maximal_number_of_classes_and_they_may_contain_dots():
     classes = tuple(f"A{n}.{n}" for n in range(300))
     columns = Columns((Column("a.b.c", family="category", classes=classes),))
     assert Columns.from_toml(columns.to_toml()) == columns
@@ -102,26 +102,26 @@ def test_a_category_has_so_many_classes_at_most_and_dots_in_them_are_none_of_key
     ],
     ids=["lists", "key", "quoted", "within"],
 )
-def test_tables_within_tables_without_end_are_refused(text, monkeypatch):
-    if "." in text:  # of dotted keys tomllib takes the square of the time
+def test_deeply_nested_tables_are_an_error(text, monkeypatch):
+    if "." in text:  # tomllib takes quadratic time for dotted keys
         monkeypatch.setattr(tomllib, "loads", None)
     with pytest.raises(ValueError, match="nested too deeply"):
         parsed(text)
 
 
-def test_a_column_is_corrected_alone_and_where_it_stands():
+def test_correcting_a_column_keeps_its_place_and_the_others():
     sky = Column("sky", family="category", classes=("clear", "rain"))
     columns = Columns((sky, Column("riders"), Column("plan", "known")), ("station",), "day")
-    found = columns.but("riders", family="count", unit="people").but("sky", role="known")
-    assert found.columns[1:] == (Column("riders", family="count", unit="people"), Column("plan", "known"))
-    assert found.columns[0].classes == sky.classes
-    assert (found.id, found.time) == (columns.id, columns.time)
+    corrected = columns.but("riders", family="count", unit="people").but("sky", role="known")
+    assert corrected.columns[1:] == (Column("riders", family="count", unit="people"), Column("plan", "known"))
+    assert corrected.columns[0].classes == sky.classes
+    assert (corrected.id, corrected.time) == (columns.id, columns.time)
     assert columns.but("sky", family="binary").columns[0] == Column("sky", family="binary")
     assert columns.without("plan", "sky").names == ["riders"]
-    for wrong, said in [
+    for call, message in [
         (lambda: columns.but("ridrs", unit="people"), r"no column 'ridrs' \(did you mean 'riders'\?\)"),
         (lambda: columns.without("sky", "riders"), "no column is a target"),
         (lambda: columns.without("pln"), r"no column 'pln' \(did you mean 'plan'\?\)"),
     ]:
-        with pytest.raises(ValueError, match=said):
-            wrong()
+        with pytest.raises(ValueError, match=message):
+            call()

@@ -1,4 +1,4 @@
-"""Who reads covariates, gaps and statics, and that the units of columns are a change of variables."""
+"""Which factors read covariates, gaps and static values; units of columns are a change of variables."""
 
 import math
 from dataclasses import replace
@@ -27,61 +27,61 @@ SCHEMA = PanelSchema(
 )
 
 
-def test_factors_read_what_is_given_at_their_step():
+def test_factors_read_covariates_of_their_step():
     pair = Factorization.parse("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t, c_{t-1})")
-    found = pair.given(["c", "d"], ["s"])
-    assert found.given(["c", "d"], ["s"]) == found
-    assert found == Factorization.parse("p(w) p(z_t | z_{t-1}, w, c_t, d_t, s) p(x_t | z_t, c_{t-1}, d_t, s)")
+    extended = pair.given(["c", "d"], ["s"])
+    assert extended.given(["c", "d"], ["s"]) == extended
+    assert extended == Factorization.parse("p(w) p(z_t | z_{t-1}, w, c_t, d_t, s) p(x_t | z_t, c_{t-1}, d_t, s)")
     guide = Factorization.parse("q(w | x_{1:T}) q(z_t | x_{1:T})")
     assert guide.given(["c"], ["s"]) == Factorization.parse("q(w | x_{1:T}, c_{1:T}, s) q(z_t | x_{1:T}, c_t, s)")
     assert guide.given(["c"], ["s"], ["q(z)"]) == Factorization.parse("q(w | x_{1:T}, c_{1:T}, s) q(z_t | x_{1:T})")
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_methods_read_covariates_where_data_have_them_and_only_then(name):
+def test_methods_read_covariates_if_and_only_if_the_data_have_them(name):
     method = dvae.method(name, **({} if name in WITHOUT_LATENTS else {"latent": 2}))
     model = method.build(SCHEMA)
     assert {*model.context} == {"c", "d", "s"}
     for part in (model.generative, model.inference):
         for factor in part.factors if part else ():
-            read = {parent.name for parent in factor.parents} & {"c", "d", "s"}
-            assert not read or read == {"c", "d", "s"}
+            covariates = {parent.name for parent in factor.parents} & {"c", "d", "s"}
+            assert not covariates or covariates == {"c", "d", "s"}
             if f"{factor.kind}({factor.child})" in method.without_covariates or not (factor.local or factor.parents):
-                assert not read
+                assert not covariates
     transition = next(factor for factor in model.generative.factors if factor.child in (*model.latents, "x"))
-    reads = {parent.name for parent in transition.parents} >= {"c", "d", "s"}
-    assert reads == (name not in ("dsae", "kvae"))  # w of dsae is static, and the chain of kvae reads its own past
+    is_read = {parent.name for parent in transition.parents} >= {"c", "d", "s"}
+    assert is_read == (name not in ("dsae", "kvae"))  # w of dsae is static, and the chain of kvae reads its own past
     assert not method.build(PanelSchema(columns=Columns((Column("y"),)))).context
-    written = methods()[name].generative
+    equations = methods()[name].generative
     plain = method.build({"x": 3})
-    assert plain.generative == Factorization.parse(written)
+    assert plain.generative == Factorization.parse(equations)
 
 
 @pytest.mark.parametrize("name", [name for name in METHODS if name not in WITHOUT_LATENTS])
-def test_methods_have_guides_with_indicators_where_training_data_have_gaps(name):
-    """Or are to have some; a mask that hides nothing then changes nothing, and one that does is seen."""
-    x, seen = torch.randn(3, 5, 1), torch.rand(3, 5, 1) < 0.5
+def test_guides_read_indicators_if_training_data_have_missing_values(name):
+    """Also with `hide`. A mask without missing values changes nothing; one with missing values does."""
+    x, mask = torch.randn(3, 5, 1), torch.rand(3, 5, 1) < 0.5
     for schema, options in ((replace(SCHEMA, with_missing=("y",)), {}), (SCHEMA, {"hide": 0.3})):
         model = dvae.method(name, latent=2, **options).build(schema)
         assert model.indicators == ("x",)
         batch = {"x": x, "c": torch.zeros(3, 5, 1), "s": torch.zeros(3, 1), "d": torch.ones(3, 5, 1)}
-        less, found = torch.where(seen, x, 0.0), []
-        for changes in ({}, {"mask": torch.ones_like(seen)}, {"x": less, "mask": seen}, {"x": less}):
+        observed, latents = torch.where(mask, x, 0.0), []
+        for changes in ({}, {"mask": torch.ones_like(mask)}, {"x": observed, "mask": mask}, {"x": observed}):
             torch.manual_seed(0)
-            found.append(model.guide({**batch, **changes})[model.latents[0]])
-        assert torch.equal(found[0], found[1])
-        assert not torch.allclose(found[2], found[3])
+            latents.append(model.guide({**batch, **changes})[model.latents[0]])
+        assert torch.equal(latents[0], latents[1])
+        assert not torch.allclose(latents[2], latents[3])
     assert not dvae.method(name, latent=2).build(SCHEMA).indicators
 
 
-def test_what_is_hidden_in_training_is_told_where_nobody_knows_what_goes_together():
+def test_hiding_values_needs_a_description_of_the_data():
     with pytest.raises(SchemaError, match="dkf needs the description of sequences, but was given object"):
         dvae.method("dkf", hide=0.2).train(object(), None, 10)
     with pytest.raises(ValueError, match="leave hide at 0"):
         dvae.method("hit-dvae", hide=0.2)
 
 
-def test_context_that_a_model_does_not_read_may_be_there_and_does_not_come_back():
+def test_a_view_accepts_unread_context_and_does_not_return_it():
     view = ContextView(("c", "s"))
     batch = {"x": torch.randn(2, 3, 1), "c": torch.randn(2, 3, 4), "s": torch.randn(2, 1)}
     assert view(batch) == batch
@@ -89,11 +89,11 @@ def test_context_that_a_model_does_not_read_may_be_there_and_does_not_come_back(
     assert view.keeps_volume
 
 
-def test_logarithms_are_read_from_a_floor_on_and_have_gradients_everywhere():
+def test_logarithms_have_a_floor_and_finite_gradients():
     units = Units(2, [Coordinate(), Coordinate(floor=0.5, level=1.0, spread=2.0)]).double()
     values = torch.tensor([[-3.0, 0.0], [0.0, 0.5], [2.0, math.e]], dtype=torch.float64, requires_grad=True)
-    least = (math.log(0.5) - 1) / 2
-    torch.testing.assert_close(units(values), torch.tensor([[-3, least], [0, least], [2, 0]], dtype=torch.float64))
+    lowest = (math.log(0.5) - 1) / 2
+    torch.testing.assert_close(units(values), torch.tensor([[-3, lowest], [0, lowest], [2, 0]], dtype=torch.float64))
     units(values).sum().backward()
     assert torch.isfinite(values.grad).all()
 
@@ -105,17 +105,17 @@ def test_logarithms_are_read_from_a_floor_on_and_have_gradients_everywhere():
         *((family, "srnn") for family in ("log-normal", "real", "laplace")),
     ],
 )
-def test_the_unit_of_a_column_changes_its_density_by_the_unit_alone(family, name):
-    """log p(a x) = log p(x) - T log a: networks read and make the same."""
+def test_a_change_of_unit_changes_the_density_by_its_jacobian(family, name):
+    """log p(a x) = log p(x) - T log a, as networks see the same scaled values."""
     rng, scale = np.random.default_rng(0), 1e3
     values = rng.lognormal(0, 2, (6, 9, 1))
-    found = []
+    bounds = []
     for unit in (1.0, scale):
         columns = Columns((Column("y", family=family),))
-        panel = Panel([Series(f"s{n}", unit * own) for n, own in enumerate(values)], columns)
+        panel = Panel([Series(f"s{n}", unit * sequence) for n, sequence in enumerate(values)], columns)
         schema = PanelSchema.from_data(panel, Cut())
         torch.manual_seed(0)
         model = dvae.method(name, **({} if name == "autoregressive" else {"latent": 2})).build(schema).double()
         torch.manual_seed(1)
-        found.append(dvae.iwae_bound(model, torch.tensor(unit * values), particles=3).bound)
-    torch.testing.assert_close(found[1], found[0] - 9 * math.log(scale), rtol=1e-5, atol=0)  # units are single
+        bounds.append(dvae.iwae_bound(model, torch.tensor(unit * values), particles=3).bound)
+    torch.testing.assert_close(bounds[1], bounds[0] - 9 * math.log(scale), rtol=1e-5, atol=0)  # units are float32

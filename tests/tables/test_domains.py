@@ -1,4 +1,4 @@
-"""Domains: what is read from each package is what it is said to be; where one is not installed, a sentence says so."""
+"""Domains: the data of each package are as documented, and a missing package is an error that names it."""
 
 import json
 import sys
@@ -39,7 +39,7 @@ def load(name, **options):
 
 
 @pytest.mark.parametrize("name", NEEDED)
-def test_a_package_that_is_not_there_is_named_and_how_to_get_it(monkeypatch, capsys, name):
+def test_a_missing_package_is_named_with_its_installation(monkeypatch, capsys, name):
     monkeypatch.setitem(sys.modules, NEEDED[name], None)
     with pytest.raises(ImportError, match=rf"the package {NEEDED[name]}: pip install 'pyro-dvae\["):
         domains.domain(name)
@@ -47,7 +47,7 @@ def test_a_package_that_is_not_there_is_named_and_how_to_get_it(monkeypatch, cap
     assert "bug" not in capsys.readouterr().err
 
 
-def test_a_name_that_is_none_is_answered_with_the_nearest():
+def test_an_unknown_domain_is_an_error_with_a_suggestion():
     with pytest.raises(ValueError, match=r"no domain 'choral'.*chorales.*known: chorales, speech"):
         domains.domain("choral")
     with pytest.raises(ValueError, match="motion is not a domain"):
@@ -57,7 +57,7 @@ def test_a_name_that_is_none_is_answered_with_the_nearest():
 # Chorales
 
 
-def test_a_roll_has_each_sounding_key_and_no_other():
+def test_a_roll_has_exactly_the_sounding_keys():
     keys = roll(np.array([[72, 67, 67, 0]]))
     assert [NAMES[n] for n in np.flatnonzero(keys[0])] == ["G4", "C5"]
     assert [NAMES[n] for n in (0, 1, 39, 87)] == ["A0", "A#0", "C4", "C8"]  # middle C is the fortieth key
@@ -68,24 +68,24 @@ def test_notes_sound_on_the_quarters_that_begin_within_them():
     np.testing.assert_array_equal(quarters([melody, [(0.0, 4.0, 48)]]), [[60, 48], [60, 48], [0, 48], [64, 48]])
 
 
-def test_any_key_comes_to_c_and_rests_stay():
+def test_transposition_to_c_works_from_any_key_and_keeps_rests():
     for up in range(-6, 7):
         assert tonic(CADENCE + up) == up % 12
-        moved = to_c(CADENCE + up)
-        assert tonic(moved) == 0
-        np.testing.assert_array_equal(np.diff(moved, axis=0), np.diff(CADENCE, axis=0))
-        assert abs(moved - CADENCE - up).max() <= 6
+        transposed = to_c(CADENCE + up)
+        assert tonic(transposed) == 0
+        np.testing.assert_array_equal(np.diff(transposed, axis=0), np.diff(CADENCE, axis=0))
+        assert abs(transposed - CADENCE - up).max() <= 6
     voices = np.where(np.arange(4) == 1, 0, CADENCE + 2)
     np.testing.assert_array_equal(to_c(voices) == 0, voices == 0)
 
 
-def test_a_setting_that_comes_again_in_another_key_or_with_a_repeat_is_left_out():
-    again, other = np.concatenate([CADENCE, CADENCE])[1:] + 3, np.cumsum(CADENCE % 5, 0) + 40
+def test_transposed_and_repeated_settings_are_left_out():
+    repeated, other = np.concatenate([CADENCE, CADENCE])[1:] + 3, np.cumsum(CADENCE % 5, 0) + 40
     assert changes(CADENCE + 3) == changes(CADENCE)
-    assert different({"a": CADENCE, "b": again, "c": other}) == ["a", "c"]
+    assert different({"a": CADENCE, "b": repeated, "c": other}) == ["a", "c"]
 
 
-def test_a_cache_of_something_else_is_refused(tmp_path, monkeypatch):
+def test_an_invalid_cache_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("dvae.tables.domains.chorales.package_folder", lambda *_: tmp_path)
     monkeypatch.setattr("dvae.tables.domains.chorales.version", lambda _: "1")
     for content in ("[1]", '{"a": [[1, 2]]}', '{"a": [[300, 50, 50, 50]]}', "{", '{"a": 1e999}'):
@@ -97,28 +97,28 @@ def test_a_cache_of_something_else_is_refused(tmp_path, monkeypatch):
         chorales(cache=tmp_path)
 
 
-def test_chorales_are_four_voices_on_88_keys_in_the_sizes_of_the_benchmark():
+def test_chorales_have_four_voices_88_keys_and_the_splits_of_the_benchmark():
     panel = load("chorales")
     parts = [one.split for one in panel]
     assert {split: parts.count(split) for split in SIZES} == SIZES
     assert len({one.values.tobytes() for one in panel}) == len(panel) == 382
-    down = np.concatenate([one.values for one in panel])
-    assert down.shape[1] == 88
+    pressed = np.concatenate([one.values for one in panel])
+    assert pressed.shape[1] == 88
     assert {column.family for column in panel.columns.targets} == {"binary"}
-    assert down.sum(1).min() >= 1
-    assert down.sum(1).max() == len(VOICES)
-    low, high = (NAMES[n] for n in np.flatnonzero(down.any(0))[[0, -1]])
+    assert pressed.sum(1).min() >= 1
+    assert pressed.sum(1).max() == len(VOICES)
+    low, high = (NAMES[n] for n in np.flatnonzero(pressed.any(0))[[0, -1]])
     assert (low, high) == ("G1", "C6")  # C2 to A5 of the voices, and up to six semitones
 
 
-def test_a_chorale_begins_as_it_is_printed():
-    """BWV 66.6, as music21's documentation shows its chords: an upbeat, in which two voices share a key."""
+def test_a_chorale_begins_as_in_its_score():
+    """BWV 66.6 begins with an upbeat, where two voices share a key (music21's documentation prints the chords)."""
     plain = load("chorales", transposed=False)
-    (own,) = (one for one in plain if one.name == "bwv66.6")
-    chords = [[NAMES[n] for n in np.flatnonzero(keys)] for keys in own.values[:2]]
+    (chorale,) = (one for one in plain if one.name == "bwv66.6")
+    chords = [[NAMES[n] for n in np.flatnonzero(keys)] for keys in chorale.values[:2]]
     assert chords == [["A3", "E4", "C#5"], ["F#3", "C#4", "F#4", "A4"]]
-    assert len(own) == 36  # nine bars of four quarters
-    for one, other in zip(load("chorales"), plain, strict=True):  # which have the same intervals
+    assert len(chorale) == 36  # nine bars of four quarters
+    for one, other in zip(load("chorales"), plain, strict=True):  # transposition keeps the intervals
         up = np.flatnonzero(one.values[0])[0] - np.flatnonzero(other.values[0])[0]
         np.testing.assert_array_equal(np.roll(other.values, up, 1), one.values)
 
@@ -137,13 +137,13 @@ def write(path, samples, rate=RATE, kind=np.int16):
 
 
 @pytest.mark.parametrize("samples", [WINDOW, WINDOW + 1, 10 * HOP, 4001])
-def test_spectra_become_the_signal_again(samples):
+def test_spectra_are_inverted_exactly(samples):
     x = tone()[:samples] if samples <= 4000 else tone(1)[:samples]
     np.testing.assert_allclose(sound(spectrum(x), samples), x, atol=1e-12)
     assert spectrum(x).shape[1] == 129
 
 
-def test_power_of_a_signal_that_is_rounded_to_16_bits_is_off_by_the_floor():
+def test_rounding_to_16_bits_changes_the_power_by_the_floor():
     x = np.random.default_rng(0).uniform(-0.5, 0.5, 80 * RATE)
     noise = power(x - np.round(x * 2**15) / 2**15) - FLOOR
     assert noise[2:-2, 1:-1].mean() == pytest.approx(FLOOR, rel=0.02)
@@ -157,16 +157,16 @@ def test_resynthesis_with_the_observed_power_is_the_signal():
         resynthesised(power(x)[1:], x)
 
 
-def test_si_sdr_heeds_no_scale_and_is_the_ratio_to_what_is_orthogonal():
-    x, rest = np.repeat([1.0, 0.0], 4), np.repeat([0.0, 0.1], 4)
-    assert si_sdr(3 * x, -7 * (x + rest)) == pytest.approx(20.0, abs=1e-9)
+def test_si_sdr_ignores_scale_and_measures_orthogonal_noise():
+    x, noise = np.repeat([1.0, 0.0], 4), np.repeat([0.0, 0.1], 4)
+    assert si_sdr(3 * x, -7 * (x + noise)) == pytest.approx(20.0, abs=1e-9)
     assert si_sdr(x, 2 * x) == np.inf
-    assert si_sdr(x, rest) == -np.inf
+    assert si_sdr(x, noise) == -np.inf
     with pytest.raises(ValueError, match="two signals of one length, not silent"):
         si_sdr(0 * x, x)
 
 
-def test_speech_is_spectra_of_recordings_without_silence(tmp_path):
+def test_speech_consists_of_spectra_without_silence(tmp_path):
     quiet = np.zeros(RATE // 2)
     write(tmp_path / "silence" / "1.wav", quiet)
     for n in range(40):
@@ -181,7 +181,7 @@ def test_speech_is_spectra_of_recordings_without_silence(tmp_path):
     assert [column.name for column in panel.columns.targets][::64] == ["0 Hz", "2000 Hz", "4000 Hz"]
 
 
-def test_speech_says_where_it_comes_from(tmp_path):
+def test_missing_or_unsuitable_recordings_are_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match="apt install asterisk-core-sounds-en-wav"):
         speech(tmp_path)
     write(tmp_path / "b.wav", tone(), rate=16000)
@@ -190,7 +190,7 @@ def test_speech_says_where_it_comes_from(tmp_path):
 
 
 @pytest.mark.skipif(not PLACE.exists(), reason="asterisk-core-sounds-en-wav is not installed")
-def test_prompts_are_22_minutes():
+def test_prompts_last_22_minutes():
     panel = speech()
     assert len(panel) == 558
     assert 21 < sum(map(len, panel.series)) * HOP / RATE / 60 < 23
@@ -199,7 +199,7 @@ def test_prompts_are_22_minutes():
 # Series
 
 
-def test_files_of_the_archive_are_dimensions_and_a_class(tmp_path):
+def test_files_of_the_archive_contain_dimensions_and_a_class(tmp_path):
     path = tmp_path / "x.ts"
     path.write_text("# about\n@problemName x\n@data\n1,2,3:4,5,6:b\n7:8:a\n")
     (first, b), (second, a) = read_ts(path)
@@ -214,8 +214,8 @@ def test_japanese_vowels_are_640_utterances_by_nine_speakers():
     parts = [one.split for one in panel]
     assert (len(panel), min(lengths), max(lengths), len(panel.groups)) == (640, 7, 29, 9)
     assert {part: parts.count(part) for part in sorted(set(parts))} == {"test": 370, "train": 216, "validation": 54}
-    held = [one.group for one in panel if one.split == "validation"]
-    assert {held.count(group) for group in panel.groups} == {6}
+    validation_groups = [one.group for one in panel if one.split == "validation"]
+    assert {validation_groups.count(group) for group in panel.groups} == {6}
 
 
 def test_basic_motions_are_ten_recordings_of_each_activity_in_each_part():
@@ -231,6 +231,6 @@ def test_macrodata_are_rates_of_202_quarters():
     (one,) = load("macrodata")
     dates = one.times.astype("datetime64[s]")
     assert [str(dates[n])[:10] for n in (0, -1)] == ["1959-04-01", "2009-07-01"]
-    growth = one.values[:, 0].sum()  # logarithms add up
+    growth = one.values[:, 0].sum()  # log differences add up
     assert growth == pytest.approx(100 * np.log(12990.341 / 2710.349))
     assert one.values.shape == (202, 8)

@@ -1,4 +1,4 @@
-"""What models see of a table, and that nothing of it is of what they are tested on."""
+"""Encoding of tables for models; nothing in it depends on test data."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from dvae.tables.windows import PanelWindows
 
 NAN = np.nan
 KINDS = ("u", "v", "w")
-TOLD = Columns(
+COLUMNS = Columns(
     (
         Column("riders", family="count", unit="people"),
         Column("plan", "known"),
@@ -30,51 +30,51 @@ TOLD = Columns(
     )
 )
 
-FREE = tuple(name for name in TOLD.names if name not in ("height", "town", "sunny"))
-"""Columns that lack values."""
+WITH_MISSING = tuple(name for name in COLUMNS.names if name not in ("height", "town", "sunny"))
+"""Columns with missing values."""
 
 
 def table(n=6, t=12, seed=0, missing=True, times=None):
     rng = np.random.default_rng(seed)
-    made = []
-    for one in range(n):
+    series = []
+    for sequence in range(n):
         columns = {"plan": rng.normal(3, 2, t), "temp": rng.normal(20, 5, t), "price": rng.normal(-3, 0.1, t)}
         columns |= {"riders": rng.poisson(4, t), "kind": rng.integers(0, 3, t), "height": np.full(t, rng.normal())}
         columns |= {name: rng.integers(0, 2, t) for name in ("weather", "open", "sunny")}
-        columns["town"] = np.full(t, one % 2)
-        values = np.stack([columns[name] for name in TOLD.names], 1).astype(float)
+        columns["town"] = np.full(t, sequence % 2)
+        values = np.stack([columns[name] for name in COLUMNS.names], 1).astype(float)
         if missing:
-            free = [TOLD.names.index(name) for name in FREE]
-            values[:, free] = np.where(rng.random((t, len(free))) < 0.2, NAN, values[:, free])
-        made.append(Series(f"s{one}", values, times))
-    return Panel(made, TOLD)
+            indices = [COLUMNS.names.index(name) for name in WITH_MISSING]
+            values[:, indices] = np.where(rng.random((t, len(indices))) < 0.2, NAN, values[:, indices])
+        series.append(Series(f"s{sequence}", values, times))
+    return Panel(series, COLUMNS)
 
 
 CUT = Cut(5, 3)
 
 
 def column(panel, name, parts):
-    held = np.concatenate([panel.series[n].values[:, TOLD.names.index(name)] for n in parts])
-    return held[~np.isnan(held)]
+    values = np.concatenate([panel.series[n].values[:, COLUMNS.names.index(name)] for n in parts])
+    return values[~np.isnan(values)]
 
 
-def test_logarithms_of_a_column_are_read_as_they_vary_and_stand_for_what_is_missing():
-    """A column that hardly varies is not blown up, however it is rounded; zeros are read as the least that is not."""
+def test_logarithms_are_standardised_and_provide_the_typical_value():
+    """A nearly constant column keeps its scale; zeros are read as the smallest positive value."""
     columns = Columns((Column("flow", family="power"), Column("flat", family="positive")))
     rng = np.random.default_rng(0)
     values = np.stack([rng.lognormal(1, 2, 9), 3 + 1e-15 * rng.normal(size=9)], 1)
     values[0, 0], values[1, 0] = 0, NAN
     panel = Panel([Series(f"s{n}", values) for n in range(4)], columns)
     flow, flat = PanelSchema.from_data(panel, Cut()).units["x"]
-    least = values[2:, 0].min()
-    logarithms = np.log([least, *values[2:, 0]])
-    assert (flow.floor, flow.level, flow.spread) == pytest.approx((least, logarithms.mean(), logarithms.std()))
+    smallest = values[2:, 0].min()
+    logarithms = np.log([smallest, *values[2:, 0]])
+    assert (flow.floor, flow.level, flow.spread) == pytest.approx((smallest, logarithms.mean(), logarithms.std()))
     assert flow.typical == pytest.approx(np.exp(flow.level))
     assert (flat.level, flat.spread, flat.typical) == pytest.approx((np.log(3), 1.0, 3.0))
 
 
-def test_a_column_far_from_zero_has_its_own_units():
-    """Of 1e9 + N(0, 1) too; a constant with rounding errors is left as it is."""
+def test_a_column_far_from_zero_is_standardised():
+    """This includes 1e9 + N(0, 1). A constant with rounding errors keeps scale 1."""
     noise = np.random.default_rng(0).normal(size=(4, 9, 3))
     values = np.array([1e9, 101325, 0.1]) + np.array([1.0, 0.01, 1e-17]) * noise
     columns = Columns(tuple(map(Column, "abc")))
@@ -85,38 +85,38 @@ def test_a_column_far_from_zero_has_its_own_units():
 
 
 @pytest.mark.parametrize(
-    ("family", "values", "said"),
+    ("family", "values", "message"),
     [
         ("positive", 1e9 + np.arange(9.0), r"has mean 1e\+09 and standard deviation 2\.58, .* the family 'real'"),
         ("real", 1e-40 * np.arange(9.0), r"column 'x' is 2\.58199e-40; .* multiply the values"),
     ],
 )
-def test_targets_that_float32_does_not_resolve_are_refused(family, values, said):
+def test_targets_that_float32_does_not_resolve_are_an_error(family, values, message):
     panel = Panel([Series(f"s{n}", values[:, None]) for n in range(4)], Columns((Column("x", family=family),)))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         PanelSchema.from_data(panel, Cut())
 
 
 @pytest.mark.parametrize(("family", "center", "count"), [("real", "6000000", 3), ("positive", "0", 4)])
-def test_levels_of_sequences_that_float32_loses_are_named(family, center, count):
+def test_sequences_that_lose_precision_in_float32_are_named(family, center, count):
     levels = [3e6, 5e6, 6e6, 7e6, 9e6]
     columns = Columns((Column("x", family=family), Column("y")))
     values = [np.stack([level + 0.1 * np.arange(9), np.arange(9.0)], 1) for level in levels]
     values[4][:, 0] = levels[4]  # a constant loses nothing
-    series = [Series(f"s{n}", own, split="train") for n, own in enumerate(values)]
+    series = [Series(f"s{n}", sequence, split="train") for n, sequence in enumerate(values)]
     with pytest.warns(UserWarning, match=rf"column 'x' varies .* from {center}.* in {count} of 5 .* such as 's0'; sub"):
         PanelSchema.from_data(Panel(series, columns), Cut())
 
 
-def test_units_are_those_of_the_training_sequences():
+def test_units_come_from_the_training_sequences():
     panel = table()
     schema = PanelSchema.from_data(panel, CUT)
     parts = [place for place, _, _ in CUT.starts(panel, "train")]
     assert 0 < len(parts) < len(panel)
     for name in ("plan", "temp", "price", "height"):
-        known = column(panel, name, parts)
-        assert schema.means[name] == pytest.approx(known.mean(), rel=1e-12)
-        assert schema.scales[name] == pytest.approx(known.std(), rel=1e-12)
+        observed = column(panel, name, parts)
+        assert schema.means[name] == pytest.approx(observed.mean(), rel=1e-12)
+        assert schema.scales[name] == pytest.approx(observed.std(), rel=1e-12)
     assert schema.means["riders"] == 0
     assert schema.scales["riders"] == pytest.approx(column(panel, "riders", parts).mean())
     means, scales, typical, floor, _, _ = map(list, zip(*schema.units["x"], strict=True))
@@ -129,10 +129,10 @@ def test_units_are_those_of_the_training_sequences():
     assert (means[-1], scales[-1]) == (share, pytest.approx((share * (1 - share)) ** 0.5))
     assert schema.coordinates == ["riders", "kind=u", "kind=v", "kind=w", "temp", "open"]
     assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2}
-    assert schema.with_missing == FREE
+    assert schema.with_missing == WITH_MISSING
 
 
-def test_guides_read_indicators_where_training_data_lack_targets():
+def test_guides_read_indicators_if_training_data_have_missing_targets():
     schema = PanelSchema.from_data(table(), CUT)
     assert schema.indicators == ("x",)
     assert schema.together == [0, 1, 1, 1, 2, 3]
@@ -143,7 +143,7 @@ def test_guides_read_indicators_where_training_data_lack_targets():
 
 
 def altered(panel, split, cut):
-    """The panel with other values, classes, times and gaps wherever it is only tested."""
+    """Return the panel with other values, classes, times and gaps in its test steps."""
     rng = np.random.default_rng(9)
     trained = {place: last + cut.length for place, _, last in cut.starts(panel, split)}
     series = []
@@ -151,9 +151,9 @@ def altered(panel, split, cut):
         values = one.values.copy()
         later = np.arange(len(one)) >= trained.get(place, 0)
         for name in ("riders", "plan", "temp", "price"):
-            values[later, TOLD.names.index(name)] = rng.integers(50, 90, later.sum())
+            values[later, COLUMNS.names.index(name)] = rng.integers(50, 90, later.sum())
         for name in ("kind", "weather", "open", "sunny"):
-            values[later, TOLD.names.index(name)] = np.where(rng.random(later.sum()) < 0.5, NAN, 1)
+            values[later, COLUMNS.names.index(name)] = np.where(rng.random(later.sum()) < 0.5, NAN, 1)
         times = one.times.copy()
         times[later] = times[later] + 100 * np.cumsum(rng.random(later.sum()))
         series.append(replace(one, values=values, times=times))
@@ -161,39 +161,39 @@ def altered(panel, split, cut):
 
 
 @pytest.mark.parametrize(("cut", "missing"), [(CUT, False), (Cut(5, 3, split="time", test=0.3), True)])
-def test_nothing_of_what_is_tested_is_in_what_is_trained_on(cut, missing):
+def test_training_windows_do_not_depend_on_test_data(cut, missing):
     panel = table(t=40, missing=missing, times=np.arange(40.0))
     other = altered(panel, "train", cut)
     assert other.fingerprint() != panel.fingerprint()
     schema = PanelSchema.from_data(panel, cut)
     assert PanelSchema.from_data(other, cut) == schema
-    windows, others = (PanelWindows(each, schema, "train") for each in (panel, other))
+    windows, others = (PanelWindows(data, schema, "train") for data in (panel, other))
     assert windows.keys == others.keys
-    batch, again = windows.all(), others.all()
-    assert batch.keys() == again.keys()
-    assert all(torch.equal(batch[name], again[name]) for name in batch)
+    batch, other_batch = windows.all(), others.all()
+    assert batch.keys() == other_batch.keys()
+    assert all(torch.equal(batch[name], other_batch[name]) for name in batch)
 
 
-def by_hand(one, schema):
-    """c, row by row, as the file says."""
+def by_hand(sequence, schema):
+    """Return c, computed row by row."""
     last, rows = {}, []
-    for row in one.values:
-        found = []
-        for value, told in zip(row, schema.columns.columns, strict=True):
-            if told.role not in ("known", "past"):
+    for row in sequence.values:
+        entries = []
+        for value, spec in zip(row, schema.columns.columns, strict=True):
+            if spec.role not in ("known", "past"):
                 continue
-            held = last[told.name] = last.get(told.name, NAN) if np.isnan(value) else value
-            if told.family == "category":
-                found += [float(held == n) for n in range(len(told.classes))]
+            current = last[spec.name] = last.get(spec.name, NAN) if np.isnan(value) else value
+            if spec.family == "category":
+                entries += [float(current == n) for n in range(len(spec.classes))]
             else:
-                found.append(np.nan_to_num((held - schema.means[told.name]) / schema.scales[told.name]))
-            if told.name in schema.with_missing:
-                found.append(float(not np.isnan(value)))
-        rows.append(found)
+                entries.append(np.nan_to_num((current - schema.means[spec.name]) / schema.scales[spec.name]))
+            if spec.name in schema.with_missing:
+                entries.append(float(not np.isnan(value)))
+        rows.append(entries)
     return np.array(rows)
 
 
-def test_covariates_have_their_last_value_or_before_any_the_mean_and_classes_are_one_of_several():
+def test_covariates_repeat_their_last_value_or_the_mean_and_classes_are_one_hot():
     panel = table(seed=3)
     for place in (0, 1):  # nothing at first, and nothing at all
         panel.series[place].values[: (4, 12)[place], [1, 3, 5]] = NAN
@@ -205,9 +205,9 @@ def test_covariates_have_their_last_value_or_before_any_the_mean_and_classes_are
         np.testing.assert_array_equal(x, np.column_stack([one.values[:, 0], eye, one.values[:, [4, 7]]]))
 
 
-def test_what_is_static_is_of_the_sequence():
+def test_static_values_are_constant_within_a_sequence():
     panel = table()
-    height, town = TOLD.names.index("height"), TOLD.names.index("town")
+    height, town = COLUMNS.names.index("height"), COLUMNS.names.index("town")
     panel.series[0].values[:5, height] = NAN
     panel.series[1].values[:, [height, town]] = NAN
     schema = replace(PanelSchema.from_data(panel, CUT), with_missing=("weather", "price", "plan", "height"))
@@ -231,7 +231,7 @@ def test_what_is_static_is_of_the_sequence():
     ],
     ids=["none", "months", "uneven", "near"],
 )
-def test_gaps_are_there_where_steps_are_uneven(times, step):
+def test_gaps_exist_if_steps_are_uneven(times, step):
     panel = table(t=24, times=times)
     schema = PanelSchema.from_data(panel, CUT)
     assert schema.step == step
@@ -244,7 +244,7 @@ def test_gaps_are_there_where_steps_are_uneven(times, step):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"means": {}}, "no mean and scale of height, plan, price"),
         (
@@ -255,13 +255,13 @@ def test_gaps_are_there_where_steps_are_uneven(times, step):
         ({"step": -1.0}, "step is -1.0"),
     ],
 )
-def test_a_schema_that_lacks_what_it_needs_is_refused(change, said):
-    with pytest.raises(ValueError, match=said):
+def test_an_incomplete_schema_is_an_error(change, message):
+    with pytest.raises(ValueError, match=message):
         replace(PanelSchema.from_data(table(), CUT), **change)
 
 
-def test_columns_of_a_family_have_one_law_and_categories_one_each():
-    told = Columns(
+def test_columns_of_a_family_share_a_distribution_and_each_category_has_one():
+    columns = Columns(
         (
             Column("real", family="category", classes=KINDS),  # may have the name of a family
             Column("a"),
@@ -270,19 +270,19 @@ def test_columns_of_a_family_have_one_law_and_categories_one_each():
             Column("l", family="category", classes=("u", "v")),
         )
     )
-    distribution = PanelSchema(columns=told).emission
+    distribution = PanelSchema(columns=columns).emission
     assert isinstance(distribution, Product)
-    places = {(0, 1, 2): "category", (3, 5): "real", (4,): "count", (6, 7): "category"}
-    assert dict(distribution.parts) == {place: FAMILIES[name] for place, name in places.items()}
+    indices = {(0, 1, 2): "category", (3, 5): "real", (4,): "count", (6, 7): "category"}
+    assert dict(distribution.parts) == {index: FAMILIES[name] for index, name in indices.items()}
     for family, spec in FAMILIES.items():
         classes = ("u", "v") if family == "category" else ()
         assert PanelSchema(columns=Columns((Column("y", family=family, classes=classes),))).emission == spec
 
 
-def test_training_parts_without_values_or_windows_are_refused():
+def test_training_parts_without_values_or_windows_are_an_error():
     panel = table()
     for place, _, _ in CUT.starts(panel, "train"):
-        panel.series[place].values[:, TOLD.names.index("temp")] = NAN
+        panel.series[place].values[:, COLUMNS.names.index("temp")] = NAN
     with pytest.raises(ValueError, match="column 'temp' has no value in the training part"):
         PanelSchema.from_data(panel, CUT)
     with pytest.raises(ValueError, match=r"no training window of 50 \+ 3 steps: its sequences have 12 to 12 steps"):

@@ -1,4 +1,4 @@
-"""A panel is the same whatever held its numbers, and says what it cannot hold."""
+"""A panel is the same from every container of its numbers, and unsuitable data are an error."""
 
 import re
 from dataclasses import replace
@@ -42,29 +42,29 @@ def long(numbers):
     return frame.assign(s=np.repeat(np.arange(n), t), t=np.tile(np.arange(t), n))
 
 
-def test_the_same_numbers_from_everywhere_are_the_same_panel():
+def test_every_container_of_the_same_numbers_makes_the_same_panel():
     numbers = grid()
-    wanted = {str(n): each.copy() for n, each in enumerate(numbers)}
+    expected = {str(n): each.copy() for n, each in enumerate(numbers)}
     tensors = torch.from_numpy(numbers).requires_grad_()
-    for held in (numbers, list(numbers), tensors, [*tensors]):
-        same(values(Panel.of(held)), wanted)
+    for data in (numbers, list(numbers), tensors, [*tensors]):
+        same(values(Panel.of(data)), expected)
     frame = long(numbers)
     for index in ("s", "t", ["s", "t"], ["t", "s"]):
         indexed = frame.set_index(index)
-        same(values(Panel.of(indexed, LONG)), wanted)
+        same(values(Panel.of(indexed, LONG)), expected)
         pd.testing.assert_frame_equal(indexed, frame.set_index(index))
-    same(values(Panel.of(frame.set_index("t", drop=False), LONG)), wanted)
+    same(values(Panel.of(frame.set_index("t", drop=False), LONG)), expected)
     dataset = xr.Dataset({name: (("s", "t"), numbers[..., n]) for n, name in enumerate(("x0", "x1"))})
     for each in (Panel.of(dataset, LONG), Panel.of(dataset), Panel.of(dataset.transpose("t", "s"), ["x0", "x1"])):
-        same(values(each), wanted)
-    first = {name: each[:, :1] for name, each in wanted.items()}
+        same(values(each), expected)
+    first = {name: each[:, :1] for name, each in expected.items()}
     same(values(Panel.of(dataset["x0"])), first)
     wide = pd.DataFrame(numbers[..., 0].T, columns=list("012"))
     same(values(Panel.wide(wide)), first)
     same(values(Panel.wide(wide.set_axis(pd.date_range("2024", periods=5, tz="Asia/Tokyo")))), first)
     panel = Panel.of(numbers)
     numbers[:] = 0
-    same(values(panel), wanted)
+    same(values(panel), expected)
 
 
 DAYS = pd.to_datetime(["2024-01-01", "2024-01-02", "2024-01-05", "2024-01-06"])
@@ -75,38 +75,38 @@ DAYS = pd.to_datetime(["2024-01-01", "2024-01-02", "2024-01-05", "2024-01-06"])
 )
 def test_dates_in_an_index_are_times(days, name):
     frame = pd.DataFrame({"x": [1.0, 2.0, 3.0, 4.0], "time": [0.5, 0.5, 0.25, 0.5]}, index=days.rename(name))[::-1]
-    told = ColumnHints(columns=("x",))
-    panel = Panel.of(frame[["x"]], told)
+    hints = ColumnHints(columns=("x",))
+    panel = Panel.of(frame[["x"]], hints)
     assert panel.columns.time == (name or "time")
     assert panel.calendar.kind == "dates"
     np.testing.assert_array_equal(panel.series[0].values[:, 0], [1, 2, 3, 4])
     np.testing.assert_array_equal(np.diff(panel.series[0].times) / 86400, [1, 3, 1])
-    assert Panel.of(frame, told).series[0].times.tolist() == panel.series[0].times.tolist()
-    assert infer_columns(frame[["x"]]) == told.of(frame[["x"]]) == panel.columns
+    assert Panel.of(frame, hints).series[0].times.tolist() == panel.series[0].times.tolist()
+    assert infer_columns(frame[["x"]]) == hints.of(frame[["x"]]) == panel.columns
     assert Panel.of(frame["x"]).fingerprint() == panel.fingerprint()
 
 
-def test_an_index_of_stations_and_days_is_that_of_their_columns():
+def test_an_index_of_stations_and_days_equals_the_two_columns():
     days = pd.date_range("2024-01-01", periods=40)
     index = pd.MultiIndex.from_product([list("abcd"), days], names=["station", "day"])
     frame = pd.DataFrame({"y": np.random.default_rng(0).normal(size=160)}, index=index)
     panel = Panel.of(frame.sample(frac=1, random_state=0))
     assert [len(one) for one in panel] == [40] * 4
-    told = ColumnHints(id=("station",), time="day")
-    for other in (Panel.of(frame.reset_index(), told), Panel.of(frame, told), Panel.of(frame.reset_index("day"))):
+    hints = ColumnHints(id=("station",), time="day")
+    for other in (Panel.of(frame.reset_index(), hints), Panel.of(frame, hints), Panel.of(frame.reset_index("day"))):
         assert other.fingerprint() == panel.fingerprint()
-    data = PanelData.of(frame, told, Cut(6, 2, split="time"))
+    data = PanelData.of(frame, hints, Cut(6, 2, split="time"))
     assert data.with_data(frame.reset_index()).fingerprint == data.fingerprint == panel.fingerprint()
-    joined = pd.concat({key: part.droplevel("station") for key, part in frame.groupby("station")})
-    joined.index.names = [None, None]
-    same(values(Panel.of(joined)), values(panel))
+    concatenated = pd.concat({key: part.droplevel("station") for key, part in frame.groupby("station")})
+    concatenated.index.names = [None, None]
+    same(values(Panel.of(concatenated)), values(panel))
 
 
-def test_an_index_that_says_nothing_is_no_column():
+def test_an_uninformative_index_is_no_column():
     frame = pd.DataFrame({"y": [1.5, 0.5, 2.5]})
-    wanted = Panel.of(frame).fingerprint()
+    expected = Panel.of(frame).fingerprint()
     for index in ([2, 0, 5], list("abc"), [0, 0, 0]):
-        assert Panel.of(frame.set_axis(index)).fingerprint() == wanted
+        assert Panel.of(frame.set_axis(index)).fingerprint() == expected
     with pytest.raises(ValueError, match="two columns 'y' or an index with the name of a column; rename one"):
         Panel.of(frame.set_axis(pd.Index([7, 8, 9], name="y")))
 
@@ -124,13 +124,13 @@ def test_the_order_of_rows_does_not_matter(order):
     assert Panel.wide(wide.iloc[rows]).fingerprint() == Panel.wide(wide).fingerprint()
 
 
-def test_wide_rows_without_times_stay_as_they_are_and_columns_begin_and_end_when_they_do():
+def test_wide_rows_without_times_keep_their_order_and_columns_are_trimmed():
     frame = pd.DataFrame({"a": [np.nan, 1.0, np.nan, 3.0], "b": [5.0, 6.0, np.nan, np.nan]}, index=list("zyxw"))
     panel = Panel.wide(frame)
     same(values(panel), {"a": np.array([[1.0], [np.nan], [3.0]]), "b": np.array([[5.0], [6.0]])})
     assert panel.series[0].times is None
-    timed = Panel.wide(frame.set_axis([0.0, 1.0, 2.5, 3.0]))
-    np.testing.assert_array_equal(timed.series[0].times, [1.0, 2.5, 3.0])
+    with_times = Panel.wide(frame.set_axis([0.0, 1.0, 2.5, 3.0]))
+    np.testing.assert_array_equal(with_times.series[0].times, [1.0, 2.5, 3.0])
 
 
 def of(column, family="real", classes=()):
@@ -140,7 +140,7 @@ def of(column, family="real", classes=()):
 
 
 @pytest.mark.parametrize(
-    ("column", "classes", "wanted"),
+    ("column", "classes", "expected"),
     [
         (np.array([1, pd.NA, 0], object), (), [1, np.nan, 0]),
         (np.array([True, None, False], object), (), [1, np.nan, 0]),
@@ -156,20 +156,20 @@ def of(column, family="real", classes=()):
     ],
     ids=str,
 )
-def test_values_and_classes_are_the_same_however_they_and_missing_ones_are_written(column, classes, wanted):
-    np.testing.assert_array_equal(of(column, "category" if classes else "real", classes), wanted)
+def test_every_type_of_a_column_has_the_same_values_and_classes(column, classes, expected):
+    np.testing.assert_array_equal(of(column, "category" if classes else "real", classes), expected)
 
 
-def test_a_value_that_is_no_class_is_refused_unless_a_class_stands_for_all_others():
+def test_an_unknown_class_is_an_error_unless_a_class_replaces_all_others():
     with pytest.raises(ValueError, match=r"'y' has 'rian' \(did you mean 'rain'\?\), .*; to read all other"):
         of(["rian"], "category", ("rain", "sun"))
-    told = Columns((Column("y", family="category", classes=("rain", "else", "sun"), other="else"),))
-    panel = Panel.of(pd.DataFrame({"y": ["rain", "hail", None, "sun"]}), told)
+    columns = Columns((Column("y", family="category", classes=("rain", "else", "sun"), other="else"),))
+    panel = Panel.of(pd.DataFrame({"y": ["rain", "hail", None, "sun"]}), columns)
     np.testing.assert_array_equal(panel.series[0].values[:, 0], [0, 1, np.nan, 2])
 
 
 @pytest.mark.parametrize(
-    ("column", "said"),
+    ("column", "message"),
     [
         ([1.0, "a few", 2], "column 'y': 2 of 3 .* are numbers; row 1 is 'a few', which is not a number; .* na_values"),
         (pd.to_datetime(["2024", None]), r"column 'y' has type datetime64\[.s\], not numbers"),
@@ -178,8 +178,8 @@ def test_a_value_that_is_no_class_is_refused_unless_a_class_stands_for_all_other
     ],
     ids=["mixed", "dates", "huge", "sign"],
 )
-def test_what_holds_no_numbers_is_named(column, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_column_without_numbers_is_an_error(column, message):
+    with pytest.raises(ValueError, match=message):
         of(column)
 
 
@@ -194,11 +194,11 @@ VALUES = {
     "power": ([0, 2.5], [-0.1]),
     **dict.fromkeys(("count", "overdispersed", "sparse", "sparse-overdispersed"), COUNTS),
 }
-"""Of a family: values that it has, and values that it has not; the others have all."""
+"""Values inside and outside the support of a family. Other families have all values."""
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_values_are_of_their_family_as_models_see_them(family):
+def test_values_outside_the_support_of_their_family_are_an_error(family):
     columns = Columns((Column("a"), Column("y", family=family, classes=("u", "v") if family == "category" else ())))
     good, bad = VALUES.get(family, ([-3.5, 0.0], []))
     for value in [*good, *bad, np.inf, 1e31]:
@@ -207,10 +207,10 @@ def test_values_are_of_their_family_as_models_see_them(family):
             Panel(series, columns, "riders")
             continue
         advice = "give it another family" if np.isfinite(value) else "write NaN for missing values"
-        said = rf"'q' of riders has .* in row 1 of column 'y', but the family '\S+' requires .*; {advice}"
-        with pytest.raises(ValueError, match=said) as refused:
+        message = rf"'q' of riders has .* in row 1 of column 'y', but the family '\S+' requires .*; {advice}"
+        with pytest.raises(ValueError, match=message) as error:
             Panel(series, columns, "riders")
-        assert len(re.findall("below", str(refused.value))) <= 1
+        assert len(re.findall("below", str(error.value))) <= 1
 
 
 @pytest.mark.parametrize(
@@ -221,31 +221,34 @@ def test_values_are_of_their_family_as_models_see_them(family):
     ],
     ids=["of several lengths", "before 1970"],
 )
-def test_dates_are_read_as_they_are_written(column, gaps):
+def test_dates_of_mixed_lengths_and_before_1970_are_read(column, gaps):
     times = Panel.of(pd.DataFrame({"t": column, "y": [1.0, 2, 3]}), Columns((Column("y"),), time="t")).series[0].times
     np.testing.assert_array_equal(np.diff(times), gaps)
 
 
 @pytest.mark.parametrize(
-    ("freq", "written"),
+    ("freq", "notation"),
     [
-        *(("667min", how) for how in ("%Y%m%dT%H%M", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %I:%M %p", " %d/%m/%Y %H:%M UTC")),
-        *(("MS", how) for how in ("%Y-%m", "%m/%Y", "number %Y%m")),
-        *(("QS", how) for how in ("%YQq", "%Y-Qq")),
-        *(("W-MON", how) for how in ("%G-W%V", "%GW%V", "number %Y%m%d")),
+        *(
+            ("667min", form)
+            for form in ("%Y%m%dT%H%M", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %I:%M %p", " %d/%m/%Y %H:%M UTC")
+        ),
+        *(("MS", form) for form in ("%Y-%m", "%m/%Y", "number %Y%m")),
+        *(("QS", form) for form in ("%YQq", "%Y-Qq")),
+        *(("W-MON", form) for form in ("%G-W%V", "%GW%V", "number %Y%m%d")),
     ],
 )
-def test_times_are_read_back_however_they_are_written(freq, written):
-    when = pd.date_range("1975-01-01", periods=300, freq=freq)
-    said = [each.strftime(written.removeprefix("number ")).replace("q", str(each.quarter)) for each in when]
-    frame = pd.DataFrame({"t": [int(each) for each in said] if "number" in written else said, "y": np.arange(300.0)})
+def test_times_are_read_in_every_notation(freq, notation):
+    times = pd.date_range("1975-01-01", periods=300, freq=freq)
+    texts = [each.strftime(notation.removeprefix("number ")).replace("q", str(each.quarter)) for each in times]
+    frame = pd.DataFrame({"t": [int(each) for each in texts] if "number" in notation else texts, "y": np.arange(300.0)})
     panel = Panel.of(frame)
     assert panel.columns.time == "t"
-    np.testing.assert_array_equal(panel.series[0].times, when.astype("datetime64[s]").astype(int))
+    np.testing.assert_array_equal(panel.series[0].times, times.astype("datetime64[s]").astype(int))
 
 
 @pytest.mark.parametrize(
-    ("column", "said"),
+    ("column", "message"),
     [
         (
             [0, 1, 1],
@@ -264,13 +267,13 @@ def test_times_are_read_back_however_they_are_written(freq, written):
         (["22:00:00", "23:00:00", "00:00:00"], "goes back from t 0 days 23:00:00 in row 1 to 0 days .* midnight"),
     ],
 )
-def test_rows_without_a_time_of_their_own_are_refused(column, said):
+def test_rows_without_a_unique_time_are_an_error(column, message):
     frame = pd.DataFrame({"t": column, "y": [1.0, 2, 3]})
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         Panel.of(frame, Columns((Column("y"),), time="t"))
 
 
-def test_sequences_are_told_apart_by_all_their_ids():
+def test_all_id_columns_distinguish_sequences():
     frame = pd.DataFrame({"a": [1, 1, 2, 2], "b": ["u", "v", "u", None], "t": [0, 0, 0, 0], "y": [1.0, 2, 3, 4]})
     panel = Panel.of(frame, Columns((Column("y"),), id=("a", "b"), time="t"))
     assert {one.name: one.values.item() for one in panel} == {"1/u": 1, "1/v": 2, "2/u": 3, "2/": 4}
@@ -280,22 +283,22 @@ def test_sequences_are_told_apart_by_all_their_ids():
         Panel.of(frame.assign(t=range(4)), Columns((Column("y"),), ("b",), "t"))
 
 
-def test_groups_and_splits_are_of_sequences():
-    told = Columns((Column("y"),), id=("s",), group="g", split="p")
+def test_each_sequence_has_one_group_and_one_split():
+    columns = Columns((Column("y"),), id=("s",), group="g", split="p")
     frame = pd.DataFrame({"s": list("aabb"), "g": [1, 1, 2, 2], "p": ["train"] * 3 + ["test"], "y": range(4)})
     with pytest.raises(ValueError, match="sequence 'b' has several values of p: test, train"):
-        Panel.of(frame, told)
-    panel = Panel.of(frame.assign(p=["train"] * 2 + ["test"] * 2), told)
+        Panel.of(frame, columns)
+    panel = Panel.of(frame.assign(p=["train"] * 2 + ["test"] * 2), columns)
     assert [(one.group, one.split) for one in panel] == [("1", "train"), ("2", "test")]
     assert panel.groups == ["1", "2"]
     with pytest.raises(ValueError, match="sequence 'a' has split 'tst'"):
-        Panel.of(frame.assign(p="tst"), told)
+        Panel.of(frame.assign(p="tst"), columns)
     with pytest.raises(ValueError, match="sequence 'b' has several values of g: , 2"):
-        Panel.of(frame.assign(p="train", g=[1, 1, 2, None]), told)
+        Panel.of(frame.assign(p="train", g=[1, 1, 2, None]), columns)
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         ([], "sequences are .T, D.; got none"),
         (torch.zeros(3), r"got \(3,\); for a single column, give \(T, 1\)"),
@@ -307,32 +310,32 @@ def test_groups_and_splits_are_of_sequences():
         ({"a": [1]}, "got dict"),
     ],
 )
-def test_what_holds_no_sequences_is_refused(data, said):
-    with pytest.raises((ValueError, TypeError), match=said):
+def test_data_without_sequences_are_an_error(data, message):
+    with pytest.raises((ValueError, TypeError), match=message):
         Panel.of(data)
 
 
-def test_sequences_are_checked():
-    one, told = np.zeros((2, 1)), Columns((Column("y"),))
-    for series, said in (
-        ([Series("a", one), Series("a", one)], "two sequences 'a'"),
-        ([Series("a", one, np.array([1.0, 1.0]))], "times that are not strictly increasing"),
+def test_sequences_are_validated():
+    values, columns = np.zeros((2, 1)), Columns((Column("y"),))
+    for series, message in (
+        ([Series("a", values), Series("a", values)], "two sequences 'a'"),
+        ([Series("a", values, np.array([1.0, 1.0]))], "times that are not strictly increasing"),
         ([], "has no sequences"),
     ):
-        with pytest.raises(ValueError, match=said):
-            Panel(series, told)
+        with pytest.raises(ValueError, match=message):
+            Panel(series, columns)
     with pytest.raises(ValueError, match=r"no column 'x00' \(did you mean 'x0'\?\); there are x0, x1, s, t"):
         Panel.of(long(grid()), Columns((Column("x00"),)))
     with pytest.raises(ValueError, match=r"no sequence '21' \(did you mean '2'\?\)"):
         Panel.of(grid()).only(["21"])
-    assert [one.name for one in Panel.of(grid()).only(["2", "0"])] == ["2", "0"]
+    assert [values.name for values in Panel.of(grid()).only(["2", "0"])] == ["2", "0"]
 
 
-def test_every_part_of_a_panel_has_a_share_in_its_fingerprint():
-    told = Columns((Column("y"),))
+def test_the_fingerprint_depends_on_every_part_of_a_panel():
+    columns = Columns((Column("y"),))
     base = Series("a", np.zeros((2, 1)), np.array([0.0, 1.0]), "g", "train")
     changes = {"name": "b", "values": base.values + 1, "times": base.times + 1, "group": "h", "split": "test"}
-    changed = [replace(base, **{name: value}) for name, value in changes.items()]
-    prints = {Panel([each], told).fingerprint() for each in (base, replace(base, times=None), *changed)}
+    variants = [replace(base, **{name: value}) for name, value in changes.items()]
+    prints = {Panel([each], columns).fingerprint() for each in (base, replace(base, times=None), *variants)}
     prints.add(Panel([base], Columns((Column("z"),))).fingerprint())
     assert len(prints) == 8

@@ -1,4 +1,4 @@
-"""Every method of the family on a table of several kinds of columns, and what is written of its forecasts."""
+"""Every method on a table of several kinds of columns, and the files of its forecasts."""
 
 import json
 from importlib.util import find_spec
@@ -24,8 +24,8 @@ SMALL = {"latent": 2, "warm_up": 1}
 WITHOUT_LATENTS = ("autoregressive", "moglow")
 METHODS = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", *WITHOUT_LATENTS)
 PLAIN = ("erd", "aclstm")
-"""Of motion, and of no latents, but for any data."""
-TOLD = Columns(
+"""Deterministic methods for motion that accept any data."""
+COLUMNS = Columns(
     (
         Column("riders", family="overdispersed", unit="people"),
         Column("temp", unit="°C"),
@@ -43,14 +43,14 @@ TOLD = Columns(
 
 def frame(count=6, t=14):
     rng = np.random.default_rng(0)
-    made = []
+    parts = []
     for n in range(count):
         columns = {"riders": rng.poisson(4, t), "temp": rng.normal(20, 5, t), "kind": rng.choice(["a", "b", "c"], t)}
         columns |= {"open": rng.integers(0, 2, t), "share": rng.uniform(0.1, 0.9, t), "plan": rng.normal(size=t)}
         part = pd.DataFrame({**columns, "weather": rng.choice(["rain", "sun"], t)}).astype(object)
         part = part.mask(rng.random(part.shape) < 0.15)
-        made.append(part.assign(station=f"s{n}", day=np.cumsum(rng.choice([1, 1, 3], t)), height=rng.normal()))
-    return pd.concat(made, ignore_index=True)
+        parts.append(part.assign(station=f"s{n}", day=np.cumsum(rng.choice([1, 1, 3], t)), height=rng.normal()))
+    return pd.concat(parts, ignore_index=True)
 
 
 @pytest.fixture(scope="module")
@@ -58,21 +58,21 @@ def data(tmp_path_factory):
     """A table with missing targets and covariates, and uneven steps."""
     path = tmp_path_factory.mktemp("tables") / "riders.csv"
     frame().to_csv(path, index=False)
-    return PanelData.open(path, TOLD, Cut(5, 3))
+    return PanelData.open(path, COLUMNS, Cut(5, 3))
 
 
 def options(name):
     return {} if name in WITHOUT_LATENTS else {"width": 4} if name in PLAIN else SMALL
 
 
-def test_every_method_that_is_not_of_motion_is_tested():
+def test_every_method_that_is_not_for_motion_is_tested():
     futures = {"cvae", "bom", "bom-parts", "pose-knows", "mt-vae", "rhp", "dlow", "dsf", "mix-and-match"}
     motion = {"hit-dvae", "gsps", "trajevae", "cvae-rnn", "motion-infilling", "motion-latent", *futures}
     assert {*METHODS, *PLAIN} == {*methods()} - motion - {"equations"}
 
 
 @pytest.mark.parametrize("name", [*METHODS, *PLAIN])
-def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_missing(data, name):
+def test_a_method_fits_and_forecasts_a_table_and_ignores_missing_values(data, name):
     windows = data.windows("train")
     assert windows.schema.sizes == {"x": 7, "c": 1 + 1 + 2 + 1, "s": 1, "d": 1}
     method = dvae.method(name, **options(name)).resolve_defaults(windows)
@@ -82,17 +82,17 @@ def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_mis
     model.eval()
     assert {"c", "s", "d"} <= {*model.context}
     batch = data.windows("test").all()
-    made = model.forecast(batch.past(5), 3, samples=4, draw_emission=True)["x"]
-    assert made.shape == (4, len(batch["x"]), 3, 7)
-    assert made.isfinite().all()
-    assert not made[..., [0, 2, 3, 4, 5]].frac().any()  # counts, a class and a binary
-    assert (made[..., 2:5].sum(-1) == 1).all()
-    assert ((made[..., 6] > 0) & (made[..., 6] < 1)).all()
+    draws = model.forecast(batch.past(5), 3, samples=4, draw_emission=True)["x"]
+    assert draws.shape == (4, len(batch["x"]), 3, 7)
+    assert draws.isfinite().all()
+    assert not draws[..., [0, 2, 3, 4, 5]].frac().any()  # counts, a class and a binary
+    assert (draws[..., 2:5].sum(-1) == 1).all()
+    assert ((draws[..., 6] > 0) & (draws[..., 6] < 1)).all()
     model.double()
     double = {key: value.double() if value.is_floating_point() else value for key, value in batch.items()}
     bounds = []
-    for other in (0.0, 1.0):  # in the support of all families but one, whose entries do not count either
-        x = torch.where(double["mask"], double["x"], other)
+    for fill in (0.0, 1.0):  # in the support of all families but one
+        x = torch.where(double["mask"], double["x"], fill)
         torch.manual_seed(0)
         bounds.append(dvae.iwae_bound(model, {**double, "x": x}, particles=3).bound)
     assert (~double["mask"]).any()
@@ -101,13 +101,13 @@ def test_a_method_is_fitted_to_a_table_forecasts_it_and_does_not_see_what_is_mis
 
 @pytest.mark.parametrize("name", ["srnn", "erd"])
 def test_the_mean_of_a_column_changes_neither_fit_nor_forecasts_nor_scores(name, tmp_path):
-    """Nor does that of a covariate; forecasts, and the truth beside them, are in float64."""
-    shifts, found = {"temp": 1e9, "plan": -1e9}, []
-    for far in (False, True):
+    """The mean of a covariate does not either. Forecasts and truth are in float64."""
+    shifts, results = {"temp": 1e9, "plan": -1e9}, []
+    for is_shifted in (False, True):
         table = frame()
         for column, shift in shifts.items():
-            table[column] = table[column].astype(float) + far * shift
-        data = PanelData.of(table, TOLD, Cut(5, 3))
+            table[column] = table[column].astype(float) + is_shifted * shift
+        data = PanelData.of(table, COLUMNS, Cut(5, 3))
         windows, test = data.windows("train"), data.windows("test")
         torch.manual_seed(0)
         method = dvae.method(name, **options(name)).resolve_defaults(windows)
@@ -115,24 +115,24 @@ def test_the_mean_of_a_column_changes_neither_fit_nor_forecasts_nor_scores(name,
         dvae.fit(model, method.train(windows, None, 2), steps=2, batch_size=4, progress=False)
         forecasts = test.forecast(model, samples=4)
         forecasts.save(tmp_path / "forecasts.csv")
-        read = pd.read_csv(tmp_path / "forecasts.csv", dtype=str).astype({"truth": float})
-        np.testing.assert_array_equal(read["truth"], forecasts.truth.ravel())
+        table_read = pd.read_csv(tmp_path / "forecasts.csv", dtype=str).astype({"truth": float})
+        np.testing.assert_array_equal(table_read["truth"], forecasts.truth.ravel())
         for values in (forecasts.draws, forecasts.past, forecasts.truth):
             assert values.dtype == np.float64
-            values[..., 1] -= far * shifts["temp"]
+            values[..., 1] -= is_shifted * shifts["temp"]
         scores = dvae.evaluate(model, test, scores=panel_scores, samples=4, draw_emission=True, progress=False)["model"]
-        own = {metric: scores[metric].mean for metric in scores}
-        found.append([forecasts.draws, forecasts.past, forecasts.truth, own])
-    (*arrays, ours), (*others, theirs) = found
+        means = {metric: scores[metric].mean for metric in scores}
+        results.append([forecasts.draws, forecasts.past, forecasts.truth, means])
+    (*arrays, first_means), (*others, second_means) = results
     for one, other in zip(arrays, others, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
-    assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-3, nan_ok=True)
+    assert first_means == pytest.approx(second_means, rel=1e-3, abs=1e-3, nan_ok=True)
 
 
-def test_equations_read_covariates_and_gaps_where_they_name_them(data):
+def test_equations_read_exactly_the_covariates_that_they_name(data):
     guide = "q(z_t | z_{t-1}, x_{1:T}, c_t)"
-    given = {"generative": "p(z_t | z_{t-1}, d_t, s) p(x_t | z_t, c_t)", "inference": guide, **SMALL}
-    model = dvae.method("equations", **given).build(data.schema)
+    settings = {"generative": "p(z_t | z_{t-1}, d_t, s) p(x_t | z_t, c_t)", "inference": guide, **SMALL}
+    model = dvae.method("equations", **settings).build(data.schema)
     batch, plain = data.windows("test").all(), dvae.method("equations", **SMALL).build(data.schema)
 
     def bound(model, batch):
@@ -148,7 +148,7 @@ def test_equations_read_covariates_and_gaps_where_they_name_them(data):
         dvae.method("equations", generative="p(x_t | x_{t-1}, e_t)", inference="").build(data.schema)
 
 
-def test_a_run_is_fitted_loaded_and_refused_where_it_was_tampered_with(data, tmp_path):
+def test_a_run_is_loaded_unless_it_was_changed(data, tmp_path):
     out = tmp_path / "run"
     training = dvae.Training(steps=1, batch_size=4, progress=False)
     dvae.fit(dvae.method("autoregressive", width=4), data, out=out, **vars(training))
@@ -189,26 +189,26 @@ def forecasts(times=None, calendar=NUMBERS, samples=50):
 @pytest.mark.parametrize(
     ("samples", "first", "bands"), [(1, "q500", 0), (8, "q250", 1), (38, "q050", 2), (39, "q025", 3)]
 )
-def test_quantiles_that_so_many_draws_do_not_have_are_left_out(samples, first, bands):
-    found = forecasts(samples=samples)
-    written = [name for name in found.table() if name.startswith("q")]
+def test_quantiles_that_need_more_draws_are_left_out(samples, first, bands):
+    result = forecasts(samples=samples)
+    columns = [name for name in result.table() if name.startswith("q")]
     names = [f"q{1000 * level:03.0f}" for level in QUANTILES]
-    assert written == names[names.index(first) : len(names) - names.index(first)]
-    assert len(found.plot().axes[0].collections) == bands
-    gaps = PanelImputed(found.draws, np.ones((2, 3, 2), bool), found.columns, found.keys)
-    assert [name for name in gaps.table() if name.startswith("q")] == written
+    assert columns == names[names.index(first) : len(names) - names.index(first)]
+    assert len(result.plot().axes[0].collections) == bands
+    gaps = PanelImputed(result.draws, np.ones((2, 3, 2), bool), result.columns, result.keys)
+    assert [name for name in gaps.table() if name.startswith("q")] == columns
 
 
 @pytest.mark.parametrize("samples", [39, 60])
-def test_intervals_hold_truths_that_are_exchangeable_with_the_draws_at_their_level(samples):
+def test_intervals_cover_exchangeable_truths_at_their_level(samples):
     rng = np.random.default_rng(0)
     count = 20_000
-    drawn, truth = rng.uniform(size=(samples, count, 1, 1)), rng.uniform(size=(count, 1, 1))
+    draws, truth = rng.uniform(size=(samples, count, 1, 1)), rng.uniform(size=(count, 1, 1))
     keys = [("a", n) for n in range(count)]
-    table = PanelForecasts(drawn, truth[:, :0], truth, {"y": ""}, keys).table()
+    table = PanelForecasts(draws, truth[:, :0], truth, {"y": ""}, keys).table()
     for quantile in QUANTILES:
-        least = 1 / min(quantile, 1 - quantile) - 1  # the mean rank of the least of K draws is 1 / (K + 1)
-        assert needed(quantile) == pytest.approx(least)
+        n_draws = 1 / min(quantile, 1 - quantile) - 1  # the smallest of K draws has mean quantile level 1 / (K + 1)
+        assert needed(quantile) == pytest.approx(n_draws)
         below = (truth.ravel() < table[f"q{1000 * quantile:03.0f}"]).mean()
         assert below == pytest.approx(quantile, abs=4 * np.sqrt(quantile * (1 - quantile) / count))
 
@@ -217,7 +217,7 @@ DIGITS = 20240101.0 + 0.5 * np.arange(14)
 
 
 @pytest.mark.parametrize(
-    ("calendar", "times", "written"),
+    ("calendar", "times", "expected"),
     [
         (NUMBERS, DIGITS, [*DIGITS[4:7], *DIGITS[11:]]),
         (
@@ -233,31 +233,31 @@ DIGITS = 20240101.0 + 0.5 * np.arange(14)
     ],
     ids=["numbers", "zone", "durations"],
 )
-def test_times_are_written_with_all_digits_and_in_their_zone(tmp_path, calendar, times, written):
-    found = forecasts(times.reshape(2, 7), calendar)
-    found.save(tmp_path / "a.csv")
-    assert [*dict.fromkeys(pd.read_csv(tmp_path / "a.csv")["time"])] == written
-    figure = found.plot()
+def test_times_are_written_with_all_digits_and_in_their_zone(tmp_path, calendar, times, expected):
+    result = forecasts(times.reshape(2, 7), calendar)
+    result.save(tmp_path / "a.csv")
+    assert [*dict.fromkeys(pd.read_csv(tmp_path / "a.csv")["time"])] == expected
+    figure = result.plot()
     figure.canvas.draw()
     labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
     assert calendar.zone is None or "04:00" in labels
 
 
-def test_fans_hold_the_quantiles():
-    found = forecasts()
-    figure = found.plot(1)
+def test_prediction_bands_are_the_quantiles():
+    result = forecasts()
+    figure = result.plot(1)
     fan, share = figure.axes[:2]
-    low, high = np.quantile(found.draws[:, 1, :, 0], [0.025, 0.975], axis=0, method="weibull")
+    low, high = np.quantile(result.draws[:, 1, :, 0], [0.025, 0.975], axis=0, method="weibull")
     edges = fan.collections[0].get_paths()[0].vertices
     assert {*np.float32(low), *np.float32(high)} <= {*np.float32(edges[:, 1])}
-    np.testing.assert_allclose(share.lines[0].get_ydata(), found.draws[:, 1, :, 1].mean(0))
+    np.testing.assert_allclose(share.lines[0].get_ydata(), result.draws[:, 1, :, 1].mean(0))
     assert [axis.get_title() for axis in figure.axes] == ["y (m)", "open"]
-    assert len(found.plot(columns=["open"]).axes) == 1
+    assert len(result.plot(columns=["open"]).axes) == 1
     with pytest.raises(ValueError, match=r"no column 'opn' \(did you mean 'open'\?\); there are y, open"):
-        found.plot(columns=["opn"])
+        result.plot(columns=["opn"])
     if not find_spec("pyarrow"):
         with pytest.raises(ValueError, match="needs pyarrow: pip install"):
-            found.save("a.parquet")
+            result.save("a.parquet")
 
 
 @pytest.fixture(scope="module")
@@ -265,44 +265,44 @@ def model(data):
     return dvae.method("dkf", **SMALL).build(data.schema).eval()
 
 
-def test_forecasts_are_what_the_model_draws(data, model):
+def test_forecasts_are_draws_of_the_model(data, model):
     test = data.windows("test")
-    found, batch = test.forecast(model, 4, seed=3), test.all()
+    result, batch = test.forecast(model, 4, seed=3), test.all()
     torch.manual_seed(3)
     draws = model.forecast(batch.past(5), 3, samples=4, draw_emission=True)["x"]
-    np.testing.assert_array_equal(found.draws, draws)
-    np.testing.assert_array_equal(np.isnan(found.past), ~batch["mask"][:, :5])
-    assert found.keys == [(name, start + 5) for _, name, start in test.keys]
-    assert (test.forecast(model, 4, seed=4).draws != found.draws).any()
-    assert list(found.columns.values()) == ["people", "°C", "", "", "", "", ""]
+    np.testing.assert_array_equal(result.draws, draws)
+    np.testing.assert_array_equal(np.isnan(result.past), ~batch["mask"][:, :5])
+    assert result.keys == [(name, start + 5) for _, name, start in test.keys]
+    assert (test.forecast(model, 4, seed=4).draws != result.draws).any()
+    assert list(result.columns.values()) == ["people", "°C", "", "", "", "", ""]
     with pytest.raises(ValueError, match="whole sequences have no future; cut them"):
         data.whole().forecast(model)
 
 
 def test_every_missing_entry_of_a_table_is_filled(data, model, tmp_path):
-    whole = data.whole()
-    found, batch = whole.impute(model, 39), whole.all()
-    np.testing.assert_array_equal(found.missing, ~batch["mask"])
-    for draw in found.draws:
-        np.testing.assert_array_equal(draw[~found.missing], batch["x"][batch["mask"]])
-    table = found.table()
-    assert len(table) == found.missing.sum() == sum(np.isnan(data.schema.targets(one)).sum() for one in data.panel)
+    windows = data.whole()
+    result, batch = windows.impute(model, 39), windows.all()
+    np.testing.assert_array_equal(result.missing, ~batch["mask"])
+    for draw in result.draws:
+        np.testing.assert_array_equal(draw[~result.missing], batch["x"][batch["mask"]])
+    table = result.table()
+    assert len(table) == result.missing.sum() == sum(np.isnan(data.schema.targets(one)).sum() for one in data.panel)
     series = {one.name: one for one in data.panel}
     for _, row in table.iterrows():
-        one, place = series[row["sequence"]], data.schema.coordinates.index(row["column"])
-        assert np.isnan(data.schema.targets(one)[row["step"], place])
+        one, index = series[row["sequence"]], data.schema.coordinates.index(row["column"])
+        assert np.isnan(data.schema.targets(one)[row["step"], index])
         assert row["time"] == one.times[row["step"]]
-    found.save(tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz") as held:
-        np.testing.assert_array_equal(held["filled"], found.draws)
-        np.testing.assert_array_equal(held["observed"], batch["mask"])
+    result.save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as arrays:
+        np.testing.assert_array_equal(arrays["filled"], result.draws)
+        np.testing.assert_array_equal(arrays["observed"], batch["mask"])
 
 
-def test_padding_and_what_is_complete_are_not_filled(model, data):
+def test_padding_is_not_filled_and_complete_data_are_an_error(model, data):
     ragged = frame().drop(index=[10, 11, 12, 13]).reset_index(drop=True)
-    found = data.with_data(ragged).whole().impute(model, 2)
-    assert not found.missing[0, 10:].any()
-    assert found.missing[0, :10].any()
+    result = data.with_data(ragged).whole().impute(model, 2)
+    assert not result.missing[0, 10:].any()
+    assert result.missing[0, :10].any()
     full = PanelData.of(np.random.default_rng(0).normal(size=(6, 12, 1)), ["y"], Cut(5, 3))
     with pytest.raises(ValueError, match="no target is missing in panel"):
         full.whole().impute(model)

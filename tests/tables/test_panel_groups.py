@@ -1,4 +1,4 @@
-"""Panels with groups: batches have several windows of a group, and no window tells another's future."""
+"""Panels with groups: batches have several windows of a group, and no window reveals another's future."""
 
 import numpy as np
 import pandas as pd
@@ -26,10 +26,10 @@ def data():
     return panel(Cut(4, 4, split="group", validation=0.2, test=0.3))
 
 
-OWN = {"generative": "p(g) p(x_t | g)", "inference": "q(g | x_{1:T})", "grouped": ("g",), "latent": 1, "width": 8}
+OPTIONS = {"generative": "p(g) p(x_t | g)", "inference": "q(g | x_{1:T})", "grouped": ("g",), "latent": 1, "width": 8}
 
 
-def test_windows_of_a_group_share_it_where_they_have_the_same_present(data):
+def test_windows_of_a_group_share_its_index_if_they_have_the_same_present(data):
     test = data.windows("test")
     groups = {one.name: one.group for one in data.panel.series}
     keys = [(groups[name], start) for _, name, start in test.keys]
@@ -44,37 +44,37 @@ def test_batches_for_training_have_several_windows_of_a_group(data):
     assert batch["group"].tolist() == sorted(batch["group"].tolist())
     assert batch["group"].bincount().max() >= 8
     means = torch.stack([batch["x"][batch["group"] == g].mean() for g in batch["group"].unique()])
-    assert means.diff().abs().min() > 0.3  # of which each has its own
+    assert means.diff().abs().min() > 0.3  # each group has its own mean
 
 
-def test_errors_are_over_groups_whose_sequences_share_what_is_drawn(data):
-    """Bounds of a group's sequences are equal shares of its own: their spread tells nothing of other groups."""
-    model = dvae.method("equations", **OWN).build(data.schema)
+def test_standard_errors_are_over_groups_if_sequences_share_a_latent(data):
+    """Bounds of a group's sequences are equal shares of the group's bound: they do not vary independently."""
+    model = dvae.method("equations", **OPTIONS).build(data.schema)
     test = data.windows("test")
-    how = {"progress": False, "samples": 2}
-    found = dvae.compare({"ours": model}, test, particles=5, contrasts=0, **how)
-    assert "windows of 3 groups" in str(found)
-    assert "clustered by group" in str(found)
+    options = {"progress": False, "samples": 2}
+    comparison = dvae.compare({"ours": model}, test, particles=5, contrasts=0, **options)
+    assert "windows of 3 groups" in str(comparison)
+    assert "clustered by group" in str(comparison)
     groups = np.unique([group for _, group, _ in test.clusters], return_inverse=True)[1]
-    bounds = found.rows["ours"].bounds["IWAE bound"][0]
+    bounds = comparison.rows["ours"].bounds["IWAE bound"][0]
     means = np.bincount(groups, bounds) / np.bincount(groups) / test.length
-    assert found["ours"]["IWAE bound"].sequences == pytest.approx(means.std(ddof=1) / 3**0.5, rel=1e-6)
-    whole = panel(Cut(None, split="group", validation=0.2, test=0.3)).windows("test")
-    bounds = str(dvae.compare({"ours": model}, whole, particles=5, contrasts=0, samples=0, progress=False))
+    assert comparison["ours"]["IWAE bound"].sequences == pytest.approx(means.std(ddof=1) / 3**0.5, rel=1e-6)
+    sequences = panel(Cut(None, split="group", validation=0.2, test=0.3)).windows("test")
+    bounds = str(dvae.compare({"ours": model}, sequences, particles=5, contrasts=0, samples=0, progress=False))
     assert "9 whole sequences of 3 groups" in bounds
     assert "over whole sequences (clustered by group)" in bounds
-    scores = dvae.evaluate({"ours": model}, test, training_windows=data.windows("train"), **how)
+    scores = dvae.evaluate({"ours": model}, test, training_windows=data.windows("train"), **options)
     assert "windows of 3 groups" in str(scores)
     assert len(scores.rows["ours"].clip_means["CRPS"]) == 3
     assert np.isfinite(scores["ours"]["CRPS"].standard_error)
 
 
-def test_what_a_group_shares_is_learned_and_told_by_its_sequences(data):
-    method = dvae.method("equations", **OWN, warm_up=None)
+def test_a_latent_of_the_group_is_learned_from_its_sequences(data):
+    method = dvae.method("equations", **OPTIONS, warm_up=None)
     model = method.build(data.schema)
     recipe = method.train(data.windows("train"), data.windows("validation"), 150)
     dvae.fit(model, recipe, batch_size=32, learning_rate=1e-2, progress=False)
     batch = data.windows("test").all()
     together = dvae.iwae_bound(model, batch, particles=200).bound.mean()
-    apart = dvae.iwae_bound(model, {"x": batch["x"]}, particles=200).bound.mean()
-    assert together > apart + 0.1  # one latent to pay for, in place of several
+    separate = dvae.iwae_bound(model, {"x": batch["x"]}, particles=200).bound.mean()
+    assert together > separate + 0.1  # one KL term instead of several

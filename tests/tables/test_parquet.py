@@ -1,4 +1,4 @@
-"""Parquet, where pyarrow is there: read as it is meant, and refused before it takes room."""
+"""Parquet files, if pyarrow is installed: read like CSV, and an error if too large for memory."""
 
 import datetime
 import io
@@ -22,7 +22,7 @@ def put(path, columns, **options):
     return path
 
 
-def test_every_kind_of_column_is_read_as_csv_would_have_it(tmp_path):
+def test_every_type_of_column_is_read_as_from_csv(tmp_path):
     days = [datetime.date(2024, 1, 1) + datetime.timedelta(n) for n in range(30)]
     columns = {
         "day": days,
@@ -35,19 +35,19 @@ def test_every_kind_of_column_is_read_as_csv_would_have_it(tmp_path):
         "seen": pa.array([[1, 2]] * 30),
     }
     with pytest.warns(UserWarning, match="columns of lists or records are left out: seen"):
-        found = read_panel(put(tmp_path / "a.parquet", columns))
+        from_parquet = read_panel(put(tmp_path / "a.parquet", columns))
     frame = pd.DataFrame({name: list(map(str, days)) if name == "day" else values for name, values in columns.items()})
     frame = frame.drop(columns="seen").assign(kind=["a", "b"] * 15, half=np.arange(-15, 15, dtype=np.float16) / 8)
     frame.to_csv(tmp_path / "a.csv", index=False)
-    there = read_panel(tmp_path / "a.csv")
-    assert found.columns == there.columns
-    np.testing.assert_allclose(found.series[0].values, there.series[0].values, rtol=1e-6)
-    np.testing.assert_array_equal(found.series[0].times, there.series[0].times)
+    from_csv = read_panel(tmp_path / "a.csv")
+    assert from_parquet.columns == from_csv.columns
+    np.testing.assert_allclose(from_parquet.series[0].values, from_csv.series[0].values, rtol=1e-6)
+    np.testing.assert_array_equal(from_parquet.series[0].times, from_csv.series[0].times)
 
 
-@pytest.mark.parametrize("written", [str, pd.Timestamp])
-def test_an_index_with_a_name_is_a_column(tmp_path, written):
-    days = [written(f"2024-01-{n:02}") for n in range(1, 31)]
+@pytest.mark.parametrize("convert", [str, pd.Timestamp])
+def test_a_named_index_is_a_column(tmp_path, convert):
+    days = [convert(f"2024-01-{n:02}") for n in range(1, 31)]
     frame = pd.DataFrame({"riders": np.arange(30.0) + 0.5}, index=pd.Index(days, name="day"))
     frame.to_parquet(tmp_path / "a.parquet")
     panel = read_panel(tmp_path / "a.parquet")
@@ -66,9 +66,9 @@ BOMBS = {
 }
 
 
-@pytest.mark.parametrize("which", BOMBS)
-def test_what_is_small_in_a_file_and_large_in_memory_is_refused(tmp_path, monkeypatch, which):
-    path = put(tmp_path / "a.parquet", BOMBS[which], compression="zstd", use_dictionary=which != "zipped")
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_small_file_that_is_large_in_memory_is_an_error(tmp_path, monkeypatch, name):
+    path = put(tmp_path / "a.parquet", BOMBS[name], compression="zstd", use_dictionary=name != "zipped")
     assert path.stat().st_size < 20_000
     read_frame(path)
     monkeypatch.setattr(reading, "LARGEST", 10**6)
@@ -76,7 +76,7 @@ def test_what_is_small_in_a_file_and_large_in_memory_is_refused(tmp_path, monkey
         read_frame(path)
 
 
-def test_many_columns_and_other_content_are_refused(tmp_path):
+def test_too_many_columns_and_other_content_are_an_error(tmp_path):
     (tmp_path / "b.parquet").write_bytes(b"PAR1 is none")
     with pytest.raises(ValueError, match=r"b.parquet cannot be read as PARQUET"):
         read_frame(tmp_path / "b.parquet")
@@ -85,23 +85,23 @@ def test_many_columns_and_other_content_are_refused(tmp_path):
         read_frame(path)
 
 
-def test_changed_files_are_read_or_refused(tmp_path):
-    rng, buffer, refused = np.random.default_rng(0), io.BytesIO(), 0
+def test_corrupted_files_are_read_or_an_error(tmp_path):
+    rng, buffer, n_errors = np.random.default_rng(0), io.BytesIO(), 0
     put(buffer, {"day": list(range(40)), "y": rng.normal(size=40), "sky": ["clear", "rain"] * 20}, compression="zstd")
     content = buffer.getvalue()
     for _ in range(200):
-        other = bytearray(content)
-        for place in rng.integers(4, len(content) - 4, rng.integers(1, 4)):
-            other[place] = rng.integers(256)
-        (tmp_path / "a.parquet").write_bytes(other)
+        changed = bytearray(content)
+        for index in rng.integers(4, len(content) - 4, rng.integers(1, 4)):
+            changed[index] = rng.integers(256)
+        (tmp_path / "a.parquet").write_bytes(changed)
         try:
             read_panel(tmp_path / "a.parquet")
         except ValueError:
-            refused += 1
-    assert 0 < refused < 200
+            n_errors += 1
+    assert 0 < n_errors < 200
 
 
-def test_the_command_line_reads_and_writes_it(tmp_path, capsys):
+def test_the_command_line_reads_and_writes_parquet(tmp_path, capsys):
     rng = np.random.default_rng(0)
     frame = pd.DataFrame({"station": np.repeat(list("abcdef"), 20), "day": np.tile(np.arange(20), 6)})
     frame = frame.assign(y=pd.Series(rng.normal(size=120)).mask(rng.random(120) < 0.1))
@@ -114,10 +114,10 @@ def test_the_command_line_reads_and_writes_it(tmp_path, capsys):
     for command, count in (("forecast", 6 * 3), ("impute", frame.y.isna().sum())):
         for end in ("parquet", "csv"):
             assert main([command, run, "--out", str(tmp_path / f"{command}.{end}")]) == 0
-        made, there = (read(tmp_path / f"{command}.{end}") for read, end in READERS)
-        assert len(made) >= count
-        assert made.columns.tolist() == there.columns.tolist()
-        np.testing.assert_allclose(made["q500"], there["q500"], rtol=1e-6)
+        from_parquet, from_csv = (reader(tmp_path / f"{command}.{end}") for reader, end in READERS)
+        assert len(from_parquet) >= count
+        assert from_parquet.columns.tolist() == from_csv.columns.tolist()
+        np.testing.assert_allclose(from_parquet["q500"], from_csv["q500"], rtol=1e-6)
 
 
 READERS = ((pd.read_parquet, "parquet"), (pd.read_csv, "csv"))

@@ -1,4 +1,4 @@
-"""Files of tables, read as they are meant or refused in a sentence, before they take time or room."""
+"""Files of tables are read, or are an error of one sentence before they take time or memory."""
 
 import io
 import os
@@ -34,7 +34,7 @@ def rows(seed=0):
     return frame.assign(station=np.repeat(list("abcde"), 30))
 
 
-def test_csv_is_read_however_it_is_written(tmp_path):
+def test_all_newlines_and_quotes_of_csv_are_read(tmp_path):
     for content in ("a,b\r1,2\r3,4\r", "a,b\n1,2,\n3,4,\n", "\n\na,b\n\n1,2\n3,4", '"a","b"\n"1","2"\n3,4\n'):
         frame = read_frame(put(tmp_path / "a.csv", content))
         assert frame.to_dict("list") == {"a": ["1", "3"], "b": ["2", "4"]}
@@ -42,7 +42,7 @@ def test_csv_is_read_however_it_is_written(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "wanted"),
+    ("content", "expected"),
     [
         ("a\tb\n1\t2\n3\t4\n", {"a": [1, 3], "b": [2, 4]}),
         ("a;b\n1,5;x\n-3,25;y,z\n", {"a": [1.5, -3.25], "b": ["x", "y,z"]}),
@@ -55,16 +55,16 @@ def test_csv_is_read_however_it_is_written(tmp_path):
     ],
     ids=["tab", "comma", "three decimals", "point", "in a name", "in a value", "comment", "sep="],
 )
-def test_what_other_countries_write_is_read_as_they_mean_it(tmp_path, content, wanted):
+def test_separators_decimal_signs_and_encodings_of_csv_are_inferred(tmp_path, content, expected):
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
-        found = read_frame(put(tmp_path / "a.csv", content.encode(encoding)))
-        assert [*found] == [*wanted]
-        for name, values in wanted.items():
-            read = read_numbers(found[name], hint=found.attrs.get("decimal", "."))
-            np.testing.assert_array_equal(read.values if read.is_numeric else found[name], values)
+        frame = read_frame(put(tmp_path / "a.csv", content.encode(encoding)))
+        assert [*frame] == [*expected]
+        for name, values in expected.items():
+            numbers = read_numbers(frame[name], hint=frame.attrs.get("decimal", "."))
+            np.testing.assert_array_equal(numbers.values if numbers.is_numeric else frame[name], values)
 
 
-def test_what_is_odd_in_a_file_is_named(tmp_path):
+def test_oddities_of_a_file_cause_a_warning(tmp_path):
     with pytest.warns(UserWarning, match="several columns named x; the further ones are read as x.1"):
         assert [*read_frame(put(tmp_path / "a.csv", "t,x,x\n1,2,3\n"))] == ["t", "x", "x.1"]
     assert len(read_frame(put(tmp_path / "b.csv", "t,,\n1,2,3\n")).columns) == 3
@@ -75,7 +75,7 @@ def test_what_is_odd_in_a_file_is_named(tmp_path):
             read_frame(put(tmp_path / "a.parquet", b"PAR1"))
 
 
-def test_an_npz_is_sequences(tmp_path):
+def test_an_npz_contains_sequences(tmp_path):
     x = np.arange(24.0).reshape(2, 4, 3)
     np.savez(tmp_path / "a.npz", x=x, other=np.zeros(3))
     panel = read_panel(tmp_path / "a.npz")
@@ -83,11 +83,11 @@ def test_an_npz_is_sequences(tmp_path):
     assert panel.columns.id == ("sequence",)
     np.savez(tmp_path / "b.npz", anything=x[0].astype(">i2"))
     (one,) = read_panel(tmp_path / "b.npz")
-    np.testing.assert_array_equal(one.values, x[0])  # and no column of the sequence's number
+    np.testing.assert_array_equal(one.values, x[0])  # no column with the number of the sequence
     np.savez(tmp_path / "c.npz", x=x, lengths=np.array([2, 4]))
     panel = read_panel(tmp_path / "c.npz")
-    for one, own, length in zip(panel, x, (2, 4), strict=True):
-        np.testing.assert_array_equal(one.values, own[:length])
+    for one, values, length in zip(panel, x, (2, 4), strict=True):
+        np.testing.assert_array_equal(one.values, values[:length])
 
 
 def npz(**arrays):
@@ -97,11 +97,11 @@ def npz(**arrays):
 
 
 def forged(shape, dtype="'<f8'", data=bytes(48)):
-    """An npz whose header says what it likes."""
-    said = f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    """Return an npz file with a forged header."""
+    header = f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr("x.npy", b"\x93NUMPY\x01\x00" + len(said).to_bytes(2, "little") + said + data)
+        archive.writestr("x.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data)
     return content.getvalue()
 
 
@@ -136,15 +136,15 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("which", HOSTILE)
-def test_hostile_files_are_refused_in_a_sentence_and_in_little_memory(tmp_path, which):
-    name, content, said = HOSTILE[which]
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_hostile_files_are_an_error_that_takes_little_memory(tmp_path, kind):
+    name, content, message = HOSTILE[kind]
     path = put(tmp_path / name, content)
     size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    if said is None:
+    if message is None:
         assert not len(read_frame(path))
     else:
-        with pytest.raises(ValueError, match=said) as error:
+        with pytest.raises(ValueError, match=message) as error:
             read_frame(path)
         assert str(path) in str(error.value)
         assert len(str(error.value)) < 500
@@ -152,7 +152,7 @@ def test_hostile_files_are_refused_in_a_sentence_and_in_little_memory(tmp_path, 
     assert grown * (1 if sys.platform == "darwin" else 1024) < 600e6
 
 
-def test_what_is_no_plain_file_is_not_waited_for(tmp_path):
+def test_a_pipe_or_folder_is_an_error_at_once(tmp_path):
     os.mkfifo(tmp_path / "a.csv")
     (tmp_path / "b.csv").mkdir()
     for name in ("a.csv", "b.csv"):
@@ -167,21 +167,21 @@ def test_what_is_no_plain_file_is_not_waited_for(tmp_path):
     assert schema_beside(tmp_path / "d.csv") == (None, None)
 
 
-def test_the_schema_beside_a_file_is_the_one_of_its_name_or_of_its_folder(tmp_path):
+def test_the_schema_of_a_file_has_its_name_or_is_in_its_folder(tmp_path):
     path = tmp_path / "riders.csv"
     rows().to_csv(path, index=False)
     assert schema_beside(path) == (None, None)
     put(tmp_path / "schema.toml", "[columns.temp]")
     assert schema_beside(path) == (Columns((Column("temp"),)), None)
     put(tmp_path / "riders.toml", "id = 'station'\ntime = 'day'\n[columns.riders]\n[cut]\nobserved = 3\nhorizon = 2")
-    own = Columns((Column("riders"),), ("station",), "day")
-    assert schema_beside(path) == (own, Cut(3, 2))
+    columns = Columns((Column("riders"),), ("station",), "day")
+    assert schema_beside(path) == (columns, Cut(3, 2))
     data = PanelData.open(path)
-    assert (data.panel.columns, data.protocol) == (own, Cut(3, 2))
+    assert (data.panel.columns, data.protocol) == (columns, Cut(3, 2))
     assert PanelData.open(path, horizon=1, split="time").protocol == Cut(3, 1, split="time")
-    told = PanelData.open(path, ["temp"])
-    assert told.panel.columns.names == ["temp"]
-    assert told.panel.columns.id == ("station",)
+    narrowed = PanelData.open(path, ["temp"])
+    assert narrowed.panel.columns.names == ["temp"]
+    assert narrowed.panel.columns.id == ("station",)
     for content in ("[columns.temp", "famly = 3", b"\xff", "[cut]\nobserved = 'a'\nhorizon = 2"):
         put(tmp_path / "riders.toml", content)
         with pytest.raises(ValueError, match=r"riders.toml is not a valid schema of a table: "):
@@ -191,15 +191,15 @@ def test_the_schema_beside_a_file_is_the_one_of_its_name_or_of_its_folder(tmp_pa
         schema_beside(path)
 
 
-def test_data_come_back_from_what_a_run_keeps_of_them(tmp_path, monkeypatch):
+def test_data_are_reopened_from_the_record_of_a_run(tmp_path, monkeypatch):
     rows().to_csv(tmp_path / "riders.csv", index=False)
     monkeypatch.chdir(tmp_path)
     data = PanelData.open("riders.csv", ["riders"], past=("temp",), observed=4, horizon=2)
-    again = PanelData.reopened(data.recorded(), data.schema)
-    assert again.fingerprint == data.fingerprint == data.recorded().fingerprint
+    reopened = PanelData.reopened(data.recorded(), data.schema)
+    assert reopened.fingerprint == data.fingerprint == data.recorded().fingerprint
     assert data.recorded().path == "riders.csv"
     assert Path(data.location) == tmp_path / "riders.csv"
-    assert again.windows("test").fingerprint == data.windows("test").fingerprint
+    assert reopened.windows("test").fingerprint == data.windows("test").fingerprint
     rows(1).to_csv(tmp_path / "other.csv", index=False)
     other = PanelData.reopened(data.recorded(), data.schema, "other.csv")
     assert other.schema == data.schema

@@ -1,4 +1,4 @@
-"""BoM by parts: the best of ten futures of GSPS's generator is all that counts, and control is GSPS's."""
+"""BoM by parts: the loss is the error of the best of ten futures of GSPS's generator."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ def batch(windows):
 
 
 @pytest.mark.parametrize("parts", [("lower", "upper"), FIVE])
-def test_what_is_minimised_is_the_squared_error_of_the_best_of_ten(windows, batch, parts):
+def test_the_loss_is_the_squared_error_of_the_best_of_ten(windows, batch, parts):
     model = built(windows, parts=parts)
     method = dvae.method("bom-parts", **SMALL, parts=parts)
     torch.manual_seed(1)
@@ -28,8 +28,8 @@ def test_what_is_minimised_is_the_squared_error_of_the_best_of_ten(windows, batc
     torch.manual_seed(1)
     latents = model.guide(batch)
     draws = [{name: w.unflatten(0, (-1, 4))[i % (len(w) // 4)] for name, w in latents.items()} for i in range(10)]
-    made = torch.cat([model.forecast({"x": batch["x"][:, :15]}, 60, fix=each)["x"] for each in draws])
-    errors = (made - batch["x"][:, 15:]).square().sum((2, 3))
+    futures = torch.cat([model.forecast({"x": batch["x"][:, :15]}, 60, fix=each)["x"] for each in draws])
+    errors = (futures - batch["x"][:, 15:]).square().sum((2, 3))
     assert len(errors.unique()) == 40
     assert {*terms.energies} == {"reconstruction"}
     loss = method.train(windows).objective(terms, 0)

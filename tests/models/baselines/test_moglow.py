@@ -1,4 +1,4 @@
-"""MoGlow: a likelihood that is exact, learns how coordinates hang together, and reads of the past what it is shown."""
+"""MoGlow: its contract, missing frames, initialisation, tables and published size."""
 
 import math
 
@@ -30,13 +30,13 @@ class TestMoGlow(FactorizationContract):
         return small(frame_dropout=0.5).build({"x": size})
 
 
-def test_where_a_frame_is_missing_the_model_reads_its_own_and_a_joint_alone_cannot_be():
+def test_whole_frames_may_be_missing_and_single_joints_may_not():
     model, mask = small().build({"x": 3}).eval(), torch.ones_like(X, dtype=torch.bool)
     mask[:, 3] = False
     batch = {"x": torch.where(mask, X, math.nan), "mask": mask}
-    filled = model.impute(batch, 3)["x"]
-    assert torch.equal(filled[:, mask], X[mask].expand(3, -1))
-    assert filled[:, :, 3].std(0).min() > 0
+    imputed = model.impute(batch, 3)["x"]
+    assert torch.equal(imputed[:, mask], X[mask].expand(3, -1))
+    assert imputed[:, :, 3].std(0).min() > 0
     assert torch.isfinite(dvae.SequenceELBO().terms(model, batch).bound).all()
     mask[0, 4, 1] = False
     with pytest.raises(ValueError, match="entries"):
@@ -44,7 +44,7 @@ def test_where_a_frame_is_missing_the_model_reads_its_own_and_a_joint_alone_cann
 
 
 @pytest.mark.parametrize(("mean", "dtype"), [(3.0, torch.float64), (1e9, torch.float32)])
-def test_it_starts_where_training_data_are_noise_of_variance_1(mean, dtype):
+def test_initialisation_maps_training_data_to_noise_of_variance_1(mean, dtype):
     x = mean + 0.1 * torch.randn(50, 20, 3).cumsum(1).double()
     torch.manual_seed(0)
     model = small().build({"x": 3}).to(dtype)
@@ -64,7 +64,7 @@ def table(*columns):
     return Panel([Series(f"s{n}", part) for n, part in enumerate(parts)], Columns(columns))
 
 
-def test_of_a_table_the_flow_makes_the_real_columns_and_others_have_their_law():
+def test_the_flow_models_real_columns_and_other_columns_keep_their_family():
     panel = table(Column("a"), Column("n", family="count"), Column("b"))
     model = small().build(PanelSchema.from_data(panel, Cut()))
     assert model.generator["x"].events == [[0, 2]]
@@ -73,13 +73,13 @@ def test_of_a_table_the_flow_makes_the_real_columns_and_others_have_their_law():
     assert not model.forecast(x, 2, samples=3)["x"][..., 1].frac().any()
     start_flow(model, Sequences({"x": x}))
     assert all(move.shift.any() for move in model.generator["x"].head.parts[0].flow.transforms[::4])
-    whole = small().build(PanelSchema.from_data(table(Column("a"), Column("b")), Cut()))
-    assert isinstance(whole.distributions["p(x)"], ConditionalFlow)
+    real_only = small().build(PanelSchema.from_data(table(Column("a"), Column("b")), Cut()))
+    assert isinstance(real_only.distributions["p(x)"], ConditionalFlow)
     with pytest.raises(ValueError, match="columns"):
         small().build(PanelSchema.from_data(table(Column("n", family="count")), Cut()))
 
 
-def test_at_the_sizes_of_the_paper_it_is_built():
+def test_the_model_of_the_paper_has_the_expected_size():
     model = dvae.method("moglow", **PAPER).build({"x": 51})
     distribution = model.generator["x"].head
     assert len(distribution.flow.transforms) == 4 * 16

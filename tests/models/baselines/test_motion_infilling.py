@@ -1,4 +1,4 @@
-"""Motion Infilling: its size, that it draws nothing, what it reads and what is hidden of that in training."""
+"""Motion Infilling: its size, its deterministic output, its inputs and the inputs hidden in training."""
 
 import math
 from dataclasses import replace
@@ -40,7 +40,7 @@ def double(batch):
     return {name: value.double() for name, value in batch.items()}
 
 
-def some(windows, count=3):
+def some_batch(windows, count=3):
     return {name: value[:count] for name, value in double(windows.given(["LWrist", "RFoot"]).all()).items()}
 
 
@@ -57,7 +57,7 @@ class TestMotionInfilling(FactorizationContract):
 
 
 def test_the_network_for_human36m_has_the_published_size():
-    """That of the network for gaps of any width, in its record; no number of it depends on the skeleton."""
+    """The size is in the record of the network for gaps of any width, and does not depend on the skeleton."""
     for skeleton in (HUMAN36M, motion.Skeleton(("root", "knee", "foot"), (-1, 0, 1))):
         model = dvae.method("motion-infilling", maps=(32, 64, 128, 256, 256)).build_on(skeleton)
         assert sum(parameter.numel() for parameter in model.parameters()) == 4_703_425
@@ -76,56 +76,56 @@ def test_motions_have_any_length_and_bodies_any_size(frames):
         assert out.isfinite().all()
 
 
-def test_minus_the_log_density_is_the_absolute_error_and_a_constant(windows):
-    model, batch = build(windows), some(windows)
+def test_the_loss_is_the_absolute_error_plus_a_constant(windows):
+    model, batch = build(windows), some_batch(windows)
     terms = dvae.SequenceELBO().terms(model, batch)
-    made = model.reconstruct(batch)["x"][0]
-    errors = (batch["x"][:, 1:] - made[:, -20:]).abs().sum((1, 2))
+    mean = model.reconstruct(batch)["x"][0]
+    errors = (batch["x"][:, 1:] - mean[:, -20:]).abs().sum((1, 2))
     assert not terms.kl
     torch.testing.assert_close(-terms.bound, errors + 20 * windows.size * math.log(2))
     torch.testing.assert_close(small().train(windows).objective(terms, 0), -terms.bound.sum() / (3 * 20))
 
 
-# ----------------------------------------------------------------------------------------------------- what it makes
+# ------------------------------------------------------------------------------------------------------- inputs
 
 
-def test_nothing_of_joints_that_are_not_given_is_read(windows):
-    """Nor of given ones while they are hidden; of the others everything."""
-    model, batch = build(windows), some(windows)
-    shown = (batch["y"] != 0).any(0).any(0)
+def test_joints_that_are_not_given_are_not_read(windows):
+    """Given joints are read entirely, except while hidden."""
+    model, batch = build(windows), some_batch(windows)
+    is_given = (batch["y"] != 0).any(0).any(0)
     hidden = torch.full_like(batch["x"], torch.inf)
     hidden[:, 8:12] = 0.3
     x = batch["x"].requires_grad_()
-    for curriculum, unseen in ((0.2, slice(0, 0)), (0.3, slice(7, 11))):
-        data = {"x": x, "y": x * shown, HIDDEN: hidden}
+    for curriculum, hidden_frames in ((0.2, slice(0, 0)), (0.3, slice(7, 11))):
+        data = {"x": x, "y": x * is_given, HIDDEN: hidden}
         rollout = model.rollout(model.read(data, curriculum=curriculum))
         mean = rollout.parameters("x", x[:, 1:])[0]
         (slope,) = torch.autograd.grad(mean.sin().sum(), x)
-        read = (slope != 0).any(0)
-        assert read[0, 3:].all()  # the first pose, whose root is where all coordinates begin
-        assert not read[1:, ~shown].any()
-        known = torch.ones(20, dtype=torch.bool)
-        known[unseen] = False
-        assert not read[1:, shown][~known].any()
-        assert read[1:, shown][known].all()
+        is_read = (slope != 0).any(0)
+        assert is_read[0, 3:].all()  # the first pose, whose root is the origin
+        assert not is_read[1:, ~is_given].any()
+        is_visible = torch.ones(20, dtype=torch.bool)
+        is_visible[hidden_frames] = False
+        assert not is_read[1:, is_given][~is_visible].any()
+        assert is_read[1:, is_given][is_visible].all()
 
 
-# ------------------------------------------------------------------------------------------- what is hidden of paths
+# ---------------------------------------------------------------------------------------- hidden parts of paths
 
 
-def test_a_batch_is_read_without_what_is_hidden(windows):
+def test_hidden_parts_of_paths_are_not_read(windows):
     model = build(windows)
     batch = double(small().train(windows).batches.sample(5, torch.Generator().manual_seed(0)))
     for curriculum in (0.0, 0.5, 1.0):
-        seen = model.read(batch, curriculum=curriculum)
-        assert torch.equal(seen["y"], torch.where(batch[HIDDEN] <= curriculum, 0.0, batch["x"])[:, 1:])
-        assert torch.equal(seen["x"], batch["x"][:, 1:])
-        assert HIDDEN not in seen
-        narrow = dvae.SequenceELBO().terms(model, batch, curriculum=curriculum).bound
-        torch.testing.assert_close(narrow, dvae.SequenceELBO().terms(model, {n: seen[n] for n in "sxy"}).bound)
+        batch_read = model.read(batch, curriculum=curriculum)
+        assert torch.equal(batch_read["y"], torch.where(batch[HIDDEN] <= curriculum, 0.0, batch["x"])[:, 1:])
+        assert torch.equal(batch_read["x"], batch["x"][:, 1:])
+        assert HIDDEN not in batch_read
+        bound = dvae.SequenceELBO().terms(model, batch, curriculum=curriculum).bound
+        torch.testing.assert_close(bound, dvae.SequenceELBO().terms(model, {n: batch_read[n] for n in "sxy"}).bound)
 
 
-def test_a_run_goes_through_its_curriculum(windows):
+def test_a_fit_follows_its_curriculum(windows):
     recipe = small(curriculum=0.5).train(windows, windows, 8)
     fit = dvae.fit(small().build(windows), recipe, batch_size=4, log_every=1, validate_every=8, progress=False)
     assert fit.series("curriculum")[1] == [0, 0.25, 0.5, 0.75, 1, 1, 1, 1]

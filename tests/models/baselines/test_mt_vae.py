@@ -1,4 +1,4 @@
-"""MT-VAE: its contract, its size, what it minimises, and that its latent codes changes of style."""
+"""MT-VAE: its contract, size and loss, and its latent of a change of style."""
 
 from dataclasses import replace
 
@@ -40,13 +40,13 @@ def batch_of(windows, size=3):
 
 
 def future(model, batch, w):
-    """What is made of w (B, T, D)."""
+    """Return the future (B, T, D) of w."""
     with torch.no_grad():
         return model.forecast({"x": batch["x"][:, :5]}, 12, fix={"w": w})["x"][0]
 
 
 def test_the_model_of_human36m_has_the_layers_of_the_public_code():
-    """That of 1024 units, of which half of an embedding are style, for poses of 48 numbers in place of 64."""
+    """1024 units, half of an embedding for style, and poses of 48 numbers instead of 64."""
     model = dvae.method("mt-vae").build({"x": 48})
 
     def linear(size, out):
@@ -55,7 +55,7 @@ def test_the_model_of_human36m_has_the_layers_of_the_public_code():
     def block(size, out):
         return linear(size, out) + linear(size, out // 2) + linear(out // 2, out // 2) + linear(out // 2, out)
 
-    def lstm(size):  # of four gates and a cell, with gains and shifts
+    def lstm(size):  # four gates and a cell, with gains and shifts
         return 4 * 1024 * (size + 1024) + 2 * 5 * 1024
 
     encoder = lstm(48) + linear(1024, 1024)
@@ -65,8 +65,8 @@ def test_the_model_of_human36m_has_the_layers_of_the_public_code():
     assert sum(parameter.numel() for parameter in model.parameters()) == encoder + guide + change + decoder
 
 
-def test_a_motion_that_stays_the_same_has_one_code(windows):
-    """Whatever it is: a guide of the change of style has nothing else to read."""
+def test_all_unchanging_motions_have_the_same_code(windows):
+    """The guide reads only the change of style."""
     network, poses = built(windows).encoder["w"].network, batch_of(windows)["x"][:, :5]
     same = network({"x": poses, "h": poses.flatten(1)}, 5)
     torch.testing.assert_close(same, same[:1].expand(3, -1), rtol=0, atol=0)
@@ -74,8 +74,8 @@ def test_a_motion_that_stays_the_same_has_one_code(windows):
     assert (other - other[:1])[1:].abs().max() > 1e-3
 
 
-def test_the_loss_is_the_papers(windows):
-    """Absolute errors, first velocities of two futures, the divergence and the way back to a latent, one by one."""
+def test_the_loss_equals_the_one_of_the_paper(windows):
+    """The terms are absolute errors, velocities of two futures, the KL divergence and the cycle of a latent."""
     model, batch = built(windows, heading=False, join=2.0), batch_of(windows)
     objective = small(heading=False, join=2.0).train(windows, steps=100).objective
     torch.manual_seed(1)
@@ -87,16 +87,18 @@ def test_the_loss_is_the_papers(windows):
     def velocity(poses):
         return torch.cat([last, poses], 1).diff(dim=1)[:, :8]
 
-    made, free = future(model, batch, w), future(model, batch, other)
+    reconstruction, sample = future(model, batch, w), future(model, batch, other)
     network, guide = model.generator["x"].network, model.encoder["w"]
     _, style = network.past(batch["x"][:, :5])
     loc, scale = guide.head(guide.network.coded(network.changed(style, other) - style))
-    again = loc + scale * torch.randn(3, 4, dtype=torch.float64)
+    recovered = loc + scale * torch.randn(3, 4, dtype=torch.float64)
     joints, a = 16, 1 - torch.exp(torch.tensor(-3.0, dtype=torch.float64))
-    paper = (made - truth).abs().sum() / joints
-    paper = paper + 5 * a * sum((velocity(each) - velocity(truth)).abs().sum() / joints for each in (made, free))
-    paper = paper + a * terms.kl["w"].sum() / 4 + 5 * (other - again).abs().sum() / 4
-    scale = joints / 4  # of the Laplace distribution
+    paper = (reconstruction - truth).abs().sum() / joints
+    paper = paper + 5 * a * sum(
+        (velocity(each) - velocity(truth)).abs().sum() / joints for each in (reconstruction, sample)
+    )
+    paper = paper + a * terms.kl["w"].sum() / 4 + 5 * (other - recovered).abs().sum() / 4
+    scale = joints / 4  # scale of the Laplace distribution
     constant = 3 * truth[0].numel() * torch.tensor(2 * scale).log()
-    join = 2 * (made[:, 0] - last[:, 0]).square().sum()
+    join = 2 * (reconstruction[:, 0] - last[:, 0]).square().sum()
     torch.testing.assert_close(objective(terms, 100), (4 * paper + constant + join) / (3 * 12))

@@ -1,4 +1,4 @@
-"""The model without latents: its bound is its likelihood, whatever the bound."""
+"""The model without latents: every bound is its likelihood."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""GSPS: the factorization, futures drawn together, energies in the shared loop, control, presets."""
+"""GSPS: its factorization, energies, control of parts, forecasts and runs."""
 
 from functools import partial
 
@@ -23,7 +23,7 @@ FIVE = ("torso", "right_leg", "left_leg", "right_arm", "left_arm")
 
 @pytest.fixture(scope="module")
 def prior_run(walkers, tmp_path_factory):
-    """A run of a pose prior, of two steps."""
+    """Return the folder of a pose prior's run of two steps."""
     out = tmp_path_factory.mktemp("prior") / "run"
     method = metric_model("pose-prior", heading=True)
     dvae.fit(method, walkers, out=out, **vars(dvae.Training(steps=2, progress=False, accelerator="cpu")))
@@ -37,14 +37,14 @@ def build(windows, **options):
 
 def batch(windows, size=4):
     method = dvae.method("gsps", **SMALL)
-    drawn = method.train(windows).batches.sample(size, torch.Generator().manual_seed(0))
-    return {name: v.double() if v.is_floating_point() else v for name, v in drawn.items()}
+    sample = method.train(windows).batches.sample(size, torch.Generator().manual_seed(0))
+    return {name: v.double() if v.is_floating_point() else v for name, v in sample.items()}
 
 
 # ------------------------------------------------------------------------------------------------- factorization
 
 
-def test_the_equations_are_the_papers():
+def test_the_equations_are_those_of_the_paper():
     model, guide = dvae.method("gsps").equations()
     assert model.text == "p(a) p(lower_t | h_{1:O}, a) p(b) p(upper_t | h_{1:O}, lower_{1:T}, b)"
     assert guide.text == "q(a) q(b)"
@@ -55,10 +55,10 @@ def test_the_equations_are_the_papers():
     ("skeleton", "observed", "length", "parameters"),
     [(motion.HUMAN36M, 25, 125, 1_298_108), (motion.HUMANEVA, 15, 75, None)],
 )
-def test_the_published_numbers_of_parameters(skeleton, observed, length, parameters):
+def test_the_model_has_the_published_number_of_parameters(skeleton, observed, length, parameters):
     method = dvae.method("gsps", **PRESETS[skeleton.name])
     model = GSPSModel(method, skeleton, observed, length)
-    prior = {"human36m": 13_970, "humaneva": 10_710 + 2}[skeleton.name]  # 10,710 is without the two slopes
+    prior = {"human36m": 13_970, "humaneva": 10_710 + 2}[skeleton.name]  # 10,710 omits the two slopes
     assert sum(p.numel() for p in model.pose_prior.parameters()) == prior
     generator = sum(p.numel() for p in model.parameters()) - prior
     nodes, width, into = skeleton.joints - 1, 256, 3 * method.coefficients + 64
@@ -68,78 +68,78 @@ def test_the_published_numbers_of_parameters(skeleton, observed, length, paramet
 
 
 def test_the_program_runs_in_pyro(windows):
-    """The factors of a trace are minus the energies; the latents are the only ones that are drawn."""
+    """A trace has minus the energies as factors, and draws only the latents."""
     model, data = build(windows).eval(), batch(windows)
     torch.manual_seed(0)
     trace = poutine.trace(model.model).get_trace(data)
     trace.compute_log_prob()
-    drawn = [n for n in trace.stochastic_nodes if not n.startswith("sequences") and n != "windows"]
-    assert drawn == ["a", "b"]
+    latents = [n for n in trace.stochastic_nodes if not n.startswith("sequences") and n != "windows"]
+    assert latents == ["a", "b"]
     truth = model.turned(data["x"])
     values = trace.nodes["_RETURN"]["value"]
-    found = energies.best_of_many(model.to_data_space(values)["x"].unflatten(0, (-1, 4))[:, :, 15:], truth[:, 15:])
-    assert torch.allclose(trace.nodes["reconstruction"]["log_prob"], -found, atol=1e-10)
+    errors = energies.best_of_many(model.to_data_space(values)["x"].unflatten(0, (-1, 4))[:, :, 15:], truth[:, 15:])
+    assert torch.allclose(trace.nodes["reconstruction"]["log_prob"], -errors, atol=1e-10)
 
 
-def test_the_energies_are_those_of_the_card(windows):
-    """Every term from its formula, over all futures, one after the other."""
+def test_the_energies_equal_their_formulas(windows):
+    """Each term is computed by its formula, in loops over all futures."""
     model, data = build(windows, heading=False, limb=1.0).eval(), batch(windows)
     values = model.to_data_space(model.model(data))
     x, S = data["x"], values["x"].unflatten(0, (-1, 4))
-    found = model.energies(values, x, data)
+    terms = model.energies(values, x, data)
     future, truth = S[:, :, 15:], x[:, 15:]
     errors = (future - truth).square().sum((2, 3))
-    assert torch.allclose(found["reconstruction"], errors.min(0).values)
+    assert torch.allclose(terms["reconstruction"], errors.min(0).values)
     pairs = [(b, m) for b in range(4) for m in range(10) if data["valid"][b, m]]
     best = [min((S[s, b, 15:] - data["pseudo"][b, m, 15:]).square().sum() for s in range(6)) for b, m in pairs]
-    assert torch.allclose(found["multimodal"].mean(), torch.stack(best).mean())
-    assert torch.allclose(found["history"].mean(), (S[:, :, :15] - x[:, :15]).square().sum(-1).mean())
+    assert torch.allclose(terms["multimodal"].mean(), torch.stack(best).mean())
+    assert torch.allclose(terms["history"].mean(), (S[:, :, :15] - x[:, :15]).square().sum(-1).mean())
     skeleton = windows.skeleton
-    lengths, own = (skeleton.bone_lengths(windows.positions(v)) for v in (S, x[:, :1]))
-    assert torch.allclose(found["limb"].mean(), (lengths - own).square().sum(-1).mean())
+    lengths, true_lengths = (skeleton.bone_lengths(windows.positions(v)) for v in (S, x[:, :1]))
+    assert torch.allclose(terms["limb"].mean(), (lengths - true_lengths).square().sum(-1).mean())
 
-    def likeness(motions, scale):
-        apart = [(motions[i] - motions[j]).abs().sum() for i in range(len(motions)) for j in range(i)]
-        return torch.stack([torch.exp(-one / scale) for one in apart]).mean()
+    def similarity(motions, scale):
+        distances = [(motions[i] - motions[j]).abs().sum() for i in range(len(motions)) for j in range(i)]
+        return torch.stack([torch.exp(-distance / scale) for distance in distances]).mean()
 
     tree = {name: values[name].unflatten(0, (2, 3, 4))[..., 15:, :] for name in ("lower", "upper")}
     scales = model.method.diversity_scale
-    lower = torch.stack([likeness(tree["lower"][0, :, b], scales[0]) for b in range(4)]).mean()
-    upper = torch.stack([likeness(tree["upper"][:, i, b], scales[1]) for i in range(3) for b in range(4)]).mean()
-    assert torch.allclose(found["diversity_lower"].mean(), lower)
-    assert torch.allclose(found["diversity_upper"].mean(), upper)
+    lower = torch.stack([similarity(tree["lower"][0, :, b], scales[0]) for b in range(4)]).mean()
+    upper = torch.stack([similarity(tree["upper"][:, i, b], scales[1]) for i in range(3) for b in range(4)]).mean()
+    assert torch.allclose(terms["diversity_lower"].mean(), lower)
+    assert torch.allclose(terms["diversity_upper"].mean(), upper)
 
 
 # ------------------------------------------------------------------------------------------------ forecasts, control
 
 
-def test_a_fixed_part_moves_the_same_and_the_others_do_not(windows):
+def test_a_fixed_part_is_equal_in_all_futures_and_the_others_vary(windows):
     for heading in (False, True):
         model, past = build(windows, heading=heading), batch(windows)["x"][:, :15]
         free = model.forecast(past, 60, 4)
-        held = model.forecast(past, 60, 5, fix={"lower": free["lower"][2]})
-        assert torch.equal(held["lower"], free["lower"][2].expand(5, -1, -1, -1))
-        assert torch.equal(held["x"][..., model.view.parts["lower"]], held["lower"])
-        assert (average_pairwise_distance(held["lower"].movedim(0, 1)) == 0).all()
-        assert (average_pairwise_distance(held["upper"].movedim(0, 1)) > 0).all()
+        fixed = model.forecast(past, 60, 5, fix={"lower": free["lower"][2]})
+        assert torch.equal(fixed["lower"], free["lower"][2].expand(5, -1, -1, -1))
+        assert torch.equal(fixed["x"][..., model.view.parts["lower"]], fixed["lower"])
+        assert (average_pairwise_distance(fixed["lower"].movedim(0, 1)) == 0).all()
+        assert (average_pairwise_distance(fixed["upper"].movedim(0, 1)) > 0).all()
         latent = model.forecast(past, 60, 5, fix={"a": free["a"][2]})
-        assert torch.allclose(latent["lower"], held["lower"], atol=1e-12)
+        assert torch.allclose(latent["lower"], fixed["lower"], atol=1e-12)
 
 
-def test_a_past_with_gaps_is_read_as_straight_lines_in_time(windows):
+def test_gaps_of_the_past_are_interpolated_linearly(windows):
     model, past = build(windows, heading=True), batch(windows)["x"][:, :15]
     mask = torch.ones_like(past, dtype=torch.bool)
     mask[:, 3:9, 30:36] = False
     straight, share = past.clone(), torch.arange(1, 7)[:, None] / 7
     straight[:, 3:9, 30:36] = past[:, 2:3, 30:36].lerp(past[:, 9:10, 30:36], share.to(past))
     futures = []
-    for given in ({"x": past.masked_fill(~mask, torch.nan), "mask": mask}, straight):
+    for observed in ({"x": past.masked_fill(~mask, torch.nan), "mask": mask}, straight):
         torch.manual_seed(0)
-        futures.append(model.forecast(given, 60, 2)["x"])
+        futures.append(model.forecast(observed, 60, 2)["x"])
     torch.testing.assert_close(*futures)
 
 
-def test_forecasts_that_cannot_be(windows):
+def test_wrong_arguments_of_a_forecast_are_an_error(windows):
     model, x = build(windows), batch(windows)["x"]
     for horizon, fix, message in (
         (61, None, "frames"),
@@ -158,20 +158,22 @@ def test_forecasts_that_cannot_be(windows):
 def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, walkers, prior_run):
     method = dvae.method("gsps", **{**SMALL, "pose_prior": 0.01, "pose_prior_run": prior_run, "draws": (2, 2)})
     options = {"batch_size": 4, "validate_every": 3, "progress": False, "accelerator": "cpu"}
-    whole = dvae.fit(method, walkers, out=tmp_path / "whole", **vars(dvae.Training(steps=6, **options)))
+    uninterrupted = dvae.fit(method, walkers, out=tmp_path / "whole", **vars(dvae.Training(steps=6, **options)))
     dvae.fit(method, walkers, out=tmp_path / "half", **vars(dvae.Training(steps=3, **options)))
     resumed = runs.resume(tmp_path / "half", steps=6, progress=False)
-    losses = whole.series("validation/loss")[1]
-    assert whole.best_bound == -min(losses)
-    assert resumed.best_bound == whole.best_bound
-    loaded, other = runs.load(tmp_path / "whole"), runs.load(tmp_path / "half")
-    for (name, value), found in zip(loaded.model.state_dict().items(), other.model.state_dict().values(), strict=True):
-        assert torch.equal(value, found), name
-    assert loaded.method == method.resolve_defaults(walkers.windows("train"))
+    losses = uninterrupted.series("validation/loss")[1]
+    assert uninterrupted.best_bound == -min(losses)
+    assert resumed.best_bound == uninterrupted.best_bound
+    first, second = runs.load(tmp_path / "whole"), runs.load(tmp_path / "half")
+    for (name, value), other_value in zip(
+        first.model.state_dict().items(), second.model.state_dict().values(), strict=True
+    ):
+        assert torch.equal(value, other_value), name
+    assert first.method == method.resolve_defaults(walkers.windows("train"))
     test = walkers.windows("test")
     prior = runs.load(prior_run).model
-    judged = partial(motion.scores, pose_prior=prior)
-    scores = dvae.evaluate({"gsps": loaded.model}, test, scores=judged, samples=3, progress=False)
+    measures = partial(motion.scores, pose_prior=prior)
+    scores = dvae.evaluate({"gsps": first.model}, test, scores=measures, samples=3, progress=False)
     assert {"APD", "ADE", "MMADE", "pose NLL"} <= scores["gsps"].keys()
     assert not {"ELBO", "KL a"} & scores["gsps"].keys()
     last = motion.Heading(test.skeleton, 15).face(test.all()["x"])[:, 14:15]
@@ -180,8 +182,8 @@ def test_a_run_is_fitted_resumed_loaded_and_scored(tmp_path, walkers, prior_run)
 
 
 @pytest.mark.parametrize("heading", [False, True])
-def test_bones_of_futures_keep_the_lengths_that_were_seen(windows, heading):
-    """Whatever the weights; and parts are coordinates of the positions, the first of which may be held."""
+def test_bones_of_futures_keep_the_observed_lengths(windows, heading):
+    """This holds for any weights. Parts are coordinates of positions, and the first part may be fixed."""
     model = build(windows, bones=True, heading=heading, parts=FIVE, draws=(2,), diversity=(1.0,)).eval()
     with torch.no_grad():
         for parameter in model.parameters():
@@ -195,16 +197,16 @@ def test_bones_of_futures_keep_the_lengths_that_were_seen(windows, heading):
     torch.testing.assert_close(lengths(free["x"]), lengths(past).mean(1)[:, None].expand(3, -1, 60, -1))
     first = next(iter(model.view.parts))
     assert torch.equal(free[first], free["x"][..., model.view.parts[first]])
-    held = model.forecast(past, 60, 3, fix={first: free[first][0]})
-    assert torch.equal(held[first], free[first][:1].expand(3, -1, -1, -1))
-    torch.testing.assert_close(lengths(held["x"]), lengths(free["x"]))
+    fixed = model.forecast(past, 60, 3, fix={first: free[first][0]})
+    assert torch.equal(fixed[first], free[first][:1].expand(3, -1, -1, -1))
+    torch.testing.assert_close(lengths(fixed["x"]), lengths(free["x"]))
 
 
 # -------------------------------------------------------------------------------------------------------- contract
 
 
 class TestTheFactorization(FactorizationContract):
-    """GSPS's equations and networks, with a density for the parts, so that the laws of scoring apply."""
+    """GSPS's equations and networks, with a density for each part, as the contract requires."""
 
     steps = 6
 
@@ -220,8 +222,8 @@ class TestTheFactorization(FactorizationContract):
         )
 
     def data(self, size):
-        drawn = {"h": 9, "lower": 6, "upper": 3}
-        return {name: torch.randn(20, self.steps, size) for name, size in drawn.items()}
+        sizes = {"h": 9, "lower": 6, "upper": 3}
+        return {name: torch.randn(20, self.steps, size) for name, size in sizes.items()}
 
-    test_every_size_may_be_one = test_padding_changes_nothing = None  # the networks make sequences of one length
-    test_training_stays_finite = None  # forecasts need the whole length; those of the method itself are tested above
+    test_every_size_may_be_one = test_padding_changes_nothing = None  # the networks output sequences of one length
+    test_training_stays_finite = None  # forecasts need the full length; see the tests above

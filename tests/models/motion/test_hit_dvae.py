@@ -1,4 +1,4 @@
-"""HiT-DVAE whole: what depends on what in the built model, the paper's objective, forecasts, ablations."""
+"""HiT-DVAE: dependencies of the model, the objective of the paper, forecasts, runs and ablations."""
 
 import math
 from dataclasses import replace
@@ -33,11 +33,11 @@ def build(windows, **options):
 
 
 def small(**options):
-    """The method at test size; options of best-of-many alone are left open beside the evidence."""
+    """Return the method at test size; the evidence ignores the options of best-of-many."""
     return dvae.method("hit-dvae", **{**QUICK, **(ENERGIES if options.get("loss") == "evidence" else {}), **options})
 
 
-def drawn(windows, size=3, **options):
+def batch_of(windows, size=3, **options):
     method = small(**options)
     batch = method.train(windows).batches.sample(size, torch.Generator().manual_seed(0))
     return {name: v.double() if v.is_floating_point() else v for name, v in batch.items()}
@@ -48,47 +48,47 @@ def terms(model, batch, **program):
     return dvae.SequenceELBO().terms(model, batch, draws=objective.draws, **program), objective
 
 
-# ------------------------------------------------------------------------------------------ what depends on what
+# -------------------------------------------------------------------------------------------------- dependencies
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS)
-def test_the_built_model_leaks_nothing_from_the_present_or_the_future(windows, ablation):
-    """By the program itself: x_t moves no p(x_s | .) and no p(z_s | .) with s <= t, z_t no p(z_s | .) with s <= t.
+def test_the_model_reads_nothing_from_the_present_or_the_future(windows, ablation):
+    """x_t changes no p(x_s | .) and no p(z_s | .) with s <= t; z_t changes no p(z_s | .) with s <= t.
 
-    With one exception: where windows are turned by a frame, here the last, what that one tells of its heading is known
-    everywhere. So it is moved in a way that turns nobody, all joints alike.
+    The exception is a model that rotates windows by the heading of a frame, here the last. All joints of that frame
+    are moved equally, which keeps the heading.
     """
     model, steps = build(windows, **ABLATIONS[ablation]).eval(), 6
-    turned = isinstance(model, HiTModel) and model.method.heading
-    x = drawn(windows)["x"][:1, :steps]
+    is_rotated = isinstance(model, HiTModel) and model.method.heading
+    x = batch_of(windows)["x"][:1, :steps]
     latents = model.guide(x)
 
     def means(x, z):
         sites = poutine.trace(poutine.condition(model.model, data={**latents, "z": z})).get_trace(x).nodes
         return [sites[name]["fn"].steps(sites[name]["value"]) for name in ("x", "z")]
 
-    def moved(x, z):
+    def changed_steps(x, z):
         before, after = means(x0, z0), means(x, z)
-        apart = [
+        differences = [
             (a.loc - b.loc).abs().amax((0, 2)) + (a.scale - b.scale).abs().amax((0, 2))
             for a, b in zip(before, after, strict=True)
         ]
-        return [values.gt(0).tolist() for values in apart]
+        return [values.gt(0).tolist() for values in differences]
 
     x0, z0 = x, latents["z"]
     for t in range(steps):
         x, z = x0.clone(), z0.clone()
-        x[:, t] += 0.1 * (1 if turned and t == steps - 1 else torch.randn_like(x[:, t]))
+        x[:, t] += 0.1 * (1 if is_rotated and t == steps - 1 else torch.randn_like(x[:, t]))
         z[:, t] += 0.1 * torch.randn_like(z[:, t])
-        of_x, of_z = moved(x, z0)
+        of_x, of_z = changed_steps(x, z0)
         assert of_x == [s > t for s in range(steps)]
         assert of_z == [s == t + 1 for s in range(steps)]
-        of_x, of_z = moved(x0, z)
+        of_x, of_z = changed_steps(x0, z)
         assert of_x == [s == t for s in range(steps)]
         assert of_z == [s > t for s in range(steps)]
 
 
-def test_the_equations_are_the_papers_and_those_of_its_ablations():
+def test_the_equations_are_those_of_the_paper_and_its_ablations():
     def texts(**options):
         return tuple(equation.text for equation in dvae.method("hit-dvae", **options).equations())
 
@@ -101,22 +101,22 @@ def test_the_equations_are_the_papers_and_those_of_its_ablations():
 # -------------------------------------------------------------------------------------------------- the objective
 
 
-def test_the_loss_is_the_papers(windows):
-    """L of the card from its terms, with means over time and sums over coordinates, for one window after the other."""
+def test_the_loss_equals_the_one_of_the_paper(windows):
+    """The terms of L are means over time and sums over coordinates, computed window by window."""
     options = {"angles": 2.0, "multimodal": 3.0, "heading": True, "warm_up": 0, "pseudo_minimum": 0.0}
-    model, batch = build(windows, **options).eval(), drawn(windows, **options)
+    model, batch = build(windows, **options).eval(), batch_of(windows, **options)
     assert batch["valid"].any()
-    found, objective = terms(model, batch)
+    result, objective = terms(model, batch)
     latents = poutine.trace(model.guide).get_trace
     torch.manual_seed(1)
     sites = latents(batch, draws=objective.draws).nodes
     torch.manual_seed(1)
-    found, _ = terms(model, batch)
+    result, _ = terms(model, batch)
     K, B, T = 3, 3, 75
     z, w = (sites[name]["value"] for name in ("z", "w"))
     x, pseudo = (model.turned(batch[name]) for name in ("x", "pseudo"))
-    again = {"x": batch["x"].repeat(K, 1, 1)}
-    program = poutine.trace(poutine.condition(model.model, data={"z": z, "w": w})).get_trace(again).nodes
+    repeated = {"x": batch["x"].repeat(K, 1, 1)}
+    program = poutine.trace(poutine.condition(model.model, data={"z": z, "w": w})).get_trace(repeated).nodes
     motions = program["x"]["fn"].steps(x.repeat(K, 1, 1)).loc.unflatten(0, (K, B))
 
     def kl(name):
@@ -136,19 +136,23 @@ def test_the_loss_is_the_papers(windows):
     best = [min(((motions[k, b] - pseudo[b, m]) ** 2).sum(-1).mean() for k in range(K)) for b, m in pairs]
     L += method.multimodal * torch.stack(best).mean()
     L += method.kl_local * kl("z").sum(-1).mean(-1).mean() + method.kl_static / T * kl("w").sum(-1).mean()
-    lengths, own = (windows.skeleton.bone_lengths(windows.positions(v)) for v in (motions, x[:, :1]))
-    L += method.limb * ((lengths - own) ** 2).sum(-1).mean()
+    lengths, true_lengths = (windows.skeleton.bone_lengths(windows.positions(v)) for v in (motions, x[:, :1]))
+    L += method.limb * ((lengths - true_lengths) ** 2).sum(-1).mean()
     for (part, joints), weight, scale in zip(
         body_parts(windows.skeleton, ("lower", "upper")).items(), method.diversity, method.diversity_scale, strict=True
     ):
-        held = motions.unflatten(-1, (-1, 3))[..., list(joints), :]
-        likeness = [torch.exp(-(held[i] - held[j]).abs().sum((1, 2, 3)) / scale) for i in range(K) for j in range(i)]
+        part_motions = motions.unflatten(-1, (-1, 3))[..., list(joints), :]
+        similarities = [
+            torch.exp(-(part_motions[i] - part_motions[j]).abs().sum((1, 2, 3)) / scale)
+            for i in range(K)
+            for j in range(i)
+        ]
         assert part in ("lower", "upper")
-        L += weight * torch.stack(likeness).mean()
+        L += weight * torch.stack(similarities).mean()
     limits = motion.AngleLimits(model.limits, model.angle_low, model.angle_high)
     L += method.angles * energies.joint_angles(motions, limits, windows.skeleton).mean()
-    L -= 1e-3 * program["x"]["fn"].log_prob(x.repeat(K, 1, 1)).mean() / T  # which fits the scale alone
-    torch.testing.assert_close(objective(found, 0), L, rtol=1e-9, atol=1e-9)
+    L -= 1e-3 * program["x"]["fn"].log_prob(x.repeat(K, 1, 1)).mean() / T  # fits only the scale
+    torch.testing.assert_close(objective(result, 0), L, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -158,15 +162,15 @@ def test_the_loss_is_the_papers(windows):
         ("humaneva", 75, (10, 5, 0.1, 0.2, 100, 1, 0.001, 0.5, 0.1)),
     ],
 )
-def test_the_presets_are_the_papers_weights(skeleton, frames, card):
-    """(lr, lmm, l_lower, l_upper, l_limb, l_angle, l_nf, lz, lw) of the card, lw beside means over T frames."""
+def test_the_presets_have_the_weights_of_the_paper(skeleton, frames, card):
+    """The weights are (lr, lmm, l_lower, l_upper, l_limb, l_angle, l_nf, lz, lw); lw is divided by T frames."""
     objective = dvae.method("hit-dvae", warm_up=0, **PRESETS[skeleton]).objective()
     names = ("reconstruction", "multimodal", "diversity_lower", "diversity_upper", "limb", "angles", "pose_prior")
     weights = [objective.energy_weights[name] for name in names]
     assert [*weights, objective.kl_weight["z"], objective.kl_weight["w"] / frames] == pytest.approx(card)
 
 
-def test_schedules_have_the_papers_shares_of_500_epochs(windows):
+def test_schedules_have_the_epochs_of_the_paper(windows):
     """KL weights rise over 20 epochs, scheduled sampling over the next 80."""
     method = dvae.method("hit-dvae").resolve_defaults(windows)
     recipe = method.train(windows, steps=500)
@@ -180,8 +184,8 @@ def test_schedules_have_the_papers_shares_of_500_epochs(windows):
 # ------------------------------------------------------------------------------------------------------ forecasts
 
 
-def test_what_lies_beyond_a_sequence_turns_nobody(windows):
-    model, x = build(windows, heading=True).eval(), drawn(windows)["x"]
+def test_padding_does_not_change_the_heading(windows):
+    model, x = build(windows, heading=True).eval(), batch_of(windows)["x"]
     bounds = []
     for padding in (0.0, 1.0):
         ragged = x.clone()
@@ -197,8 +201,8 @@ def test_what_lies_beyond_a_sequence_turns_nobody(windows):
 
 
 @pytest.mark.parametrize("ablation", ["without attention and w", "evidence, turned"])
-def test_an_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
-    """And the best weights are by what is trained."""
+def test_an_ablation_is_fitted_and_loaded_and_forecasts(people, tmp_path, ablation):
+    """The best weights are selected by the trained loss."""
     data = dvae.motion.MotionData.open(people)
     method = small(warm_up=1, **ABLATIONS[ablation])
     training = dvae.Training(steps=4, validate_every=2, batch_size=2, progress=False, accelerator="cpu")
@@ -206,17 +210,15 @@ def test_an_ablation_is_fitted_loaded_and_forecasts(people, tmp_path, ablation):
     rows = [row for row in result.history if any(name.startswith("validation/") for name in row)]
     assert all(("validation/loss" in row) == (method.loss == "best-of-many") for row in rows)
     assert ("validation loss" in result.best) == (method.loss == "best-of-many")
-    loaded = runs.load(tmp_path / "run")
-    assert (
-        loaded.method == configured(loaded.method.config()) == replace(method.resolve_defaults(data.windows("train")))
-    )
-    assert loaded.model.feeding.probability == 0
+    run = runs.load(tmp_path / "run")
+    assert run.method == configured(run.method.config()) == replace(method.resolve_defaults(data.windows("train")))
+    assert run.model.feeding.probability == 0
     past = data.windows("test").all()["x"][:2, :15]
-    assert torch.isfinite(loaded.model.forecast(past, 3, 2)["x"]).all()
-    assert ("w" in loaded.model.latents) == bool(method.static)
+    assert torch.isfinite(run.model.forecast(past, 3, 2)["x"]).all()
+    assert ("w" in run.model.latents) == bool(method.static)
 
 
-def test_without_a_skeleton_there_are_the_equations_and_their_networks():
+def test_without_a_skeleton_the_model_has_only_equations_and_networks():
     model = dvae.method("hit-dvae").build({"x": 12})
     assert not isinstance(model, HiTModel)
     assert math.isfinite(dvae.SequenceELBO().loss(model, model.guide, torch.randn(2, 4, 12)))

@@ -1,4 +1,4 @@
-"""Mix-and-Match and the three ways it compares with: their contract, how noise enters, what codes differ by."""
+"""Mix-and-Match and three alternatives: their contract, the use of noise, and the diversity of codes."""
 
 from typing import ClassVar
 
@@ -29,7 +29,7 @@ class Contract(FactorizationContract):
         return small(**self.options).build({"x": size})
 
 
-class TestMixAndMatchWithALatentOfAnotherSize(Contract):
+class TestMixAndMatchWithAnotherLatentSize(Contract):
     options: ClassVar = {"latent": 3, "velocity": True, "alpha": 0.3}
 
 
@@ -38,7 +38,7 @@ class TestAdded(Contract):
     missing: ClassVar = {"z": ("h", "x_{1:T}")}
 
 
-class TestALatentForEachStep(Contract):
+class TestLatentForEachStep(Contract):
     options: ClassVar = {"noise": "step", "latent": 3, "velocity": True}
 
 
@@ -47,7 +47,7 @@ def windows(quaternions):
     return quaternions
 
 
-def made(windows, **options):
+def build_model(windows, **options):
     torch.manual_seed(0)
     return small(**options).build(windows["train"]).eval()
 
@@ -60,24 +60,24 @@ def past(windows, rows=4):
 # -------------------------------------------------------------------------------------------------- the drawn indices
 
 
-@pytest.mark.parametrize(("share", "size", "chosen"), [(0, 7, 0), (0.3, 10, 3)])
-def test_a_subset_has_its_share_of_indices_all_alike_often(share, size, chosen):
+@pytest.mark.parametrize(("share", "size", "count"), [(0, 7, 0), (0.3, 10, 3)])
+def test_all_subsets_of_a_share_are_equally_probable(share, size, count):
     distribution = Subset(share).distribution(size)
-    drawn = distribution.sample((4000,))
-    assert (drawn.sum(-1) == chosen).all()
-    np.testing.assert_allclose(drawn.mean(0), chosen / size, atol=0.04)
-    different = np.unique(drawn.numpy(), axis=0)
-    np.testing.assert_allclose(distribution.log_prob(drawn).exp() * len(different), 1, rtol=1e-5)
-    assert distribution.log_prob(1 - drawn[0]) == -torch.inf
+    draws = distribution.sample((4000,))
+    assert (draws.sum(-1) == count).all()
+    np.testing.assert_allclose(draws.mean(0), count / size, atol=0.04)
+    different = np.unique(draws.numpy(), axis=0)
+    np.testing.assert_allclose(distribution.log_prob(draws).exp() * len(different), 1, rtol=1e-5)
+    assert distribution.log_prob(1 - draws[0]) == -torch.inf
 
 
-def test_model_and_guide_share_one_set_of_indices_which_costs_nothing(windows):
-    model, batch = made(windows), windows["train"].sample(6, torch.Generator().manual_seed(0))
+def test_model_and_guide_share_indices_without_a_kl_term(windows):
+    model, batch = build_model(windows), windows["train"].sample(6, torch.Generator().manual_seed(0))
     guide = poutine.trace(model.guide).get_trace(batch)
     trace = poutine.trace(poutine.replay(model.model, guide)).get_trace(batch)
-    drawn = trace.nodes["i"]["value"]
-    assert drawn is guide.nodes["i"]["value"]
-    assert drawn.shape == (24,)  # of no sequence, and outside the plate
+    indices = trace.nodes["i"]["value"]
+    assert indices is guide.nodes["i"]["value"]
+    assert indices.shape == (24,)  # no batch dimension, and outside the plate
     assert [frame.name for frame in trace.nodes["i"]["cond_indep_stack"]] == []
     trace.compute_log_prob()
     guide.compute_log_prob()
@@ -88,32 +88,32 @@ def test_model_and_guide_share_one_set_of_indices_which_costs_nothing(windows):
     assert dvae.iwae_bound(model, batch, particles=3).bound.shape == (6,)
 
 
-# ------------------------------------------------------------------------------------------------ how noise enters
+# ---------------------------------------------------------------------------------------------------------- noise
 
 
-def test_with_alpha_0_the_model_is_deterministic_and_with_1_there_is_no_place_for_noise(windows):
+def test_alpha_0_and_alpha_1_make_the_model_deterministic(windows):
     for alpha in (0.0, 1.0):
-        futures = made(windows, alpha=alpha).forecast(past(windows), 6, samples=3)["x"]
+        futures = build_model(windows, alpha=alpha).forecast(past(windows), 6, samples=3)["x"]
         torch.testing.assert_close(futures, futures[:1].expand_as(futures))
-    futures = made(windows, alpha=0.5).forecast(past(windows), 6, samples=3)["x"]
+    futures = build_model(windows, alpha=0.5).forecast(past(windows), 6, samples=3)["x"]
     assert futures.std(0).min() > 0
 
 
-def test_what_was_not_drawn_goes_on_as_it_was():
+def test_noise_changes_only_the_selected_units():
     torch.manual_seed(0)
     noise = MixAndMatch(0.25)
     decoder = noise.decoder(8, noise.latent(8)).eval()
     decoder.last = torch.nn.Identity()
-    code, z, chosen = torch.randn(3, 8), torch.randn(3, 6), noise.indices.distribution(8).sample()
-    perturbed = decoder(code, z, chosen.expand(3, -1))
+    code, z, is_selected = torch.randn(3, 8), torch.randn(3, 6), noise.indices.distribution(8).sample()
+    perturbed = decoder(code, z, is_selected.expand(3, -1))
     same = perturbed == code
-    assert (same == (chosen == 0)).all()
-    jacobian = torch.autograd.functional.jacobian(lambda z: decoder(code, z, chosen.expand(3, -1)).sum(0), z)
-    assert (jacobian[chosen == 0] == 0).all()
-    assert (jacobian[chosen == 1].abs().sum((1, 2)) > 0).all()
+    assert (same == (is_selected == 0)).all()
+    jacobian = torch.autograd.functional.jacobian(lambda z: decoder(code, z, is_selected.expand(3, -1)).sum(0), z)
+    assert (jacobian[is_selected == 0] == 0).all()
+    assert (jacobian[is_selected == 1].abs().sum((1, 2)) > 0).all()
 
 
-def test_the_loss_is_of_quaternions_and_positions_and_the_annealed_kl(windows):
+def test_the_loss_adds_errors_of_quaternions_and_positions_and_the_annealed_kl(windows):
     """L_rot + L_skl, each the mean over its numbers, in units of D / 2 scale^2."""
     method = small(skeleton=0.5)
     model = method.build(windows["train"]).eval()
@@ -142,7 +142,7 @@ def test_the_loss_is_of_quaternions_and_positions_and_the_annealed_kl(windows):
 
 
 @pytest.mark.parametrize("noise", ["mix", "add"])
-def test_every_way_is_trained_by_the_shared_loop_and_scored_in_metres(windows, noise):
+def test_each_use_of_noise_is_trained_and_scored_in_metres(windows, noise):
     method = small(noise=noise)
     model = method.build(windows["train"])
     recipe = method.train(windows["train"], windows["test"], steps=6)
@@ -162,33 +162,33 @@ def test_every_way_is_trained_by_the_shared_loop_and_scored_in_metres(windows, n
 
 
 @pytest.mark.parametrize("noise", ["mix", "concatenate", "add", "step"])
-def test_codes_are_those_that_futures_are_made_of(windows, noise):
-    """A first pose is linear in the code of a latent for each step; elsewhere the decoder goes on from the code."""
-    model = made(windows, noise=noise)
+def test_the_codes_are_those_of_the_forecasts(windows, noise):
+    """With a latent for each step, the first pose is linear in the code; otherwise the decoder starts from the code."""
+    model = build_model(windows, noise=noise)
     torch.manual_seed(1)
-    found = codes(model, past(windows), 3)
+    code_samples = codes(model, past(windows), 3)
     torch.manual_seed(1)
     forecast = model.forecast(past(windows), 1, 3)
-    assert found.shape == (3, 4, 24)
+    assert code_samples.shape == (3, 4, 24)
     network, data = model.generator["x"].network, model.read(past(windows))
     last = data["h"][:, -model.sizes["x"] :]
-    for code, x in zip(found, forecast["x"], strict=True):
+    for code, x in zip(code_samples, forecast["x"], strict=True):
         state = code if noise == "step" else network.cell(last[:, None], code[None].contiguous())[0][:, 0]
-        shown = model.to_data_space({"x": network.out(state)[:, None]}, data)["x"]
-        torch.testing.assert_close(shown, x, atol=1e-6, rtol=1e-5)
+        decoded = model.to_data_space({"x": network.out(state)[:, None]}, data)["x"]
+        torch.testing.assert_close(decoded, x, atol=1e-6, rtol=1e-5)
 
 
-def test_it_is_written_into_the_log_as_a_model_learns_and_changes_nothing(windows, tmp_path):
+def test_the_diversity_of_codes_is_logged_and_does_not_change_training(windows, tmp_path):
     method = small(width=8)
     recipe = method.train(windows["train"], windows["test"], steps=6)
     options = {"batch_size": 4, "validate_every": 3, "log_every": 3, "progress": False, "accelerator": "cpu"}
 
-    def fitted(**more):
+    def fit(**more):
         torch.manual_seed(0)
         return dvae.fit(method.build(windows["train"]), recipe, **options, **more)
 
     watch = CodeDiversity(past(windows), every=2, samples=5)
-    plain, watched = fitted(), fitted(out=tmp_path / "run", callbacks=[watch])
+    plain, watched = fit(), fit(out=tmp_path / "run", callbacks=[watch])
     steps, means = watched.series("codes/diversity")
     assert steps == [2, 4, 6]
     assert min(watched.series("codes/latent")[1]) > 0

@@ -1,4 +1,4 @@
-"""The latent space of 4D motion: its two guides, its two phases, and what it makes of bodies."""
+"""The latent space of 4D motion: its two guides, its energy of surfaces and its two phases."""
 
 import pytest
 import torch
@@ -23,16 +23,16 @@ def segments(people):
     return Segments(motion.gait_cycles(people))
 
 
-def made(segments, method=SMALL):
+def build(segments, method=SMALL):
     torch.manual_seed(0)
     return method.build(segments).eval()
 
 
-def test_the_published_guide_lacks_the_shape_and_the_other_does_not(segments):
+def test_only_the_guide_with_shape_is_exact(segments):
     for shaped in (False, True):
-        model = made(segments, MotionLatent(latent=4, widths=(32, 16), shaped=shaped))
-        found = dvae.audit(model.generative, model.inference, observed=model.observed)
-        assert found.exact == shaped
+        model = build(segments, MotionLatent(latent=4, widths=(32, 16), shaped=shaped))
+        audit = dvae.audit(model.generative, model.inference, observed=model.observed)
+        assert audit.exact == shaped
         batch = segments.all()
         torch.manual_seed(1)
         first = model.guide(batch)["z"]
@@ -42,15 +42,15 @@ def test_the_published_guide_lacks_the_shape_and_the_other_does_not(segments):
 
 
 def test_the_energy_is_the_mean_squared_distance_of_vertices(segments):
-    model, batch = made(segments), segments.all()
+    model, batch = build(segments), segments.all()
     torch.manual_seed(0)
     terms = dvae.SequenceELBO().terms(model, batch, draws={"z": 1})
     torch.manual_seed(0)
     means = model.reconstruct(batch)["x"][0]
-    away = model.vertices(means, batch[SHAPE]) - model.vertices(batch["x"], batch[SHAPE])
-    expected = away.square().sum(-1).mean(-1).sum(-1) / (2 * 0.05**2)
+    differences = model.vertices(means, batch[SHAPE]) - model.vertices(batch["x"], batch[SHAPE])
+    expected = differences.square().sum(-1).mean(-1).sum(-1) / (2 * 0.05**2)
     torch.testing.assert_close(terms.energies[SURFACE], expected, rtol=1e-4, atol=1e-4)
-    assert not dvae.SequenceELBO().terms(model, batch).energies  # asked by nobody
+    assert not dvae.SequenceELBO().terms(model, batch).energies  # computed only on request
 
 
 def test_training_has_two_phases_of_adaptive_weights(segments, tmp_path):
@@ -59,7 +59,7 @@ def test_training_has_two_phases_of_adaptive_weights(segments, tmp_path):
     assert (first.steps, second.steps) == (18, 12)
     assert isinstance(first.objective, GradNorm)
     assert (first.objective.tasks, second.objective.tasks) == (PARTS, (SURFACE, "time"))
-    model = made(segments)
+    model = build(segments)
     result = dvae.fit(model, recipe, out=tmp_path, batch_size=8, validate_every=6, log_every=1, progress=False)
     assert result.best_step >= 18
     for row in result.history:

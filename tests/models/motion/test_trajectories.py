@@ -1,4 +1,4 @@
-"""TrajeVAE and CVAE-RNN: equations, what is given and what is not, the objective, completing motion along paths."""
+"""TrajeVAE and CVAE-RNN: their contract, given joints, losses, and completion of motion along paths."""
 
 import math
 from dataclasses import replace
@@ -65,7 +65,7 @@ class Contract(FactorizationContract):
 
 
 class OfOneLength(Contract):
-    @pytest.mark.skip(reason="these networks make sequences of one length, and none is padded")
+    @pytest.mark.skip(reason="these networks output sequences of one length, without padding")
     def test_padding_changes_nothing(self):
         pass
 
@@ -78,7 +78,7 @@ class TestTrajeVAEWithFewerComponents(OfOneLength):
     name = "trajevae"
     options: ClassVar = {"components": 2}
 
-    @pytest.mark.skip(reason="coefficients beyond those of the model are noise, and read nothing; see below")
+    @pytest.mark.skip(reason="further coefficients are noise and read nothing; another test covers them")
     def test_networks_read_the_declared_parents_and_nothing_else(self):
         pass
 
@@ -93,7 +93,7 @@ def test_models_of_human36m_have_the_published_size():
         assert sum(parameter.numel() for parameter in model.parameters()) == published
 
 
-def test_the_decoder_reads_the_components_of_the_model_and_no_others(windows):
+def test_the_decoder_reads_only_the_components_of_the_model(windows):
     model, first = build(windows, components=3), windows.all()["x"][:2, 0].double()
     z = torch.randn(2, 20, 4, dtype=torch.float64, requires_grad=True)
     mean = model.generator["x"]({"z": z, "s": first}, 2, 20)[0]
@@ -102,7 +102,7 @@ def test_the_decoder_reads_the_components_of_the_model_and_no_others(windows):
     assert (gradient[:, 3:] == 0).all()
 
 
-def test_the_loss_is_squared_errors_and_the_weighted_divergence(windows):
+def test_the_loss_adds_squared_errors_and_the_weighted_kl(windows):
     method, model = small(), build(windows)
     batch = double(method.train(windows).batches.sample(3, torch.Generator().manual_seed(0)))
     torch.manual_seed(1)
@@ -118,9 +118,9 @@ def test_the_loss_is_squared_errors_and_the_weighted_divergence(windows):
     divergence = torch.distributions.kl_divergence(torch.distributions.Normal(*q), torch.distributions.Normal(*p))
     torch.manual_seed(1)
     errors = (x - mean).square().sum((1, 2))
-    constant = 0.5 * math.log(math.pi) * windows.size * 20  # of N(0, 1/2)
+    constant = 0.5 * math.log(math.pi) * windows.size * 20  # normalisation of N(0, 1/2)
     expected = (errors + constant + 0.01 * divergence.sum((1, 2))).sum() / (3 * 20)
-    assert loss.item() == pytest.approx(expected.item(), rel=1e-7)  # the scale is kept in single precision
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-7)  # the scale is float32
 
 
 @pytest.mark.parametrize(
@@ -131,86 +131,86 @@ def test_the_loss_is_squared_errors_and_the_weighted_divergence(windows):
         (lambda: small(heads_count=3), "features"),
     ],
 )
-def test_options_that_cannot_be(run, message):
+def test_invalid_options_are_an_error(run, message):
     with pytest.raises(ValueError, match=message):
         run()
 
 
-# ---------------------------------------------------------------------------------------------------- what is given
+# ------------------------------------------------------------------------------------------------------ given joints
 
 
-def test_every_joint_is_given_over_a_whole_window_or_not_at_all(windows):
+def test_joints_are_given_over_whole_windows(windows):
     x, y = small().train(windows).batches.sample(400, torch.Generator().manual_seed(0)).values()
-    joints, given = x.unflatten(-1, (-1, 3)), y.unflatten(-1, (-1, 3))
-    shown = (given != 0).any(-1).any(1)
-    assert torch.equal(given, joints * shown[:, None, :, None])
-    assert binomtest(int(shown.sum()), shown.numel(), 0.15).pvalue > 0.001
-    together = shown.float().sum(1).var().item()
-    assert together == pytest.approx(17 * 0.15 * 0.85, rel=0.25)  # joints are drawn apart
-    assert not torch.equal(shown[0], shown[1])
+    joints, paths = x.unflatten(-1, (-1, 3)), y.unflatten(-1, (-1, 3))
+    is_given = (paths != 0).any(-1).any(1)
+    assert torch.equal(paths, joints * is_given[:, None, :, None])
+    assert binomtest(int(is_given.sum()), is_given.numel(), 0.15).pvalue > 0.001
+    variance = is_given.float().sum(1).var().item()
+    assert variance == pytest.approx(17 * 0.15 * 0.85, rel=0.25)  # joints are drawn independently
+    assert not torch.equal(is_given[0], is_given[1])
 
 
-def test_hidden_entries_are_unknown_to_the_guide(windows):
+def test_the_guide_does_not_read_hidden_entries(windows):
     model, x = build(windows), windows.sample(2, torch.Generator().manual_seed(0))["x"].double()
     mask = torch.ones_like(x, dtype=torch.bool)
     mask[:, 5:, 3:9] = False
     path = torch.zeros_like(x)
-    path[..., 6:12] = x[..., 6:12]  # of a joint that is hidden, and of another one
+    path[..., 6:12] = x[..., 6:12]  # a hidden joint, and another joint
     both = model.read({"x": x, "y": path, "mask": mask})
     assert torch.equal(both["r"], torch.where((path == 0) & mask, x, 0.0)[:, 1:])
     assert torch.equal(model.read({"x": x, "mask": {"x": mask}})["mask"]["x"], mask[:, 1:])
-    found = model.read({"x": x, "mask": mask})
-    assert (found["r"][:, 4:, 3:9] == 0).all()
-    assert torch.equal(found["mask"]["x"], mask[:, 1:])
-    broken = x.masked_fill(~mask, torch.nan)
+    masked = model.read({"x": x, "mask": mask})
+    assert (masked["r"][:, 4:, 3:9] == 0).all()
+    assert torch.equal(masked["mask"]["x"], mask[:, 1:])
+    with_nan = x.masked_fill(~mask, torch.nan)
     torch.manual_seed(0)
     bound = dvae.SequenceELBO().terms(model, {"x": x, "mask": mask}).bound
     torch.manual_seed(0)
-    assert torch.equal(dvae.SequenceELBO().terms(model, {"x": broken, "mask": mask}).bound, bound)
+    assert torch.equal(dvae.SequenceELBO().terms(model, {"x": with_nan, "mask": mask}).bound, bound)
 
 
 # -------------------------------------------------------------------------------------------------------- forecasts
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_with_a_heading_turned_windows_have_turned_motions(windows, name):
+def test_with_a_heading_rotated_windows_have_rotated_motions(windows, name):
     model, angle = build(windows, name, heading=True), torch.tensor(2.0, dtype=torch.float64)
     batch = double(windows.given(["LWrist"]).all())
     batch = {variable: value[:3] for variable, value in batch.items()}
 
-    def turn(values):
+    def rotate(values):
         joints = torch.as_tensor(values, dtype=torch.float64).unflatten(-1, (-1, 3))
         return motion.rotate_about_up(joints, angle, windows.skeleton.up).flatten(-2)
 
-    def of(batch):
+    def motions(batch):
         first = {"s": batch["x"][:, 0], "y": batch["y"][:, 1:]}
         runs = {
             "forecast": lambda: model.forecast({"x": batch["x"][:, :1], "y": batch["y"]}, 20, 2)["x"],
             "sample": lambda: model.sample(length=20, batch=first)["x"],
             "reconstruct": lambda: model.reconstruct(batch, 2)["x"],
         }
-        found = {}
-        for run, made in runs.items():
+        results = {}
+        for run, call in runs.items():
             torch.manual_seed(1)
-            found[run] = made()
-        return found
+            results[run] = call()
+        return results
 
-    ours, turned = of(batch), of({variable: turn(value) for variable, value in batch.items()})
-    for run in ours:
-        torch.testing.assert_close(turned[run], turn(ours[run]), msg=run)
+    original, rotated = motions(batch), motions({variable: rotate(value) for variable, value in batch.items()})
+    for run in original:
+        torch.testing.assert_close(rotated[run], rotate(original[run]), msg=run)
     assert (
-        build(windows, name, heading=False).forecast(batch["x"][:, :1], 20, 2)["x"] - ours["forecast"]
+        build(windows, name, heading=False).forecast(batch["x"][:, :1], 20, 2)["x"] - original["forecast"]
     ).norm() > 1e-3
 
 
 # ---------------------------------------------------------------------------------------------------------- control
 
 
-class Straight:
-    """A pose and the way that its joints take in a window, moved somewhere else in the world."""
+class Walk:
+    """A pose and the paths of its joints in a window, moved to another place."""
 
-    def __init__(self, windows, at=(3.0, 0.0, -2.0)):
-        positions = windows.positions(windows.all()["x"])[4].double().numpy() + np.array(at)
+    def __init__(self, windows, offset=(3.0, 0.0, -2.0)):
+        positions = windows.positions(windows.all()["x"])[4].double().numpy() + np.array(offset)
         self.pose, self.motion = positions[0], positions[1:]
         self.skeleton = windows.skeleton
 
@@ -220,82 +220,86 @@ class Straight:
 
 @pytest.fixture(scope="module")
 def walk(windows):
-    return Straight(windows)
+    return Walk(windows)
 
 
-def test_a_motion_is_completed_where_the_pose_is(windows, walk):
+def test_a_motion_is_completed_at_the_position_of_the_pose(windows, walk):
     model = build(windows)
     torch.manual_seed(0)
-    done = model.complete(walk.pose, {"left_wrist": walk.path("LWrist")}, samples=3)
-    assert done.positions.shape == (3, 20, 17, 3)
+    completed = model.complete(walk.pose, {"left_wrist": walk.path("LWrist")}, samples=3)
+    assert completed.positions.shape == (3, 20, 17, 3)
     torch.manual_seed(0)
-    away = np.array([1.0, 2.0, 3.0])
-    moved = model.complete(walk.pose + away, {"LWrist": walk.path("LWrist") + away}, samples=3)
-    assert np.allclose(moved.positions, done.positions + away, atol=1e-9)
-    missed = np.linalg.norm(done.positions[:, :, walk.skeleton.find("LWrist")] - walk.path("LWrist"), axis=-1)
-    assert np.allclose(done.errors["LWrist"], missed)
+    offset = np.array([1.0, 2.0, 3.0])
+    shifted = model.complete(walk.pose + offset, {"LWrist": walk.path("LWrist") + offset}, samples=3)
+    assert np.allclose(shifted.positions, completed.positions + offset, atol=1e-9)
+    distances = np.linalg.norm(completed.positions[:, :, walk.skeleton.find("LWrist")] - walk.path("LWrist"), axis=-1)
+    assert np.allclose(completed.errors["LWrist"], distances)
     x = torch.from_numpy(np.concatenate([walk.pose[None], walk.motion]) - walk.pose[0]).flatten(1)[None]
     torch.manual_seed(0)
-    given = torch.zeros_like(x)
-    held = [3 * walk.skeleton.find("LWrist") + axis for axis in range(3)]
-    given[..., held] = x[..., held]
-    same = model.forecast({"x": x[:, :1], "y": given}, 20, 3)["x"][:, 0]
-    assert np.allclose(same.unflatten(-1, (-1, 3)).numpy() + walk.pose[0], done.positions, atol=1e-9)
+    paths = torch.zeros_like(x)
+    coordinates = [3 * walk.skeleton.find("LWrist") + axis for axis in range(3)]
+    paths[..., coordinates] = x[..., coordinates]
+    forecast = model.forecast({"x": x[:, :1], "y": paths}, 20, 3)["x"][:, 0]
+    assert np.allclose(forecast.unflatten(-1, (-1, 3)).numpy() + walk.pose[0], completed.positions, atol=1e-9)
     torch.manual_seed(0)
     short = model.complete(walk.pose, {"left_wrist": walk.path("LWrist")[:9]}, samples=3)
     assert short.positions.shape == (3, 9, 17, 3)
-    rest = np.concatenate([walk.path("LWrist")[:9], np.full((11, 3), np.nan)])
+    with_gap = np.concatenate([walk.path("LWrist")[:9], np.full((11, 3), np.nan)])
     torch.manual_seed(0)
-    whole = model.complete(walk.pose, {"left_wrist": rest}, samples=3)
-    assert np.allclose(short.positions, whole.positions[:, :9])  # the beginning of a whole motion
-    assert "within 1 cm" in str(done)
+    long = model.complete(walk.pose, {"left_wrist": with_gap}, samples=3)
+    assert np.allclose(short.positions, long.positions[:, :9])  # the beginning of the longer motion
+    assert "within 1 cm" in str(completed)
 
 
-def test_gaps_are_bridged_from_the_first_pose_on(windows, walk, monkeypatch):
-    model, told = build(windows), []
+def test_gaps_of_a_path_are_interpolated_from_the_first_pose(windows, walk, monkeypatch):
+    model, paths = build(windows), []
     plain = model.forecast
-    monkeypatch.setattr(model, "forecast", lambda data, *rest, **o: told.append(data["y"]) or plain(data, *rest, **o))
+    monkeypatch.setattr(
+        model,
+        "forecast",
+        lambda data, *arguments, **options: paths.append(data["y"]) or plain(data, *arguments, **options),
+    )
     path, joint = walk.path("LWrist"), walk.skeleton.find("LWrist")
     path[:2], path[5:8], path[-3:] = np.nan, np.nan, np.nan
-    done = model.complete(walk.pose, {"LWrist": path})
-    seen = told[0][0].unflatten(-1, (-1, 3))[:, joint].numpy() + walk.pose[0]
-    known = ~np.isnan(path).any(1)
-    assert np.allclose(seen[known], path[known])
-    assert np.allclose(seen[1], walk.pose[joint] + (path[2] - walk.pose[joint]) * 2 / 3)
-    assert np.allclose(seen[6], (path[4] + path[8]) / 2)
-    assert np.allclose(seen[-1], path[-4])
-    assert np.isnan(done.errors["LWrist"][0, ~known]).all()
-    assert np.isfinite(done.errors["LWrist"][0, known]).all()
+    completed = model.complete(walk.pose, {"LWrist": path})
+    filled = paths[0][0].unflatten(-1, (-1, 3))[:, joint].numpy() + walk.pose[0]
+    observed = ~np.isnan(path).any(1)
+    assert np.allclose(filled[observed], path[observed])
+    assert np.allclose(filled[1], walk.pose[joint] + (path[2] - walk.pose[joint]) * 2 / 3)
+    assert np.allclose(filled[6], (path[4] + path[8]) / 2)
+    assert np.allclose(filled[-1], path[-4])
+    assert np.isnan(completed.errors["LWrist"][0, ~observed]).all()
+    assert np.isfinite(completed.errors["LWrist"][0, observed]).all()
 
 
 @pytest.mark.slow
 def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
-    """After some training, so that there is something that the latents move."""
+    """The model is trained, as untrained latents have almost no effect."""
     torch.manual_seed(0)
     method = small(width=32, feedforward=32, latent=16, dropout=0.0)
     model = method.build(windows)
     options = {"steps": 150, "batch_size": 16, "learning_rate": 2e-3, "progress": False, "accelerator": "cpu"}
     dvae.fit(model, method.train(windows, steps=options.pop("steps")), **options)
-    walk = Straight(windows)
+    walk = Walk(windows)
     paths = {joint: walk.path(joint) for joint in ("LWrist", "RFoot")}
     paths["LWrist"][8:11] = np.nan
     torch.manual_seed(0)
-    free = model.complete(walk.pose, paths, samples=4)
+    inexact = model.complete(walk.pose, paths, samples=4)
     torch.manual_seed(0)
-    done = model.complete(walk.pose, paths, samples=4, exact=True)
+    exact = model.complete(walk.pose, paths, samples=4, exact=True)
     for joint, path in paths.items():
-        known = ~np.isnan(path).any(1)
-        assert free.errors[joint][:, known].mean() > 0.05
-        assert (done.errors[joint][:, known] < 1e-5).all()
-    lengths, first = (windows.skeleton.bone_lengths(positions) for positions in (done.positions, walk.pose))
+        observed = ~np.isnan(path).any(1)
+        assert inexact.errors[joint][:, observed].mean() > 0.05
+        assert (exact.errors[joint][:, observed] < 1e-5).all()
+    lengths, first = (windows.skeleton.bone_lengths(positions) for positions in (exact.positions, walk.pose))
     assert (np.abs(lengths / first - 1) < 0.1).mean() > 0.99
-    assert not np.allclose(done.positions[0], done.positions[1], atol=1e-2)  # each from its own draw
+    assert not np.allclose(exact.positions[0], exact.positions[1], atol=1e-2)  # each sample has its own draw
     key = np.full((20, 3), np.nan)
     key[10] = walk.path("LWrist")[10] + np.array([0.0, 0.2, 0.0])
     reached = model.complete(walk.pose, {"LWrist": key}, samples=2, exact=True)
     wrist = reached.positions[:, :, walk.skeleton.find("LWrist")]
     assert np.allclose(wrist[:, 10], key[10], atol=1e-5)
-    assert np.linalg.norm(np.diff(wrist, axis=1), axis=-1).max() < 0.1  # the hand does not jump there and back
+    assert np.linalg.norm(np.diff(wrist, axis=1), axis=-1).max() < 0.1  # the hand does not jump
 
 
 @pytest.mark.parametrize(
@@ -310,7 +314,7 @@ def test_exact_paths_are_followed_and_bones_keep_their_lengths(windows):
     ],
 )
 @pytest.mark.filterwarnings("ignore:the path of")
-def test_poses_and_paths_that_cannot_be(windows, walk, change, message):
+def test_invalid_poses_and_paths_are_an_error(windows, walk, change, message):
     pose = change.get("initial_pose", walk.pose)
     if isinstance(pose, str):
         pose = walk.pose * 1000 if pose == "millimetres" else np.where(np.arange(17)[:, None] == 3, np.nan, walk.pose)
@@ -340,14 +344,14 @@ def test_paths_are_read_from_files(tmp_path):
         ("LWrist_x,LWrist_y,LWrist_z\n1,2\n", "header"),
     ],
 )
-def test_paths_that_cannot_be_read(tmp_path, text, message):
+def test_invalid_files_of_paths_are_an_error(tmp_path, text, message):
     (tmp_path / "paths.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         motion.read_paths(tmp_path / "paths.csv")
 
 
-def test_scores_are_of_poses_relative_to_the_root_and_of_the_world(people):
-    """Against their definitions, with a body that is where it should not be in the right poses."""
+def test_scores_measure_poses_relative_to_the_root_and_global_positions(people):
+    """The scores match their definitions for a body with correct poses at a wrong position."""
     windows = motion.windows(people, PROTOCOL, "test")
     x = windows.all()["x"]
 
@@ -361,8 +365,8 @@ def test_scores_are_of_poses_relative_to_the_root_and_of_the_world(people):
 
         def forecast(self, batch, horizon, samples, draw_emission=False):
             rows = (x[:, None, 0] - batch["x"][None, :, 0]).abs().sum(-1).argmin(0)
-            moved = x[rows, 1:].unflatten(-1, (-1, 3)) + torch.tensor([0.3, 0.0, 0.4])
-            return {"x": moved.flatten(-2).expand(samples, *moved.flatten(-2).shape)}
+            shifted = x[rows, 1:].unflatten(-1, (-1, 3)) + torch.tensor([0.3, 0.0, 0.4])
+            return {"x": shifted.flatten(-2).expand(samples, *shifted.flatten(-2).shape)}
 
     plain = evaluate(Moved(), windows, samples=3, references=False)
     scores = plain["model"]
@@ -371,35 +375,37 @@ def test_scores_are_of_poses_relative_to_the_root_and_of_the_world(people):
     assert scores["global ADE"].mean == pytest.approx(0.5 * math.sqrt(17), rel=1e-5)
     assert scores["global FDE"].mean == pytest.approx(0.5 * math.sqrt(17), rel=1e-5)
     assert "path error" not in scores
-    given = evaluate(Moved(), windows.given(["LWrist"]), samples=3, references=False)
-    assert given["model"]["path error"].mean == pytest.approx(0.5, rel=1e-5)
-    assert given.data["given"] == ["LWrist"]
+    with_path = evaluate(Moved(), windows.given(["LWrist"]), samples=3, references=False)
+    assert with_path["model"]["path error"].mean == pytest.approx(0.5, rel=1e-5)
+    assert with_path.data["given"] == ["LWrist"]
     assert "path error" not in evaluate(Moved(), windows.given([]), samples=3)["model"]
 
 
 def test_poses_are_exchanged_among_windows_whose_given_joints_agree(people):
     windows = motion.windows(people, replace(PROTOCOL, test_stride=3), "test").given(["RFoot", "LFoot"])
-    found = motion.ExchangedWindows(windows, threshold=0.4)
-    x, y = found.all()["x"], found.all()["y"]
-    whole, keys = windows.all(), windows.keys
+    exchanged = motion.ExchangedWindows(windows, threshold=0.4)
+    x, y = exchanged.all()["x"], exchanged.all()["y"]
+    original, keys = windows.all(), windows.keys
     feet = [windows.skeleton.find(name) for name in ("RFoot", "LFoot")]
-    assert 0 < len(x) == len(found.keys) < len(keys)
+    assert 0 < len(x) == len(exchanged.keys) < len(keys)
     partners = set()
-    for n, key in enumerate(found.keys):
-        own = keys.index(key)
-        assert torch.equal(x[n, 1:], whole["x"][own, 1:])
-        assert torch.equal(y[n], whole["y"][own])
-        (partner,) = [m for m in range(len(keys)) if torch.equal(whole["x"][m, 0], x[n, 0])]
+    for n, key in enumerate(exchanged.keys):
+        index = keys.index(key)
+        assert torch.equal(x[n, 1:], original["x"][index, 1:])
+        assert torch.equal(y[n], original["y"][index])
+        (partner,) = [m for m in range(len(keys)) if torch.equal(original["x"][m, 0], x[n, 0])]
         partners.add(partner)
         assert keys[partner][:2] != key[:2]
-        apart = (whole["x"][partner, 0] - whole["x"][own, 0]).unflatten(-1, (-1, 3))[feet].norm(dim=-1)
-        assert (apart < 0.4).all()
+        distances = (original["x"][partner, 0] - original["x"][index, 0]).unflatten(-1, (-1, 3))[feet].norm(dim=-1)
+        assert (distances < 0.4).all()
     assert (
-        found.fingerprint != motion.ExchangedWindows(windows, threshold=0.4, seed=5).fingerprint != windows.fingerprint
+        exchanged.fingerprint
+        != motion.ExchangedWindows(windows, threshold=0.4, seed=5).fingerprint
+        != windows.fingerprint
     )
-    scores = evaluate(build(windows).float(), found, samples=2, references=False)
+    scores = evaluate(build(windows).float(), exchanged, samples=2, references=False)
     assert math.isfinite(scores["model"]["path error"].mean)
-    assert "MMADE" not in scores["model"]  # the windows that begin with that pose have other paths
+    assert "MMADE" not in scores["model"]  # windows that begin with this pose have other paths
     assert scores.data["exchanged"] == {"threshold": 0.4, "seed": 0, "partners": len(partners), "truth": "path"}
     assert len(partners) > 0.3 * len(x)
     owner = motion.ExchangedWindows(windows, 0.4, truth="pose").all()
