@@ -1,4 +1,4 @@
-"""A browser without a window, driven over a pipe: what a page says, shows and asks of the network."""
+"""A headless browser controlled over a pipe: console messages, page contents and network requests."""
 
 import json
 import os
@@ -26,8 +26,8 @@ class Tab:
     """A page in the browser.
 
     Attributes:
-        said: messages on its console, errors among them, and exceptions.
-        asked: addresses that it asked for, but its own and those that hold what they lead to.
+        said: console messages, errors and exceptions.
+        asked: requested addresses other than data URLs; the page itself is removed.
     """
 
     def __init__(self, commands, answers):
@@ -50,7 +50,7 @@ class Tab:
         return answer["result"]
 
     def open(self, path, width, height=800):
-        """Show a file in a window of this size, until it has loaded."""
+        """Show a file in a window of this size and wait until it is loaded."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         self.said.clear()
@@ -61,14 +61,14 @@ class Tab:
         assert self.asked.pop(0) == address
 
     def ask(self, expression):
-        """The value of an expression, or of what it promises."""
+        """Return the value of an expression, or of its promise."""
         options = {"expression": expression, "returnByValue": True, "awaitPromise": True}
         result = self.call("Runtime.evaluate", **options)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
     def wait(self, condition):
-        """Until an expression is true."""
+        """Wait until an expression is true."""
         poll = f"(async () => {{ while (!({condition})) await new Promise(done => setTimeout(done, 20)); }})()"
         self.ask(poll)
 
@@ -90,18 +90,18 @@ class Tab:
 
 @contextmanager
 def browser(profile):
-    """A tab of a browser whose profile is a new folder; the test is skipped where there is none."""
+    """Open a tab in a browser with a new profile folder; skip the test if no browser is installed."""
     if not (program := next(filter(None, map(shutil.which, NAMES)), None)):
         pytest.skip(f"no browser: none of {', '.join(NAMES)} is on the path")
-    theirs, commands = os.pipe()
-    answers, ours = os.pipe()
+    browser_input, commands = os.pipe()
+    answers, browser_output = os.pipe()
 
-    given = [sys.executable, "-c", START, str(theirs), str(ours)]
-    command = [*given, program, *OPTIONS, f"--user-data-dir={profile}"]
+    launcher = [sys.executable, "-c", START, str(browser_input), str(browser_output)]
+    command = [*launcher, program, *OPTIONS, f"--user-data-dir={profile}"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(command, pass_fds=(theirs, ours), **quiet) as process:
-        os.close(theirs)
-        os.close(ours)
+    with subprocess.Popen(command, pass_fds=(browser_input, browser_output), **quiet) as process:
+        os.close(browser_input)
+        os.close(browser_output)
         try:
             yield Tab(commands, answers)
         finally:

@@ -1,4 +1,4 @@
-"""Files of markers, written by the letter of the C3D format."""
+"""Files of markers in the C3D format."""
 
 import struct
 
@@ -6,9 +6,9 @@ import numpy as np
 
 
 def write_c3d(path, labels, places, **lists):
-    """A header, a group of parameters, and frames of markers: (F, M, 4), x, y, z in mm and below 0 if unseen.
+    """Write a header, parameters and frames of markers (F, M, 4): x, y, z in mm, and a residual below 0 if unseen.
 
-    `lists` are further parameters of texts, such as the names of points that are angles.
+    `lists` are further text parameters, such as the names of points that are angles.
     """
     frames, markers, _ = np.shape(places)
 

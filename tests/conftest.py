@@ -1,4 +1,4 @@
-"""What every test starts from: the same seeds, an empty parameter store; and what it must leave as it was."""
+"""Common fixtures: fixed seeds, an empty parameter store, and a check that tests keep the global state."""
 
 import os
 import shutil
@@ -18,10 +18,10 @@ import dvae.program
 import dvae.runs.directory
 from dvae.testing import FactorizationContract
 
-# A shell has what it starts in the background ignore Ctrl-C, and so would all that is started from there.
+# A background process of a shell ignores Ctrl-C, and so do its children.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Examples are the same in every run, so that a failure is one for everybody.
+# Examples are the same in every run, so that failures are reproducible.
 settings.register_profile("dvae", derandomize=True, deadline=None)
 settings.load_profile("dvae")
 
@@ -31,24 +31,24 @@ FactorizationContract.training_steps = 5
 
 ROOT = Path(__file__).parents[1]
 REAL = Path(os.environ.get("DVAE_SHARED_DATA", ROOT.parent / "shared" / "data"))
-"""Where the real motion capture is, which is not part of the project."""
+"""Folder of the real motion capture, which is not part of the project."""
 
 
 @pytest.fixture(scope="session")
 def shared() -> Callable[[str], Path]:
-    """A file of the real motion capture; a test that asks for one is skipped where it is absent."""
+    """Return a file of the real motion capture; skip the test if it is missing."""
 
-    def found(file: str) -> Path:
+    def path_of(file: str) -> Path:
         if not (REAL / file).is_file():
             pytest.skip(f"{file} of the real motion capture is not beside the project")
         return REAL / file
 
-    return found
+    return path_of
 
 
 @pytest.fixture(scope="session")
 def real(shared: Callable[[str], Path]) -> Callable[[str], Any]:
-    """Real motion by its file, read once."""
+    """Return real motion by its file, read once."""
 
     @cache
     def read(file: str) -> Any:
@@ -59,7 +59,7 @@ def real(shared: Callable[[str], Path]) -> Callable[[str], Any]:
 
 @pytest.fixture(scope="session")
 def people(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file of simulated people, enough for windows of every split; nobody writes to it."""
+    """Return a file of simulated people with windows of every split; tests do not write to it."""
     path = tmp_path_factory.mktemp("data") / "people.npz"
     dvae.motion.save(path, dvae.motion.simulate(clips=14, frames=90, seed=1))
     return path
@@ -67,19 +67,19 @@ def people(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def walkers() -> Any:
-    """The simulated people of the default, as motion data."""
+    """Return the default simulated people as motion data."""
     return dvae.motion.MotionData.open()
 
 
 @pytest.fixture(scope="session")
 def windows(walkers: Any) -> Any:
-    """Their training windows."""
+    """Return their training windows."""
     return walkers.windows("train")
 
 
 @pytest.fixture(scope="session")
 def fitted(people: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run directory of a small model of those people, after ten steps; nobody writes to it."""
+    """Return the run directory of a small model of those people after ten steps; tests do not write to it."""
     out = tmp_path_factory.mktemp("runs") / "fitted"
     training = dvae.Training(steps=10, batch_size=4, validate_every=5, progress=False)
     method = dvae.method("vae", latent=3, warm_up=4)
@@ -89,7 +89,7 @@ def fitted(people: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(fitted: Path, tmp_path: Path) -> Path:
-    """A copy of it, or of what a module calls `fitted`, to be used up."""
+    """Return a copy of `fitted` that a test may change; modules may define their own `fitted`."""
     return Path(shutil.copytree(fitted, tmp_path / "run"))
 
 
@@ -113,16 +113,16 @@ def _seeded_and_guarded() -> Iterator[None]:
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
-    changed = [
-        f"{name}: {value} -> {now}"
-        for (name, value), now in zip(before.items(), global_state().values())
-        if value != now
+    changes = [
+        f"{name}: {value} -> {after}"
+        for (name, value), after in zip(before.items(), global_state().values())
+        if value != after
     ]
-    if changed:
+    if changes:
         torch.set_default_dtype(before["default dtype"])
         torch.set_grad_enabled(before["grad mode"])
         torch.autograd.set_detect_anomaly(before["anomaly detection"])
         torch.use_deterministic_algorithms(before["deterministic algorithms"])
         torch.set_num_threads(before["threads"])
         pyro.settings.set(**before["Pyro settings"])
-        pytest.fail(f"the test changed the global state: {'; '.join(changed)}")
+        pytest.fail(f"the test changed the global state: {'; '.join(changes)}")

@@ -1,8 +1,8 @@
-"""The bound of a linear-Gaussian model and guide as they are run, as dense Gaussian algebra, apart from the library.
+"""The exact bound of a linear-Gaussian model and guide by dense Gaussian algebra, independent of the library.
 
 Every value is an affine function of the guide's noise e ~ N(0, I): a tensor (E + 1, D) of coefficients, the constant
-last. The mean of its square is then the sum of the coefficients' squares, so that the bound, and by automatic
-differentiation its gradient, are exact. What is missing or fed is what the model makes of it: the mean of its parents.
+last. The mean of its square is the sum of the squared coefficients, so that the bound and its gradient, by automatic
+differentiation, are exact. Missing and fed values are the mean given their parents.
 """
 
 from contextlib import ExitStack
@@ -21,12 +21,12 @@ from dvae.program.conditional import CONSTANT
 
 
 def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):
-    """The bound of one sequence, its data shape (T, D), all steps of them real up to `length`.
+    """Return the bound of one sequence of shape (T, D), whose first `length` steps are data.
 
     Args:
-        seen: (T, D) True where an entry was observed.
-        fed: (T,) True where a frame of the history is the model's own mean.
-        detach: fed frames carry no gradient, missing ones do.
+        seen: mask of observed entries, (T, D).
+        fed: mask of history frames that are the model's mean, (T,).
+        detach: whether fed frames carry no gradient; missing values always do.
     """
     padded, width = x.shape
     length = padded if length is None else length
@@ -39,7 +39,7 @@ def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):
         return torch.cat([value.new_zeros(noise, value.shape[-1]), value[None]])
 
     def evaluate(factorization, conditionals, values, make):
-        """Goes through the unrolled graph, parents first; `make` takes the mean and the scale of each node."""
+        """Visit the unrolled graph, parents first; `make` gets the mean and scale of each node."""
         for name, t in nx.topological_sort(factorization.dag(padded)):
             if name not in factorization.variables:
                 continue
@@ -63,44 +63,44 @@ def exact_bound(model, x, *, length=None, seen=None, fed=None, detach=False):
             make(name, t, mean, (log_scale if log_scale.dim() == 1 else log_scale[row]).exp())
 
     bound = x.new_zeros(())
-    used = 0
-    given = {("x", t + 1): constant(torch.where(seen[t], x[t], 0.0)) for t in range(padded)}
-    given |= {("x", t + 1): x.new_zeros(noise + 1, width) for t in range(length, padded)}
-    drawn = dict(given)
+    n_used = 0
+    observed = {("x", t + 1): constant(torch.where(seen[t], x[t], 0.0)) for t in range(padded)}
+    observed |= {("x", t + 1): x.new_zeros(noise + 1, width) for t in range(length, padded)}
+    values_by_node = dict(observed)
 
     def draw(name, t, mean, scale):
-        nonlocal bound, used
+        nonlocal bound, n_used
         size = len(scale)
         value = mean.clone()
-        value[used : used + size] += torch.diag(scale)
-        used += size
+        value[n_used : n_used + size] += torch.diag(scale)
+        n_used += size
         bound = bound + (0.5 + scale.log() + 0.5 * np.log(2 * np.pi)).sum()  # - E log q
-        drawn[name, t] = value
+        values_by_node[name, t] = value
 
-    evaluate(model.inference, model.encoder, drawn, draw)
-    history = {node: value for node, value in drawn.items() if node[0] != "x"}
+    evaluate(model.inference, model.encoder, values_by_node, draw)
+    history = {node: value for node, value in values_by_node.items() if node[0] != "x"}
 
     def score(name, t, mean, scale):
         nonlocal bound
-        value = given["x", t] if name == "x" else drawn[name, t]
+        value = observed["x", t] if name == "x" else values_by_node[name, t]
         squares = ((value - mean) / scale).square().sum(0)
         entries = -0.5 * squares - scale.log() - 0.5 * np.log(2 * np.pi)
-        counted = seen[t - 1] if name == "x" else torch.ones_like(entries, dtype=torch.bool)
-        bound = bound + torch.where(counted, entries, 0.0).sum()
+        mask = seen[t - 1] if name == "x" else torch.ones_like(entries, dtype=torch.bool)
+        bound = bound + torch.where(mask, entries, 0.0).sum()
         if name == "x":
-            own = torch.where(seen[t - 1], mean.detach() if detach else mean, mean)
-            value = torch.where(~seen[t - 1] | fed[t - 1], own, value)
+            model_mean = torch.where(seen[t - 1], mean.detach() if detach else mean, mean)
+            value = torch.where(~seen[t - 1] | fed[t - 1], model_mean, value)
         history[name, t] = value
 
     evaluate(model.generative, model.generator, history, score)
-    assert used == noise
+    assert n_used == noise
     return bound
 
 
 def library_bound(model, x, *, lengths=None, seen=None, fed=None, feeding=None):
-    """The mean over its noise of the library's bound, (B,), exactly: it is quadratic in the noise.
+    """Return the library's bound (B,), averaged exactly over its noise, in which it is quadratic.
 
-    Two draws at plus and minus the root of E along every axis have the mean and the covariance of N(0, I).
+    Draws at plus and minus the root of E along every axis have the mean and covariance of N(0, I).
     """
     batch, padded = x.shape[:2]
     noise = sum(model.sizes[name] * (padded if model.generative.local(name) else 1) for name in model.latents)
@@ -111,13 +111,13 @@ def library_bound(model, x, *, lengths=None, seen=None, fed=None, feeding=None):
         rows["mask"] = seen.repeat(2 * noise, 1, 1)
     if lengths is not None:
         rows["lengths"] = torch.as_tensor(lengths).repeat(2 * noise)
-    used = 0
+    n_used = 0
 
     def take(shape, *_, **__):
-        nonlocal used
+        nonlocal n_used
         width = int(np.prod(shape[1:]))
-        used += width
-        return points[:, used - width : used].reshape(shape)
+        n_used += width
+        return points[:, n_used - width : n_used].reshape(shape)
 
     with ExitStack() as patched:
         patched.enter_context(
@@ -128,21 +128,21 @@ def library_bound(model, x, *, lengths=None, seen=None, fed=None, feeding=None):
             frames = (~fed).to(x.dtype).repeat(2 * noise, 1)[..., None]
             patched.enter_context(mock.patch("torch.rand", return_value=frames))
         terms = SequenceELBO().terms(model, rows, scheduled_sampling=feeding)
-    assert used == noise
+    assert n_used == noise
     return terms.bound.unflatten(0, (2 * noise, batch)).mean(0)
 
 
 def masked(text, rng, share):
-    """The equations with some relations cut by masks of the user's own, of single steps or the same row for all."""
+    """Return the equations with random custom masks, either square or with equal rows."""
     equations = Factorization.parse(text)
 
     def cut(factor, parent):
         if parent.relation is None or rng.random() > share:
             return parent
-        seen, row = rng.random((8, 8)) < 0.6, rng.random((1, 8)) < 0.6
+        square, row = rng.random((8, 8)) < 0.6, rng.random((1, 8)) < 0.6
         if not factor.local:
             return replace(parent, relation=Relation.custom("row", lambda T: resized(row, T)))
-        shape = row if rng.random() < 0.3 else seen
+        shape = row if rng.random() < 0.3 else square
         return replace(parent, relation=parent.relation & Relation.custom("own", lambda T: resized(shape, T)))
 
     factors = [replace(f, parents=tuple(cut(f, parent) for parent in f.parents)) for f in equations.factors]
@@ -150,6 +150,6 @@ def masked(text, rng, share):
 
 
 def resized(mask, T):
-    """A mask at any length, the same one over and over."""
+    """Return a mask of any length by periodic repetition."""
     rows, columns = (np.arange(T) % n for n in mask.shape)
     return mask[np.ix_(rows[: T if len(mask) > 1 else 1], columns)]

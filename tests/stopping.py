@@ -1,4 +1,4 @@
-"""Stops a run at a step, or does something else there."""
+"""Callbacks that stop a run, or call a function, at a step."""
 
 from dvae.inference.training.fit import Callback
 

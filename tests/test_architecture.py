@@ -1,4 +1,4 @@
-"""The house rules: imports run one way, one path leads to each package, nothing is tied to one machine."""
+"""Architecture: imports follow the layers, each package has one import path, no path depends on a machine."""
 
 import ast
 import importlib
@@ -30,27 +30,27 @@ LAYERS = {
     "dvae.cli": 9,
     "dvae.command": 10,
 }
-# Motion is an application: beside itself, the methods and commands for it import it, and nothing else does.
+# Only motion itself, and the methods and commands for motion, import it.
 MOTION = re.compile(
     r"dvae\.(motion|models\.motion|models\.baselines)\b|dvae\.cli\.(checks|data|fitting|futures|assessment|loading|report|segments)$"
 )
-# Tables likewise, but that any method is fitted to them.
+# Only tables and the commands for them import tables; methods do not.
 TABLES = re.compile(r"dvae\.tables\b|dvae\.cli\.(checks|data|fitting|futures|assessment|loading|report|tables)$")
 
 
 @cache
 def sources():
-    """Module name -> file, without going through the links."""
+    """Return the file of each module, without following links."""
     files = [path for path in (ROOT / "dvae").rglob("*.py") if not {"models", "inference"} & set(path.parts)]
-    found = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+    files_by_module = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
     for name in ("models", "inference"):
         files = (ROOT / name).rglob("*.py")
-        found |= {".".join(("dvae", *path.relative_to(ROOT).with_suffix("").parts)): path for path in files}
-    return found
+        files_by_module |= {".".join(("dvae", *path.relative_to(ROOT).with_suffix("").parts)): path for path in files}
+    return files_by_module
 
 
 def imports(module, path):
-    """Absolute names of the modules of this project that a module imports, wherever in the file it does."""
+    """Return the absolute names of the project's modules that a module imports, anywhere in its file."""
     package = module.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -63,7 +63,7 @@ def imports(module, path):
 
 
 def named(path):
-    """What a module names by strings such as "dvae.models.family.vae:VAE", to be imported when it is asked for."""
+    """Return names in strings such as "dvae.models.family.vae:VAE", which are imported on demand."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Constant) and re.fullmatch(r"dvae(\.\w+)+:\w+", str(node.value)):
             yield node.value.replace(":", ".")
@@ -73,34 +73,34 @@ def layer(module):
     return max(rank for name, rank in LAYERS.items() if f"{module}.".startswith(f"{name}."))
 
 
-def test_imports_run_one_way():
+def test_imports_follow_the_layers():
     for module, path in sources().items():
-        if module == "dvae.__init__":  # the façade shows all of them
+        if module == "dvae.__init__":  # the façade imports all layers
             continue
         for target in (*imports(module, path), *named(path)):
             assert layer(target) <= layer(module), f"{module} imports {target}"
 
 
-def test_motion_is_imported_by_its_own_methods_and_commands_alone():
+def test_only_motion_methods_and_commands_import_motion():
     for module, path in sources().items():
         if module != "dvae.__init__" and not MOTION.match(module):
             assert not [target for target in imports(module, path) if target.startswith("dvae.motion")], module
 
 
-def test_tables_are_imported_by_commands_alone():
+def test_only_commands_import_tables():
     for module, path in sources().items():
         if module != "dvae.__init__" and not TABLES.match(module):
             assert not [target for target in imports(module, path) if target.startswith("dvae.tables")], module
 
 
 def words(path):
-    """Those of which the names in a module are made."""
+    """Return the words in the names of a module."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         name = next((getattr(node, field) for field in ("name", "id", "attr", "arg") if hasattr(node, field)), None)
         yield from re.findall(r"[a-z]+", re.sub("([A-Z])", r"_\1", name or "").lower())
 
 
-def test_the_core_has_no_name_for_a_joint():
+def test_names_in_the_core_do_not_mention_joints():
     for module, path in sources().items():
         if layer(module) < LAYERS["dvae.inference"]:
             assert not {*words(path)} & {"joints", "pose", "poses", "skeleton", "limb", "limbs", "bone", "bones"}, (
@@ -108,7 +108,7 @@ def test_the_core_has_no_name_for_a_joint():
             )
 
 
-def test_the_core_and_inference_do_not_speak_of_motion():
+def test_the_core_and_inference_do_not_mention_motion():
     motion = re.compile(r"skeleton|\bmotion\b|zero velocity|multimodal_|\bADE\b", re.IGNORECASE)
     core = ("factorization", "distributions", "networks", "data", "program", "inference")
     for module, path in sources().items():
@@ -116,8 +116,8 @@ def test_the_core_and_inference_do_not_speak_of_motion():
             assert not motion.findall(path.read_text(encoding="utf-8")), module
 
 
-def test_registries_alone_name_motion():
-    """The one exception: what is known by name is imported when its name is given."""
+def test_only_registries_name_motion_modules():
+    """Registries are the only exception: they import by name on demand."""
     naming = {
         module: {target for target in named(path) if target.startswith("dvae.motion.")}
         for module, path in sources().items()
@@ -137,18 +137,18 @@ def test_registries_alone_name_motion():
 
 
 def definitions(path):
-    """Public classes, functions and types that a module defines, by name."""
+    """Return the names of public classes, functions and types that a module defines."""
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             names = [node.name]
-        else:  # a type has a name like a class, a constant is in capitals
+        else:  # types are named like classes, constants in capitals
             targets = node.targets if isinstance(node, ast.Assign) else []
             names = [target.id for target in targets if isinstance(target, ast.Name) and not target.id.isupper()]
         yield from (name for name in names if not name.startswith("_"))
 
 
-def test_no_two_public_things_share_a_name():
-    """Commands have the names of what they run, so the command line alone may repeat one."""
+def test_public_names_are_unique():
+    """Commands have the names of the functions that they run, so the command line is excluded."""
     places = {}
     for module, path in sources().items():
         for name in definitions(path) if not module.startswith(("dvae.cli", "dvae.command")) else ():
@@ -156,15 +156,15 @@ def test_no_two_public_things_share_a_name():
     assert {name: modules for name, modules in places.items() if len(modules) > 1} == {}
 
 
-def test_nothing_hides_a_module_of_its_name():
+def test_no_name_hides_a_module():
     for module in sources():
         package, _, name = module.removesuffix(".__init__").rpartition(".")
         if package:
-            loaded = importlib.import_module(f"{package}.{name}")
-            assert getattr(sys.modules[package], name) is loaded, module
+            submodule = importlib.import_module(f"{package}.{name}")
+            assert getattr(sys.modules[package], name) is submodule, module
 
 
-def test_there_are_no_circles():
+def test_imports_have_no_cycles():
     graph = nx.DiGraph()
     for module, path in sources().items():
         for target in imports(module, path):
@@ -175,14 +175,14 @@ def test_there_are_no_circles():
     assert not circles
 
 
-def test_methods_hold_no_loop_and_no_optimiser():
+def test_methods_contain_no_training_loop():
     for path in (ROOT / "models").rglob("*.py"):
         names = {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
         assert not names & {"backward", "zero_grad", "optim", "DataLoader"}, path.name
 
 
 @pytest.mark.parametrize("name", ["models", "inference"])
-def test_a_second_import_path_is_refused(name):
+def test_a_second_import_path_is_an_error(name):
     command = [sys.executable, "-c", f"import {name}"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 1
@@ -195,8 +195,8 @@ def test_the_public_names_exist():
         assert getattr(dvae, name) is not None
 
 
-def test_what_is_shown_is_found_where_it_is_imported_from():
-    """Names that type checkers read, and the table by which they are imported when they are used."""
+def test_lazy_imports_match_the_imports_for_type_checkers():
+    """Compare the names for type checkers with the table for lazy imports."""
     tree = ast.parse((ROOT / "dvae" / "__init__.py").read_text(encoding="utf-8"))
     imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level]
     places = {alias.name: node.module for node in imported for alias in node.names}
@@ -217,7 +217,7 @@ def test_what_is_shown_is_found_where_it_is_imported_from():
         ("import dvae.cli.fitting", "scipy.special"),
     ],
 )
-def test_what_takes_long_to_import_is_imported_when_it_is_used(program, unused):
+def test_slow_imports_are_lazy(program, unused):
     command = [sys.executable, "-c", f"{program}; import sys; assert {unused!r} not in sys.modules"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
@@ -235,22 +235,22 @@ dvae.motion.geometry.rotations.to_matrix(torch.ones(1, 3), "vector")
 """
 
 
-def test_packages_of_an_extra_are_needed_where_they_are_used():
-    done = subprocess.run([sys.executable, "-c", WITHOUT], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.stderr.rstrip().endswith("ImportError: roma is not installed: pip install 'pyro-dvae[motion]'")
+def test_packages_of_an_extra_are_imported_on_use_only():
+    process = subprocess.run([sys.executable, "-c", WITHOUT], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert process.stderr.rstrip().endswith("ImportError: roma is not installed: pip install 'pyro-dvae[motion]'")
 
 
-def test_every_module_can_be_imported_and_says_what_it_is():
+def test_every_module_can_be_imported_and_has_a_docstring():
     for module, path in sources().items():
         name = module.removesuffix(".__init__")
         assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or not path.read_text(), name
         importlib.import_module(name)
 
 
-def test_nothing_is_tied_to_one_machine():
+def test_no_file_contains_machine_paths():
     absolute = re.compile(r"""(?:^|[\s"'(=])/(?:home|root|work|tmp|Users|opt)/""", re.MULTILINE)
-    kept = [ROOT / name for name in ("Makefile", "README.md", "pyproject.toml", "constraints.txt", ".ci/run")]
-    for path in [*sources().values(), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").rglob("*.py"), *kept]:
+    others = [ROOT / name for name in ("Makefile", "README.md", "pyproject.toml", "constraints.txt", ".ci/run")]
+    for path in [*sources().values(), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").rglob("*.py"), *others]:
         assert not absolute.search(path.read_text(encoding="utf-8")), path
 
 
@@ -259,7 +259,7 @@ def test_readme_example_beats_zero_velocity():
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert "steps=600" in example
     variables = {}
-    exec(compile(example.replace("steps=600", "steps=120"), "README.md", "exec"), variables)  # a fifth does
+    exec(compile(example.replace("steps=600", "steps=120"), "README.md", "exec"), variables)  # a fifth suffices
     scores = variables["scores"]
     for error in ("ADE", "FDE", "MMADE", "MMFDE"):
         assert scores["model"][error].mean < 0.9 * scores["zero velocity"][error].mean

@@ -1,4 +1,4 @@
-"""Every name that a notebook starts from has an example, which runs."""
+"""Every public name has an example that runs."""
 
 import doctest
 
@@ -12,7 +12,7 @@ import dvae
 @pytest.mark.filterwarnings("ignore:.*it is shortened to:UserWarning")
 def test_the_example_of_a_public_name_runs(name, capsys):
     names = {"dvae": dvae, "torch": torch}
-    found = doctest.DocTestFinder(recurse=False).find(getattr(dvae, name), name, globs=names)
-    examples = [each for each in found if each.examples]
+    tests = doctest.DocTestFinder(recurse=False).find(getattr(dvae, name), name, globs=names)
+    examples = [each for each in tests if each.examples]
     assert examples, f"dvae.{name} has no example"
     assert sum(doctest.DocTestRunner().run(each).failed for each in examples) == 0, capsys.readouterr().out

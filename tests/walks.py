@@ -1,4 +1,4 @@
-"""A small model, random walks to fit it to, and the equality of weights."""
+"""A small model, random walks as its data, and a comparison of weights."""
 
 import torch
 
@@ -21,6 +21,6 @@ TRAIN, HELD_OUT = walks(24), walks(7, seed=1)
 
 
 def same(first, second):
-    """Whether two mappings hold equal tensors."""
+    """Return whether two mappings have equal tensors."""
     assert first.keys() == second.keys()
     return all(torch.equal(first[name], second[name]) for name in first)

@@ -1,4 +1,4 @@
-"""The command line, as a user meets it: what works, what is refused and how, what a signal leaves behind."""
+"""The command line: results, errors and signals."""
 
 import json
 import os
@@ -30,7 +30,7 @@ EQUATIONS = ["--generative", "p(z_t | z_{t-1}) p(x_t | z_t)", "--inference", "q(
 
 
 def failure(capsys, *arguments, code=1):
-    """The sentence with which a command fails."""
+    """Return the error message of a failing command."""
     assert main(list(arguments)) == code
     error = capsys.readouterr().err
     assert "Traceback" not in error
@@ -39,10 +39,10 @@ def failure(capsys, *arguments, code=1):
 
 def test_every_method_is_listed_with_its_equations(capsys):
     assert main(["list"]) == 0
-    printed = capsys.readouterr().out
+    output = capsys.readouterr().out
     for name, kind in dvae.methods().items():
-        assert name in printed
-        assert kind.source.split(",")[0] in printed
+        assert name in output
+        assert kind.source.split(",")[0] in output
         texts = [*dvae.methods().texts(name, "generative", "inference"), kind.source]
         assert texts == [*((None, None) if name == "equations" else (kind.generative, kind.inference)), kind.source]
 
@@ -52,19 +52,19 @@ def test_methods_are_listed_without_importing_them():
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode == 0
 
 
-def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
-    def shown(*arguments):
+def test_show_prints_the_audit_and_draws_the_graph(capsys, tmp_path):
+    def show(*arguments):
         assert main(["show", *arguments]) == 0
         return capsys.readouterr().out
 
-    printed = shown("hit-dvae", "--out", str(tmp_path / "graph.png"))
-    assert "∏_t p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)" in printed
-    assert "z_{<t}" in next(line for line in printed.splitlines() if "q(z_t" in line and "│" in line)
-    assert "not exact" in printed
+    output = show("hit-dvae", "--out", str(tmp_path / "graph.png"))
+    assert "∏_t p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)" in output
+    assert "z_{<t}" in next(line for line in output.splitlines() if "q(z_t" in line and "│" in line)
+    assert "not exact" in output
     assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
-    assert "exact: the guide reads everything" in shown(*EQUATIONS)
-    assert "q(z_t | z_{t-1}, x_{>=t})" in shown(*EQUATIONS[:2])
-    assert "the model has no latents" in shown("--generative", "p(x_t | x_{<t})", "--inference", "")
+    assert "exact: the guide reads everything" in show(*EQUATIONS)
+    assert "q(z_t | z_{t-1}, x_{>=t})" in show(*EQUATIONS[:2])
+    assert "the model has no latents" in show("--generative", "p(x_t | x_{<t})", "--inference", "")
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_show_prints_the_audit_and_draws_the_graphs(capsys, tmp_path):
         ("show srnn --out graph", "--out graph: the suffix selects the format"),
     ],
 )
-def test_what_makes_no_sense_exits_with_2_first(capsys, tmp_path, monkeypatch, people, fitted, arguments, message):
+def test_wrong_arguments_exit_with_2_before_any_work(capsys, tmp_path, monkeypatch, people, fitted, arguments, message):
     monkeypatch.chdir(tmp_path)
     error = failure(capsys, *arguments.replace("RUN", str(fitted)).replace("FILE", str(people)).split(), code=2)
     assert message in " ".join(error.replace("│", " ").split())
@@ -100,7 +100,7 @@ def test_what_makes_no_sense_exits_with_2_first(capsys, tmp_path, monkeypatch, p
 
 
 @pytest.mark.parametrize("arguments", [["show", "vae", "--out", "graph.png"], ["list"], ["fit", "--help"]])
-def test_output_that_nobody_reads_loses_no_file(arguments, tmp_path, monkeypatch):
+def test_a_closed_pipe_still_writes_the_files(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     reader, writer = os.pipe()
     os.close(reader)
@@ -111,7 +111,7 @@ def test_output_that_nobody_reads_loses_no_file(arguments, tmp_path, monkeypatch
     assert not [name for name in arguments if name.endswith(".png") and not (tmp_path / name).exists()]
 
 
-def test_a_closed_output_is_no_error(tmp_path):
+def test_a_closed_standard_output_is_no_error(tmp_path):
     program = f"from dvae.cli.console import OUT; OUT.print('a'); print(open({str(tmp_path / 'a')!r}, 'w').fileno())"
     started = subprocess.run(["sh", "-c", '"$0" "$@" >&-', sys.executable, "-c", program], capture_output=True)
     assert (started.returncode, started.stderr) == (0, b"")
@@ -128,7 +128,7 @@ def test_version_is_printed(capsys):
     assert capsys.readouterr().out == f"dvae {dvae.__version__}\n"
 
 
-def test_a_file_that_is_no_motion_is_refused_in_a_sentence(capsys, tmp_path, people):
+def test_an_invalid_motion_file_is_an_error(capsys, tmp_path, people):
     class Hostile:
         def __reduce__(self):
             return os.system, ("true",)
@@ -145,7 +145,7 @@ def test_a_file_that_is_no_motion_is_refused_in_a_sentence(capsys, tmp_path, peo
     assert "no clips; 1 were skipped" in failure(capsys, "data", "info", str(metres), "--skip-bad")
 
 
-def test_the_archive_of_human36m_needs_no_skeleton(capsys, tmp_path):
+def test_the_human36m_archive_needs_no_skeleton(capsys, tmp_path):
     walks = motion.simulate(clips=14, frames=140, seed=3)
     subjects = [f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)]
     nested = {subject: {} for subject in subjects}
@@ -159,16 +159,16 @@ def test_the_archive_of_human36m_needs_no_skeleton(capsys, tmp_path):
     assert "human36m: 17 joints, z up" in capsys.readouterr().out
     run = str(tmp_path / "run")
     assert main(["fit", "vae", "--data", path, "--protocol", "h36m", "--out", run, "--steps", "4", *SMALL]) == 0
-    loaded = dvae.load(run)
-    assert loaded.model.sizes["x"] == 48
-    assert {clip.split for clip in loaded.data.windows("test").clips} == {"S9", "S11"}
+    fitted_run = dvae.load(run)
+    assert fitted_run.model.sizes["x"] == 48
+    assert {clip.split for clip in fitted_run.data.windows("test").clips} == {"S9", "S11"}
 
 
-def test_evaluation_is_printed_and_written_with_all_that_it_rests_on(capsys, run, people):
+def test_an_evaluation_is_printed_and_stored_with_its_data_and_config(capsys, run, people):
     assert main(["evaluate", str(run), "--samples", "3", "--figure", str(run / "scores.png")]) == 0
-    printed = capsys.readouterr().out
+    output = capsys.readouterr().out
     for word in ("zero velocity", "nearest neighbours", "ADE", "ELBO", "vae"):
-        assert word in printed
+        assert word in output
     evaluation = dvae.Evaluation.load(run / "evaluation.json")
     assert evaluation.samples == 3
     assert evaluation.rows["vae"].config["data"]["path"] == str(people)
@@ -176,7 +176,7 @@ def test_evaluation_is_printed_and_written_with_all_that_it_rests_on(capsys, run
     assert (run / "scores.png").exists()
 
 
-def test_runs_of_other_windows_are_not_put_in_one_table(capsys, run, people, tmp_path):
+def test_evaluating_runs_on_different_windows_is_an_error(capsys, run, people, tmp_path):
     other = tmp_path / "other"
     motion.save(tmp_path / "few.npz", motion.simulate(clips=12, frames=90, seed=2))
     data = str(tmp_path / "few.npz")
@@ -185,7 +185,7 @@ def test_runs_of_other_windows_are_not_put_in_one_table(capsys, run, people, tmp
     assert "other test windows" in failure(capsys, "evaluate", str(run), str(other))
 
 
-def test_forecasts_continue_what_was_observed(capsys, run, tmp_path):
+def test_forecasts_continue_the_observed_frames(capsys, run, tmp_path):
     out = tmp_path / "futures.npz"
     assert main(["forecast", str(run), "--out", str(out), "--samples", "2", "--figure", f"{out}.png"]) == 0
     windows = dvae.load(run).data.windows("test")
@@ -203,15 +203,15 @@ def test_forecasts_continue_what_was_observed(capsys, run, tmp_path):
     assert "no clip 'nobody'" in failure(capsys, "forecast", str(run), "--out", str(out), "--clip", "nobody")
 
 
-def test_equations_of_ones_own_are_fitted_and_read_back(people, tmp_path):
+def test_custom_equations_are_fitted_and_loaded(people, tmp_path):
     out = tmp_path / "own"
     options = ["--latents", "z", "2", "--network", "dense", "--steps", "5", *SMALL]
     assert main(["fit", "equations", *EQUATIONS, *options, "--data", str(people), "--out", str(out)]) == 2
-    options[options.index("dense")] = "recurrent"  # a perceptron cannot read x_{t:T}
+    options[options.index("dense")] = "recurrent"  # the dense network cannot read x_{t:T}
     assert main(["fit", "equations", *EQUATIONS, *options, "--data", str(people), "--out", str(out)]) == 0
-    loaded = dvae.load(out)
-    assert loaded.model.sizes == {"z": 2, "x": 48}
-    assert str(loaded.model.inference) == str(dvae.Factorization.parse(EQUATIONS[3]))
+    fitted_run = dvae.load(out)
+    assert fitted_run.model.sizes == {"z": 2, "x": 48}
+    assert str(fitted_run.model.inference) == str(dvae.Factorization.parse(EQUATIONS[3]))
 
 
 @pytest.fixture(scope="module")
@@ -219,12 +219,12 @@ def tracker(people, tmp_path_factory):
     """A run of a method that follows paths."""
     out = tmp_path_factory.mktemp("runs") / "tracker"
     small = ["--latent", "4", "--width", "8", "--feedforward", "8", "--layers", "1", "--batch-size", "4"]
-    where = ["--data", str(people), "--protocol", "simulated-trajectories", "--out", str(out)]
-    assert main(["fit", "trajevae", *where, "--steps", "6", "--validate-every", "3", *small]) == 0
+    options = ["--data", str(people), "--protocol", "simulated-trajectories", "--out", str(out)]
+    assert main(["fit", "trajevae", *options, "--steps", "6", "--validate-every", "3", *small]) == 0
     return out
 
 
-@pytest.mark.filterwarnings("ignore:only .* of the bones")  # hardly fitted
+@pytest.mark.filterwarnings("ignore:only .* of the bones")  # a barely fitted model
 def test_motion_is_completed_along_the_paths_of_a_clip_or_a_file(capsys, tracker, tmp_path):
     out, figure = tmp_path / "walk.npz", tmp_path / "walk.png"
     run = ["forecast", str(tracker), "--clip", "person_0003"]
@@ -234,37 +234,37 @@ def test_motion_is_completed_along_the_paths_of_a_clip_or_a_file(capsys, tracker
         return motion.Forecasts.load(out)
 
     joints = ["--joints", "left_wrist, RFoot", "--samples", "2"]
-    done = complete(*joints, "--figure", str(figure))
+    forecasts = complete(*joints, "--figure", str(figure))
     assert "LWrist: off its path by" in capsys.readouterr().out
     assert figure.exists()
-    assert done.forecasts.shape == (2, 1, 60, 17, 3)
-    assert done.observed.shape == (1, 1, 17, 3)
-    assert done.keys[0][1] == "person_0003"
-    assert np.array_equal(complete(*joints).forecasts, done.forecasts)
+    assert forecasts.forecasts.shape == (2, 1, 60, 17, 3)
+    assert forecasts.observed.shape == (1, 1, 17, 3)
+    assert forecasts.keys[0][1] == "person_0003"
+    assert np.array_equal(complete(*joints).forecasts, forecasts.forecasts)
     still = complete(*joints, "--temperature", "0").forecasts
     assert np.array_equal(still[0], still[1])
     assert not np.array_equal(complete(*joints, "--window", "0").truth, complete(*joints, "--window", "1").truth)
-    hand = done.truth[0, :30, 13]
+    hand = forecasts.truth[0, :30, 13]
     rows = ["LWrist_x,LWrist_y,LWrist_z", *(f"{x},{y},{z}" for x, y, z in hand), ",,"]
     (tmp_path / "hand.csv").write_text("\n".join(rows))
     np.savez(tmp_path / "hand.npz", LWrist=np.concatenate([hand, np.full((1, 3), np.nan)]))
     for kind in ("csv", "npz"):
-        drawn = complete("--paths", str(tmp_path / f"hand.{kind}"), "--samples", "1", "--exact").forecasts
-        assert drawn.shape == (1, 1, 31, 17, 3)
-        assert np.abs(drawn[0, 0, :30, 13] - hand).max() < 1e-4
+        completed = complete("--paths", str(tmp_path / f"hand.{kind}"), "--samples", "1", "--exact").forecasts
+        assert completed.shape == (1, 1, 31, 17, 3)
+        assert np.abs(completed[0, 0, :30, 13] - hand).max() < 1e-4
     error = failure(
         capsys, *run, "--out", str(out), "--joints", "LWrist", "--paths", str(tmp_path / "hand.csv"), code=2
     )
     assert "LWrist: both --joints and" in error
 
 
-def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
+def test_an_evaluation_conditions_on_paths(capsys, tracker, fitted, tmp_path):
     out = ["--samples", "2", "--out", str(tmp_path / "scores.json")]
     assert main(["evaluate", str(tracker), "--joints", "RFoot,LFoot", "--temperature", "0", *out]) == 0
-    found = dvae.Evaluation.load(tmp_path / "scores.json")
-    assert found.data["given"] == ["RFoot", "LFoot"]
-    assert found["trajevae"]["path error"].mean > 0
-    assert found["trajevae"]["APD"].mean == 0
+    evaluation = dvae.Evaluation.load(tmp_path / "scores.json")
+    assert evaluation.data["given"] == ["RFoot", "LFoot"]
+    assert evaluation["trajevae"]["path error"].mean > 0
+    assert evaluation["trajevae"]["APD"].mean == 0
     assert "no joint 'RPaw'" in failure(capsys, "evaluate", str(tracker), "--joints", "RPaw", *out)
     error = failure(capsys, "evaluate", str(fitted), "--joints", "RFoot", *out, code=2)
     assert "are for methods that take trajectories" in error
@@ -274,7 +274,7 @@ def test_paths_are_given_to_an_evaluation(capsys, tracker, fitted, tmp_path):
     assert dvae.Evaluation.load(tracker / "evaluation-RFoot-exchanged-2.json").data["exchanged"]["threshold"] == 2
 
 
-def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, tracker, tmp_path):
+def test_models_that_start_from_a_pose_have_predictive_checks_only(capsys, tracker, tmp_path):
     out = tmp_path / "calibration.json"
     assert main(["check", "calibration", str(tracker), "--samples", "19", "--out", str(out)]) == 0
     assert "no calibration" in capsys.readouterr().err
@@ -283,7 +283,7 @@ def test_what_starts_from_a_pose_is_criticised_by_its_motion_alone(capsys, track
     assert document["predictive"]["attributes"]["emission"] == "mean"
 
 
-def test_completions_that_cannot_be(capsys, tracker, fitted, people, tmp_path):
+def test_impossible_completions_are_errors(capsys, tracker, fitted, people, tmp_path):
     out = ["--out", str(tmp_path / "walk.npz")]
     along = ["--joints", "LWrist"]
     assert "which takes no paths" in failure(capsys, "forecast", str(fitted), *out, *along, code=2)
@@ -300,8 +300,8 @@ def log(run):
 
 
 @pytest.mark.filterwarnings("ignore:.*it is shortened to:UserWarning")
-def test_a_longer_run_is_laid_out_anew(people, tmp_path):
-    """The learning rate falls over the last half of all steps, scheduled sampling rises over their first half."""
+def test_resuming_with_more_steps_rescales_the_schedules(people, tmp_path):
+    """The learning rate falls over the second half of all steps, scheduled sampling rises over the first half."""
     out, options = tmp_path / "run", ["--width", "8", "--scheduled-sampling", "0.5", *SMALL]
     fit = ["fit", "vrnn", "--data", str(people), "--out", str(out), "--learning-rate", "0.01", "--tensorboard"]
     assert main([*fit, "--steps", "20", *options]) == 0
@@ -319,7 +319,7 @@ def test_a_longer_run_is_laid_out_anew(people, tmp_path):
     assert log(out)[-1]["learning_rate"] == pytest.approx(0.02 / 35)
 
 
-def test_a_run_of_a_gpu_goes_on_without_one(people, tmp_path, capsys, monkeypatch):
+def test_a_run_fitted_on_a_gpu_resumes_without_one(people, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     out = tmp_path / "run"
     assert main(["fit", "vae", "--data", str(people), "--out", str(out), "--steps", "4", *SMALL]) == 0
@@ -329,7 +329,7 @@ def test_a_run_of_a_gpu_goes_on_without_one(people, tmp_path, capsys, monkeypatc
     assert main(["resume", str(out), "--steps", "5", "--accelerator", "auto"]) == 0
 
 
-def test_of_several_processes_the_first_speaks_and_each_tells_why_it_fails(capsys, monkeypatch):
+def test_only_the_first_process_prints_and_each_reports_its_errors(capsys, monkeypatch):
     monkeypatch.setenv("LOCAL_RANK", "1")
     assert main(["list"]) == 0
     assert capsys.readouterr() == ("", "")
@@ -340,9 +340,14 @@ def test_of_several_processes_the_first_speaks_and_each_tells_why_it_fails(capsy
     assert "srnn" in capsys.readouterr().out
 
 
-def test_what_torchrun_starts_again_goes_on_with_its_run(people, tmp_path, capsys, monkeypatch):
-    told = {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_MAX_RESTARTS": "1", "WORLD_SIZE": "1", "LOCAL_WORLD_SIZE": "1"}
-    for name, value in told.items():
+def test_a_command_restarted_by_torchrun_resumes_its_run(people, tmp_path, capsys, monkeypatch):
+    environment = {
+        "TORCHELASTIC_RUN_ID": "none",
+        "TORCHELASTIC_MAX_RESTARTS": "1",
+        "WORLD_SIZE": "1",
+        "LOCAL_WORLD_SIZE": "1",
+    }
+    for name, value in environment.items():
         monkeypatch.setenv(name, value)
     arguments = ["fit", "vae", "--data", str(people), "--out", str(tmp_path / "run"), "--steps", "5", *SMALL]
     assert main(arguments) == 0
@@ -353,25 +358,25 @@ def test_what_torchrun_starts_again_goes_on_with_its_run(people, tmp_path, capsy
     assert "start it without torchrun" in failure(capsys, "sweep", "vae", "--out", str(tmp_path / "runs"))
 
 
-def test_a_method_with_an_objective_of_its_own_resumes(people, tmp_path, monkeypatch):
-    seen = []
+def test_a_method_with_a_custom_objective_resumes(people, tmp_path, monkeypatch):
+    steps = []
 
     @dataclass(frozen=True)
     class Plain(type(dvae.method("vae"))):
         name: ClassVar[str] = "plain"
 
         def objective(self):
-            return lambda terms, step: (seen.append(step), -terms.bound.sum() / terms.frames.sum())[1]
+            return lambda terms, step: (steps.append(step), -terms.bound.sum() / terms.frames.sum())[1]
 
-    known = {**dvae.methods(), "plain": Plain}
-    monkeypatch.setattr("dvae.models.registry.methods", lambda: known)
+    methods = {**dvae.methods(), "plain": Plain}
+    monkeypatch.setattr("dvae.models.registry.methods", lambda: methods)
     training = dvae.Training(steps=3, batch_size=4, progress=False)
     dvae.fit(Plain(latent=3), MotionData.open(people), out=tmp_path / "run", **vars(training))
     runs.resume(tmp_path / "run", steps=5)
-    assert seen == [0, 1, 2, 3, 4]
+    assert steps == [0, 1, 2, 3, 4]
 
 
-def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
+def test_scheduled_sampling_is_an_option_of_the_method(people, tmp_path):
     with pytest.raises(
         ValueError, match=r"instead of scheduled_sampling=0\.5 here write dvae\.method\(…, scheduled_sampling=…\)"
     ):
@@ -383,7 +388,7 @@ def test_self_feeding_is_told_by_the_method_alone(people, tmp_path):
         )
 
 
-def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path):
+def test_existing_and_missing_runs_are_errors(capsys, run, people, tmp_path):
     again = ["fit", "vae", "--data", str(people), "--out", str(run)]
     assert f"with: dvae resume {run}; or" in failure(capsys, *again)
     state = json.loads((run / "state.json").read_text())
@@ -393,7 +398,7 @@ def test_a_run_is_neither_overwritten_nor_invented(capsys, run, people, tmp_path
     assert "is not a run directory" in failure(capsys, "evaluate", str(tmp_path))
 
 
-def test_a_damaged_run_is_refused(capsys, run):
+def test_a_damaged_run_is_an_error(capsys, run):
     weights = run / "best.safetensors"
     good = weights.read_bytes()
     weights.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
@@ -422,7 +427,7 @@ def test_a_damaged_run_is_refused(capsys, run):
         (["training", "learning_rate"], {"schedule": "Falling"}),
     ],
 )
-def test_a_config_of_wrong_types_is_refused_in_a_sentence(capsys, run, keys, value):
+def test_a_config_with_wrong_types_is_an_error(capsys, run, keys, value):
     config = content = json.loads((run / "config.json").read_text())
     for key in keys[:-1]:
         content = content[key]
@@ -434,7 +439,7 @@ def test_a_config_of_wrong_types_is_refused_in_a_sentence(capsys, run, keys, val
     assert "looks like a bug" not in error
 
 
-def test_changed_or_moved_data_are_noticed(capsys, people, tmp_path, monkeypatch):
+def test_moved_data_are_found_and_changed_data_are_an_error(capsys, people, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("people.npz", "people.npz.skeleton.json", "people.npz.labels.csv"):
         shutil.copy(people.with_name(name), tmp_path)
@@ -450,7 +455,7 @@ def test_changed_or_moved_data_are_noticed(capsys, people, tmp_path, monkeypatch
     assert "has changed since run was fitted" in failure(capsys, "evaluate", "run")
 
 
-def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monkeypatch):
+def test_a_run_works_without_its_training_data(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for seed, name in enumerate(("own", "other")):
         motion.save(tmp_path / name / "people.npz", motion.simulate(clips=14, frames=90, seed=seed))
@@ -477,13 +482,13 @@ def test_a_run_is_used_without_the_data_it_was_fitted_on(capsys, tmp_path, monke
         assert "note: other/people.npz is not the data that run was fitted on" in capsys.readouterr().err
     windows = MotionData.open("other/people.npz").windows("test")
     assert motion.Forecasts.load("f.npz").keys == windows.keys
-    found = dvae.Evaluation.load("run/evaluation-people.json")
-    assert found.data["fingerprint"] == windows.fingerprint
-    assert set(found.rows) == {"zero velocity", "run", "second"}  # the neighbours went with the training data
+    evaluation = dvae.Evaluation.load("run/evaluation-people.json")
+    assert evaluation.data["fingerprint"] == windows.fingerprint
+    assert set(evaluation.rows) == {"zero velocity", "run", "second"}  # nearest neighbours need the training data
 
 
-def test_a_guide_is_put_beside_its_posterior(capsys, run, tmp_path):
-    """Of so few draws the reference says that it has not converged; of the frames alone latents are inferred."""
+def test_a_guide_is_compared_with_its_posterior(capsys, run, tmp_path):
+    """Few draws do not converge, and latents are inferred from the frames only."""
     few = ["--windows", "2", "--frames", "2", "--draws", "4", "--chains", "2", "--warmup", "1", "--stein-draws", "9"]
     assert main(["check", "posterior", str(run), *few, "--figure", str(tmp_path / "a.png")]) == 0
     document = json.loads((run / "posterior.json").read_text())
@@ -496,7 +501,7 @@ def test_a_guide_is_put_beside_its_posterior(capsys, run, tmp_path):
     assert {path.name for path in tmp_path.glob("*.png")} == {"a-stein.png", "a-posterior.png"}
 
 
-def test_data_of_other_joints_are_refused_unless_they_mean_the_same(capsys, run, tmp_path):
+def test_data_with_other_joints_are_errors_unless_they_match(capsys, run, tmp_path):
     clips = motion.simulate(clips=14, frames=90, seed=1)
     skeleton = replace(clips.skeleton, name="stranger", fps=60.0)
     motion.save(tmp_path / "far" / "people.npz", motion.MotionSet(list(clips), skeleton, "people"))
@@ -505,13 +510,22 @@ def test_data_of_other_joints_are_refused_unless_they_mean_the_same(capsys, run,
     assert "skeleton.name is 'stranger', not 'walker'" in error
     assert "skeleton.fps is 60.0, not 30.0" in error
     other = motion.simulate(clips=8, frames=90, seed=5)
-    motion.write_motion(tmp_path / "bvh", other, "bvh")  # whose joints mean those of the run
-    told = ["forecast", str(run), "--data", str(tmp_path / "bvh"), "--out", str(tmp_path / "f.npz"), "--samples", "1"]
-    assert main(told) == 0
+    motion.write_motion(tmp_path / "bvh", other, "bvh")  # other names for the joints of the run
+    command = [
+        "forecast",
+        str(run),
+        "--data",
+        str(tmp_path / "bvh"),
+        "--out",
+        str(tmp_path / "f.npz"),
+        "--samples",
+        "1",
+    ]
+    assert main(command) == 0
     assert "its joints are matched with those of" in capsys.readouterr().err
 
 
-def test_debug_shows_where_it_failed(capsys, tmp_path):
+def test_debug_prints_the_traceback(capsys, tmp_path):
     assert main(["data", "info", str(tmp_path / "nowhere.npz"), "--debug"]) == 1
     assert "Traceback" in capsys.readouterr().err
 
@@ -541,7 +555,7 @@ def test_ctrl_c_leaves_a_run_that_resumes(people, tmp_path):
     assert json.loads((run / "state.json").read_text())["step"] == stopped["step"] + 5
 
 
-def test_a_further_ctrl_c_changes_no_exit_code():
+def test_a_second_ctrl_c_changes_no_exit_code():
     before = signal.getsignal(signal.SIGINT)
     try:
         assert exit_code(lambda: signal.raise_signal(signal.SIGINT)) == 130
@@ -551,8 +565,8 @@ def test_a_further_ctrl_c_changes_no_exit_code():
         signal.signal(signal.SIGINT, before)
 
 
-def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, tmp_path, capsys):
-    """Models of positions, fitted to an npz, and of turns, to BVH files of the same motion, score alike on either."""
+def test_scores_are_equal_for_every_format_and_representation(people, tmp_path, capsys):
+    """Models of positions, fitted to npz, and of rotations, fitted to BVH, have equal scores on both files."""
     folder, npz, options = tmp_path / "bvh", tmp_path / "all.npz", ["--samples", "3"]
     motion.write_motion(folder, motion.read_motion(people), "bvh")
     motion.save(npz, motion.read_motion(folder))
@@ -582,35 +596,44 @@ def test_motion_is_the_same_in_every_format_and_to_models_of_everything(people, 
     assert main(["report", *runs, "--data", str(npz), "--windows", "1", "--out", str(page)]) == 0
     assert page.read_text(encoding="utf-8").count("<canvas") == 2
     assert main(["forecast", runs[1], "--samples", "2", "--horizon", "4", "--out", futures]) == 0
-    found = motion.Forecasts.load(futures)
-    lengths = found.skeleton.bone_lengths(found.forecasts)  # each has one
+    forecasts = motion.Forecasts.load(futures)
+    lengths = forecasts.skeleton.bone_lengths(forecasts.forecasts)  # constant
     np.testing.assert_allclose(lengths, lengths[:1, :, :1].repeat(2, 0).repeat(4, 2), atol=1e-5)
     other = ["fit", "gsps", "--data", str(people), "--representation", "6d", "--out", str(tmp_path / "other")]
     assert "gsps reads positions of joints" in failure(capsys, *other, "--steps", "2")
 
 
-def test_forecasts_become_bands_on_validation_windows_or_on_clips_of_a_label(capsys, tmp_path):
+def test_prediction_bands_are_calibrated_on_validation_windows_or_labelled_clips(capsys, tmp_path):
     clips = motion.simulate(clips=30, frames=90, seed=1)
-    styled = [replace(clip, labels={"style": "ab"[place % 2]}) for place, clip in enumerate(clips)]
+    styled = [replace(clip, labels={"style": "ab"[n % 2]}) for n, clip in enumerate(clips)]
     styled[0] = replace(styled[0].between(0, 60), split="test", name="short")
     motion.save(tmp_path / "people.npz", motion.MotionSet(styled, clips.skeleton, clips.name))
     run = tmp_path / "run"
     assert main(["fit", "vae", "--data", str(tmp_path / "people.npz"), "--out", str(run), "--steps", "5", *SMALL]) == 0
     assert "too short for one: short" in capsys.readouterr().err
     assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5"]) == 0
-    opened = dvae.load(run).data
-    assert dvae.PredictionBands.load(run / "coverage.json").clips == len(opened.windows("validation").clips)
-    told = ["--label", "style", "--values", "a", "--out", str(tmp_path / "a.json"), "--figure", str(tmp_path / "a.png")]
-    assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5", *told]) == 0
+    data = dvae.load(run).data
+    assert dvae.PredictionBands.load(run / "coverage.json").clips == len(data.windows("validation").clips)
+    options = [
+        "--label",
+        "style",
+        "--values",
+        "a",
+        "--out",
+        str(tmp_path / "a.json"),
+        "--figure",
+        str(tmp_path / "a.png"),
+    ]
+    assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5", *options]) == 0
     assert "held 50 %, future" in capsys.readouterr().out
-    test = opened.windows("test").clips
+    test = data.windows("test").clips
     assert dvae.PredictionBands.load(tmp_path / "a.json").clips == sum(clip.labels["style"] == "a" for clip in test)
     assert (tmp_path / "a.png").stat().st_size
-    for wrong, said in (
+    for arguments, message in (
         (["--label", "style"], "select the test clips for calibration; give both"),
         (["--label", "style", "--values", "c"], "no test clip has style c; there are a, b"),
         (["--label", "style", "--values", "a", "b"], "selects all test clips"),
         (["--level", ".9"], "90 % need 9 clips"),
     ):
-        assert main(["check", "coverage", str(run), "--samples", "4", *wrong])
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert main(["check", "coverage", str(run), "--samples", "4", *arguments])
+        assert message in " ".join(capsys.readouterr().err.split())

@@ -1,4 +1,4 @@
-"""Names that files and users give are shown as they are: no markup, no tags, no formulas, whatever is in them."""
+"""Names in files and options are displayed literally: no markup, no HTML tags, no formulas."""
 
 import html
 import io
@@ -41,33 +41,33 @@ def windows():
     return ArrayWindows(torch.randn(6, 5, 3, generator=torch.Generator().manual_seed(0)), 2, clips=clips)
 
 
-def printed(renderable):
-    """What a console prints that takes markup, as a user's own does."""
+def console_output(renderable):
+    """Return what a console with markup prints, as a user's console does."""
     console = Console(file=io.StringIO(), width=1000, force_jupyter=False, no_color=True)
     console.print(renderable)
     return console.file.getvalue()
 
 
-def blank(text):
-    """Without white space: long names are wrapped."""
+def without_spaces(text):
+    """Remove white space, because long names are wrapped."""
     return "".join(text.split())
 
 
-def is_shown_as_it_is(result, names=NAMES):
-    text, page = printed(result), result._repr_html_()
+def assert_displayed_literally(result, names=NAMES):
+    text, page = console_output(result), result._repr_html_()
     for name in names:
-        assert blank(name) in blank(text), name
-        assert blank(html.escape(name)) in blank(re.sub("<[^>]*>", "", page)), name
+        assert without_spaces(name) in without_spaces(text), name
+        assert without_spaces(html.escape(name)) in without_spaces(re.sub("<[^>]*>", "", page)), name
     assert "<script" not in page
     assert "<a " not in page
     assert "\x1b" not in text
 
 
-def is_drawn_as_it_is(figure, names=NAMES):
-    figure.savefig(io.BytesIO())  # mathtext refuses $\frac$
+def assert_drawn_literally(figure, names=NAMES):
+    figure.savefig(io.BytesIO())  # mathtext raises on $\frac$
     texts = [text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_parse_math"))]
     for name in names:
-        assert any(blank(name) in blank(text) for text in texts), name
+        assert any(without_spaces(name) in without_spaces(text) for text in texts), name
 
 
 def evaluation(models, windows):
@@ -95,25 +95,25 @@ def calibration(models, windows):
 
 
 @pytest.mark.parametrize("make", [evaluation, comparison, checks, calibration])
-def test_names_in_results(models, windows, make):
+def test_names_in_results_are_literal(models, windows, make):
     result, figure, others = make(models, windows)
-    is_shown_as_it_is(result, (*NAMES, *others))
-    is_drawn_as_it_is(figure, others if make is calibration else NAMES)  # it draws the worst of them
+    assert_displayed_literally(result, (*NAMES, *others))
+    assert_drawn_literally(figure, others if make is calibration else NAMES)  # it draws only the worst statistics
 
 
-def test_masks_in_an_audit():
+def test_masks_in_an_audit_are_literal():
     masks = {"[/x]": lambda T: np.eye(T, dtype=bool)}
     audit = dvae.audit(
         dvae.Factorization.parse("p(z_t) p(x_t | z_t)"),
         dvae.Factorization.parse("q(z_t | x_{[/x]})", masks=masks),
     )
-    assert "x_{[/x]}" in printed(audit.table())
+    assert "x_{[/x]}" in console_output(audit.table())
 
 
-def test_terms_in_learning_curves_and_on_the_terminal():
+def test_terms_in_learning_curves_and_on_the_terminal_are_literal():
     row = {f"energy/{name}": 1.0 for name in NAMES}
     history = [{"step": step, "loss": 1.0, **row} for step in (1, 2)]
-    is_drawn_as_it_is(Fit(history, 2, None, None, "finished", None).plot())
+    assert_drawn_literally(Fit(history, 2, None, None, "finished", None).plot())
     for live in (True, False):
         screen = io.StringIO()
         terminal = Terminal(2, Console(file=screen, force_terminal=live, width=1000, no_color=True))
@@ -124,46 +124,46 @@ def test_terms_in_learning_curves_and_on_the_terminal():
             assert name.replace("/", " ") in screen.getvalue().replace("/", " ")
 
 
-def test_models_beside_a_progress_bar():
+def test_model_names_in_a_progress_bar_are_literal():
     bar = progress_bar(True)
     for name in NAMES:
         bar.add_task(name)
-    text = printed(bar.get_renderable())
+    text = console_output(bar.get_renderable())
     for name in NAMES:
         assert name in text
 
 
 def hostile(name):
-    """A clip of that name, with labels and in a skeleton of that name; in a file, a slash ends the split's name.
+    """Return a clip, labels and skeleton of that name; a slash separates split and clip.
 
-    A skeleton's own name is one that can be printed.
+    The name of the skeleton is printable.
     """
-    split, _, own = name.rpartition("/")
+    split, _, clip_name = name.rpartition("/")
     walk = motion.simulate(clips=1, frames=20)
-    of_skeleton = name if name.isprintable() else "walker"
-    names = tuple(f"{of_skeleton}{j}" for j in range(walk.skeleton.joints))
-    skeleton = motion.Skeleton(names, walk.skeleton.parents, fps=30.0, name=of_skeleton)
-    clip = motion.Clip(split or "train", own, walk.clips[0].positions, {name: name}, {})
+    skeleton_name = name if name.isprintable() else "walker"
+    names = tuple(f"{skeleton_name}{j}" for j in range(walk.skeleton.joints))
+    skeleton = motion.Skeleton(names, walk.skeleton.parents, fps=30.0, name=skeleton_name)
+    clip = motion.Clip(split or "train", clip_name, walk.clips[0].positions, {name: name}, {})
     return motion.MotionSet([clip], skeleton, name)
 
 
 @pytest.mark.parametrize("name", [*NAMES[::3], LINES, COLOURED])
-def test_clips_labels_and_skeletons_in_what_a_file_holds(name):
-    text = printed(hostile(name).info())
+def test_names_in_the_description_of_a_file_are_literal(name):
+    text = console_output(hostile(name).info())
     assert "\x1b" not in text
     for line in name.replace("\x1b", "\\x1b").split("\n"):
         assert text.count(line) >= 4 + name.isprintable()  # title, skeleton, clip, label and its value
 
 
 @pytest.mark.parametrize("name", [LINES, COLOURED])
-def test_names_that_cannot_be_printed_are_not_written(name, tmp_path):
+def test_unprintable_names_are_errors_on_writing(name, tmp_path):
     with pytest.raises(ValueError, match="is not a name of a split and a clip: expected text that can be printed"):
         motion.save(tmp_path / "clips.npz", hostile(name))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", [NAMES[0], NAMES[4], NAMES[5]])
-def test_files_are_described_and_played(name, tmp_path, capsys):
+def test_names_in_reports_and_animations_are_literal(name, tmp_path, capsys):
     file, page, figure = (tmp_path / ending for ending in ("[/d].npz", "[/p].html", "[/f].png"))
     clips = hostile(name)
     motion.save(file, clips)
@@ -177,8 +177,8 @@ def test_files_are_described_and_played(name, tmp_path, capsys):
     parts = positions[None, :, 5:], positions[:, :5], positions[:, 5:]
     motion.Forecasts(clips.skeleton, [("test", name, 0)], *parts).save(tmp_path / "futures.npz")
     assert main(["animate", str(tmp_path / "futures.npz"), "--out", str(page), "--figure", str(figure)]) == 0
-    own = page.read_text(encoding="utf-8")
-    assert "<a " not in own
-    assert "<script>alert" not in own
+    text = page.read_text(encoding="utf-8")
+    assert "<a " not in text
+    assert "<script>alert" not in text
     assert main(["animate", str(file), "--out", str(page), "--clip", f"{name} else"]) == 1
     assert "no clip" in capsys.readouterr().err

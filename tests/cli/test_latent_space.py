@@ -1,4 +1,4 @@
-"""The command line on segments: fit, resume and evaluate a latent space of 4D motion; what is not for it is refused."""
+"""The command line on segments: fit, resume, evaluate and impute with a latent space of 4D motion."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ SMALL = ["motion-latent", "--latent", "3", "--widths", "16", "8", "--batch-size"
 
 
 def failure(capsys, *arguments, code=1):
-    """The sentence with which a command fails."""
+    """Return the error message of a failing command."""
     assert main([*map(str, arguments)]) == code
     error = " ".join(capsys.readouterr().err.split())
     assert "looks like a bug" not in error
@@ -35,7 +35,7 @@ def change(run, keys, value):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two files of people, and a run fitted on the first; nobody writes to them."""
+    """Return a folder with two files of people, and a run fitted to the first; tests do not write to it."""
     path = tmp_path_factory.mktemp("segments")
     for seed, name in enumerate(("own", "other")):
         motion.save(path / name / "people.npz", motion.simulate(clips=8, frames=50, seed=seed))
@@ -49,9 +49,9 @@ def run(folder, tmp_path):
     return shutil.copytree(folder / "run", tmp_path / "run")
 
 
-def test_a_fit_says_what_to_do_with_the_run_and_resumes(capsys, folder, tmp_path):
-    own, out = folder / "own" / "people.npz", tmp_path / "run"
-    assert main(["fit", *SMALL, "--data", str(own), "--out", str(out), "--steps", "4", "--scaling", "deviation"]) == 0
+def test_a_fit_prints_the_next_command_and_resumes(capsys, folder, tmp_path):
+    data, out = folder / "own" / "people.npz", tmp_path / "run"
+    assert main(["fit", *SMALL, "--data", str(data), "--out", str(out), "--steps", "4", "--scaling", "deviation"]) == 0
     assert f"dvae evaluate {out}" in capsys.readouterr().out
     config = json.loads((out / "config.json").read_text())
     assert (config["data"]["cut"], config["schema"]["kind"]) == ("clips", "segments")
@@ -62,16 +62,16 @@ def test_a_fit_says_what_to_do_with_the_run_and_resumes(capsys, folder, tmp_path
     assert "has changed since" in failure(capsys, "resume", out, "--data", tmp_path / "people.npz", "--steps", "6")
 
 
-def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder, run, tmp_path):
+def test_segments_are_scored_with_principal_components_also_on_other_data(capsys, folder, run, tmp_path):
     second = shutil.copytree(run, tmp_path / "second")
     change(second, ("training", "seed"), 1)
     figure = tmp_path / "boxes.png"
     assert main(["evaluate", str(run), str(second), "--figure", str(figure), "--bound-particles", "2"]) == 0
-    printed = capsys.readouterr().out
-    assert all(word in printed for word in ("vertex error", "duration error", "ELBO", "PCA of 11"))
-    found = Reconstruction.load(run / "evaluation.json")
-    assert list(found.rows) == ["run", "PCA of 11", "second"]
-    assert found.configs["run"]["data"]["path"] == str(folder / "own" / "people.npz")
+    output = capsys.readouterr().out
+    assert all(word in output for word in ("vertex error", "duration error", "ELBO", "PCA of 11"))
+    result = Reconstruction.load(run / "evaluation.json")
+    assert list(result.rows) == ["run", "PCA of 11", "second"]
+    assert result.configs["run"]["data"]["path"] == str(folder / "own" / "people.npz")
     assert figure.exists()
 
     other = ["--data", str(folder / "other" / "people.npz")]
@@ -87,46 +87,46 @@ def test_segments_are_scored_beside_components_on_other_data_too(capsys, folder,
 BRIEF = ["--steps", "3", "--starts", "2", "--candidates", "2", "--newton", "0"]
 
 
-def recovered(capsys, folder, *arguments):
-    """What `dvae impute` prints of the run, the notes and what was written."""
+def impute(capsys, folder, *arguments):
+    """Return the table and notes that `dvae impute` prints for the run."""
     assert main(["impute", str(folder / "run"), *map(str, arguments), *BRIEF]) == 0
-    printed = capsys.readouterr()
-    return " ".join(printed.out.split()), " ".join(printed.err.split())
+    captured = capsys.readouterr()
+    return " ".join(captured.out.split()), " ".join(captured.err.split())
 
 
-def test_segments_are_recovered_from_a_glimpse(capsys, folder, tmp_path):
+def test_segments_are_recovered_from_partial_observations(capsys, folder, tmp_path):
     one = ["--from", "person_0001", "--seen", "markers", "--seconds", ".25", "--gaps", ".2", "--samples", "2"]
     one += ["--marker", ".01"]
-    table, said = recovered(capsys, folder, *one, "--out", tmp_path / "a.npz")
+    table, notes = impute(capsys, folder, *one, "--out", tmp_path / "a.npz")
     for word in ("duration", "markers", "vertex", "left", "behind", "k-hat", "train/person_0001"):
         assert word in table
-    assert "1 of 1 segments not converged" in said
-    assert "; try --marker 0." in said
-    assert "train/person_0001, the most probable and 2 draws of each" in said
+    assert "1 of 1 segments not converged" in notes
+    assert "; try --marker 0." in notes
+    assert "train/person_0001, the most probable and 2 draws of each" in notes
     clips = motion.read_motion(tmp_path / "a.npz")
     assert [clip.name for clip in clips] == [f"person_0001-{end}" for end in ("found", "draw-01", "draw-02")]
-    again, _ = recovered(capsys, folder, *one, "--out", tmp_path / "a.html")
-    assert again == table  # of the same seed
+    again, _ = impute(capsys, folder, *one, "--out", tmp_path / "a.html")
+    assert again == table  # the same seed
     page = (tmp_path / "a.html").read_text()
     assert all(name in page for name in ("truth", "most probable", "draw 2"))
     one = ["--from", "person_0001", "--seen", "points", "--frames", "3", "--points", "5", "--known-body"]
-    recovered(capsys, folder, *one, "--no-aggregate", "--out", tmp_path / "a.bvh")
+    impute(capsys, folder, *one, "--no-aggregate", "--out", tmp_path / "a.bvh")
     assert len(motion.read_motion(tmp_path / "a.bvh")) == 1
     several = ["--from", "person_0001", "test/person_0007", "--seen", "markers", "--frames", "3"]
-    table, said = recovered(capsys, folder, *several, "--samples", "0", "--out", tmp_path / "b.npz")
+    table, notes = impute(capsys, folder, *several, "--samples", "0", "--out", tmp_path / "b.npz")
     assert "train/person_0001" in table
     assert "test/person_0007" in table
-    assert said.endswith("train/person_0001, test/person_0007, the most probable")
+    assert notes.endswith("train/person_0001, test/person_0007, the most probable")
     assert len(motion.read_motion(tmp_path / "b.npz")) == 2
 
 
 @pytest.fixture(scope="module")
-def opened(folder):
+def loaded_run(folder):
     return dvae.load(folder / "run")
 
 
 def observations(run, **options):
-    """What is seen of the body's markers in two segments of the run, for a file."""
+    """Return observed body markers in two segments of the run, as arrays of a file."""
     truth = run.data.windows("test").all()
     return {
         name: value.numpy()
@@ -134,54 +134,63 @@ def observations(run, **options):
     }
 
 
-def test_what_somebody_has_seen_is_read_without_the_data(capsys, folder, opened, tmp_path):
-    """One segment or several; the same numbers are the same segments, whatever way they came."""
-    moved = shutil.copytree(folder, tmp_path / "moved")
-    change(moved / "run", ("data", "path"), "gone.npz")
-    seen = observations(opened, fps=10.0)
-    np.savez(tmp_path / "both.npz", **seen)
-    np.savez(tmp_path / "one.npz", **{name: value[0] for name, value in seen.items()})
-    table, said = recovered(capsys, moved, "--file", tmp_path / "both.npz")
-    assert "the search starts from this prior only" in said
+def test_observations_in_a_file_need_no_training_data(capsys, folder, loaded_run, tmp_path):
+    """Test one and several segments; equal numbers give equal results for every source."""
+    without_data = shutil.copytree(folder, tmp_path / "moved")
+    change(without_data / "run", ("data", "path"), "gone.npz")
+    observed = observations(loaded_run, fps=10.0)
+    np.savez(tmp_path / "both.npz", **observed)
+    np.savez(tmp_path / "one.npz", **{name: value[0] for name, value in observed.items()})
+    table, notes = impute(capsys, without_data, "--file", tmp_path / "both.npz")
+    assert "the search starts from this prior only" in notes
     assert "seen/segment-00" in table
     assert "seen/segment-01" in table
     assert "vertex" not in table
-    table, said = recovered(capsys, folder, "--file", tmp_path / "one.npz", "--out", tmp_path / "one.html")
-    assert "no known segments" not in said
+    table, notes = impute(capsys, folder, "--file", tmp_path / "one.npz", "--out", tmp_path / "one.html")
+    assert "no known segments" not in notes
     assert "&#34;truth&#34;" not in (tmp_path / "one.html").read_text()
     names = [clip.name for clip in dvae.load(folder / "run").data.windows("test").motion]
-    theirs, _ = recovered(capsys, folder, "--from", f"test/{names[0]}", "--seen", "markers", "--fps", "10")
-    assert table.split("seen/segment-00 │ ")[1].split(" │ ")[0] in theirs
+    expected, _ = impute(capsys, folder, "--from", f"test/{names[0]}", "--seen", "markers", "--fps", "10")
+    assert table.split("seen/segment-00 │ ")[1].split(" │ ")[0] in expected
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda seen: {**seen, "marker": seen["markers"]}, "'marker' is not an observation .did you mean 'markers'"),
-        (lambda seen: {**seen, "markers": seen["markers"][:, :, :5]}, r"expected \(2, \d+, 16, 3\)"),
         (
-            lambda seen: {**seen, "markers": np.nan * seen["markers"]},
+            lambda arrays: {**arrays, "marker": arrays["markers"]},
+            "'marker' is not an observation .did you mean 'markers'",
+        ),
+        (lambda arrays: {**arrays, "markers": arrays["markers"][:, :, :5]}, r"expected \(2, \d+, 16, 3\)"),
+        (
+            lambda arrays: {**arrays, "markers": np.nan * arrays["markers"]},
             "segment 0 of 2, counted from 0, has no observations.*leave it",
         ),
-        (lambda seen: {**seen, "markers": 1000 * seen["markers"]}, "markers has a coordinate of .* expected metres"),
-        (lambda seen: {**seen, "markers": seen["markers"].astype("U8")}, "markers is <U8 .* expected numbers"),
-        (lambda seen: {**seen, "markers": seen["markers"].astype(object)}, "pickled objects"),
-        (lambda seen: {**seen, "times": 1000 * seen["times"]}, "times go from 0 to .* expected seconds"),
-        (lambda seen: {"markers": seen["markers"]}, "with their moments"),
-        (lambda seen: {}, "surfaces, points or markers|npz"),
-        (lambda seen: {**seen, "times": np.zeros((2, 1001)), "markers": np.zeros((2, 1001, 16, 3))}, "at most 1000"),
-        (lambda seen: {**seen, "points": np.zeros((2, 1, 2**17 + 1, 3))}, "at most 131,072 of a segment"),
+        (
+            lambda arrays: {**arrays, "markers": 1000 * arrays["markers"]},
+            "markers has a coordinate of .* expected metres",
+        ),
+        (lambda arrays: {**arrays, "markers": arrays["markers"].astype("U8")}, "markers is <U8 .* expected numbers"),
+        (lambda arrays: {**arrays, "markers": arrays["markers"].astype(object)}, "pickled objects"),
+        (lambda arrays: {**arrays, "times": 1000 * arrays["times"]}, "times go from 0 to .* expected seconds"),
+        (lambda arrays: {"markers": arrays["markers"]}, "with their moments"),
+        (lambda arrays: {}, "surfaces, points or markers|npz"),
+        (
+            lambda arrays: {**arrays, "times": np.zeros((2, 1001)), "markers": np.zeros((2, 1001, 16, 3))},
+            "at most 1000",
+        ),
+        (lambda arrays: {**arrays, "points": np.zeros((2, 1, 2**17 + 1, 3))}, "at most 131,072 of a segment"),
     ],
 )
-def test_files_of_what_nobody_can_have_seen_are_refused(opened, tmp_path, change, message):
+def test_files_of_impossible_observations_are_errors(loaded_run, tmp_path, change, message):
     path = tmp_path / "seen.npz"
-    np.savez_compressed(path, **change(observations(opened, fps=5.0)))
+    np.savez_compressed(path, **change(observations(loaded_run, fps=5.0)))
     with pytest.raises(ValueError, match=f"seen.npz: (.*{message})"):
-        read_seen(path, opened.model)
+        read_seen(path, loaded_run.model)
 
 
 @pytest.mark.parametrize("command", ["forecast RUN --out f.npz", "check calibration RUN", "animate RUN --out f.html"])
-def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monkeypatch, command):
+def test_forecast_commands_suggest_the_right_command(capsys, folder, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     error = failure(capsys, *command.replace("RUN", str(folder / "run")).split())
     assert "is a fitted motion-latent, which generates whole segments and has no forecasts; use dvae evaluate" in error
@@ -216,8 +225,8 @@ def test_commands_about_forecasts_say_what_to_use(capsys, folder, tmp_path, monk
 )
 def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
-    given = arguments.replace("RUN", str(folder / "run")).replace("FITTED", str(fitted)).split()
-    assert message in failure(capsys, *given, code=2)
+    command = arguments.replace("RUN", str(folder / "run")).replace("FITTED", str(fitted)).split()
+    assert message in failure(capsys, *command, code=2)
     assert not list(tmp_path.iterdir())
 
 
@@ -230,7 +239,7 @@ def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypat
         (("schema", "timed", "skeleton", "names"), ["a"], "skeleton|names|parents"),
     ],
 )
-def test_a_config_out_of_range_is_refused(run, keys, value, message):
+def test_a_config_out_of_range_is_an_error(run, keys, value, message):
     change(run, keys, value)
     with pytest.raises(dvae.inference.training.checkpoints.CheckpointError, match=message):
         dvae.load(run)

@@ -1,4 +1,4 @@
-"""The page of runs: it is whole in one file, says what is there and what is not, moves, and believes nothing."""
+"""The report of runs: one complete page, notes for missing parts, animation, and no active content from runs."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def report(*arguments, code=0):
 
 
 class Tags(HTMLParser):
-    """What a page is made of: tags with their attributes, texts, and what is between tags of scripts."""
+    """The tags of a page with their attributes, its text, and the contents of script tags."""
 
     def __init__(self, page):
         super().__init__()
@@ -45,17 +45,17 @@ class Tags(HTMLParser):
         self.text += data
 
 
-def is_harmless(page):
-    """Only our script, nothing that is fetched, and no attribute that runs."""
-    found = Tags(page)
-    assert "".join(found.scripts).strip() == SCRIPT.strip()
-    assert sum(tag == "script" for tag, _ in found.tags) == 1
-    for tag, attributes in found.tags:
+def assert_harmless(page):
+    """Assert that the page has only our script, fetches nothing and has no event attributes."""
+    tags = Tags(page)
+    assert "".join(tags.scripts).strip() == SCRIPT.strip()
+    assert sum(tag == "script" for tag, _ in tags.tags) == 1
+    for tag, attributes in tags.tags:
         assert not [name for name in attributes if name.startswith("on")]
         assert tag not in ("iframe", "object", "embed", "base", "form")
         for name in ("src", "href"):
             assert attributes.get(name, "#").startswith(("#", "data:")), attributes
-    return found
+    return tags
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +71,8 @@ def tab(tmp_path_factory):
         yield tab
 
 
-def test_every_section_is_there_and_what_is_missing_has_its_command(page, fitted):
-    text = is_harmless(page.read_text(encoding="utf-8")).text
+def test_every_section_is_present_and_missing_records_name_their_command(page, fitted):
+    text = assert_harmless(page.read_text(encoding="utf-8")).text
     for title in ("Run", "Equations", "Learning curves", "Scores", "Posterior against prior", "Futures"):
         assert title in text
     for name, file in (("evaluate", "evaluation.json"), ("check calibration", "calibration.json")):
@@ -88,7 +88,7 @@ def test_the_same_seed_gives_the_same_page(page, fitted, tmp_path):
 
 
 @pytest.mark.parametrize("width", [1280, 360])
-def test_the_page_is_shown_without_an_error_or_a_network(page, tab, width):
+def test_the_page_renders_without_errors_or_network_requests(page, tab, width):
     tab.open(page, width)
     tab.wait("document.querySelector('.player').dataset.frames")
     assert tab.ask("document.documentElement.scrollWidth") <= width
@@ -96,13 +96,13 @@ def test_the_page_is_shown_without_an_error_or_a_network(page, tab, width):
     assert (tab.said, tab.asked) == ([], [])
 
 
-def test_people_play_scrub_and_turn(page, tab):
+def test_the_player_plays_scrubs_and_rotates(page, tab):
     picture = "document.querySelector('canvas').toDataURL()"
     slider = "document.querySelector('.player input')"
     tab.open(page, 1280)
     tab.wait("document.querySelector('.player').dataset.frames")
     assert int(tab.ask("document.querySelector('.player').dataset.frames")) == FRAMES
-    seen = [tab.ask(picture)]
+    pictures = [tab.ask(picture)]
     for action in (
         f"{slider}.value = 20; {slider}.dispatchEvent(new Event('input'))",
         "document.querySelector('canvas').dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}))",
@@ -110,45 +110,45 @@ def test_people_play_scrub_and_turn(page, tab):
         "document.querySelector('select').dispatchEvent(new Event('change'))",
     ):
         tab.ask(action)
-        tab.wait(f"{picture} !== {json.dumps(seen[-1])}")
-        seen.append(tab.ask(picture))
-    assert len(set(seen)) == len(seen)
+        tab.wait(f"{picture} !== {json.dumps(pictures[-1])}")
+        pictures.append(tab.ask(picture))
+    assert len(set(pictures)) == len(pictures)
     middle = tab.ask(
         "(b => [b.x + b.width / 2, b.y + b.height / 2])(document.querySelector('canvas')"
         ".getBoundingClientRect(document.querySelector('canvas').scrollIntoView()))"
     )
     for kind, x in (("mousePressed", 0), ("mouseMoved", 60), ("mouseReleased", 60)):
-        place = {"x": middle[0] + x, "y": middle[1]}
-        tab.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
-    tab.wait(f"{picture} !== {json.dumps(seen[-1])}")
+        position = {"x": middle[0] + x, "y": middle[1]}
+        tab.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **position)
+    tab.wait(f"{picture} !== {json.dumps(pictures[-1])}")
     tab.ask("document.querySelector('.player button').click()")
     tab.wait(f"0 < {slider}.value && {slider}.value < {FRAMES - 1}")
-    tab.wait(f"{slider}.value == {FRAMES - 1}")  # the window's own 2.5 s
+    tab.wait(f"{slider}.value == {FRAMES - 1}")  # the 2.5 s of the window
     assert tab.ask("document.querySelector('.player button').textContent") == "Play"
     assert tab.said == []
 
 
-def test_the_browser_unpacks_the_motion_itself(tmp_path, tab):
+def test_the_browser_decodes_the_motion(tmp_path, tab):
     people = motion.simulate(clips=3, frames=12, seed=2)
     positions = np.stack([clip.positions for clip in people])
     scene = make_scene(people.skeleton, positions[0, :5], positions[1:, 5:], positions[0, 5:9], every=1)
     path = tmp_path / "page.html"
     path.write_text(document("motion", [Section("a", before=player({"b": scene}))], [SCRIPT]), encoding="utf-8")
     tab.open(path, 800)
-    read = "opened(JSON.parse(document.querySelector('.player').dataset.motion)[0])"
+    script = "opened(JSON.parse(document.querySelector('.player').dataset.motion)[0])"
     values = tab.ask(
-        f"{read}.then(scene => scene.people.map((person, k) => [...Array(12).keys()].map(frame => "
+        f"{script}.then(scene => scene.people.map((person, k) => [...Array(12).keys()].map(frame => "
         "[...scene.values.slice(scene.at(person, frame), scene.at(person, frame) + 51)])))"
     )
-    shown = np.array(values).reshape(3, 12, 17, 3) / 1000
-    np.testing.assert_allclose(shown[1:], scene.motion[1:], atol=0.00051)
-    np.testing.assert_allclose(shown[0, :9], scene.motion[0, :9], atol=0.00051)  # the truth ends there
+    decoded = np.array(values).reshape(3, 12, 17, 3) / 1000
+    np.testing.assert_allclose(decoded[1:], scene.motion[1:], atol=0.00051)
+    np.testing.assert_allclose(decoded[0, :9], scene.motion[0, :9], atol=0.00051)  # the truth ends here
     assert tab.said == []
 
 
 @pytest.fixture(scope="module")
 def scored(fitted, tmp_path_factory):
-    """A run with all that can be beside it."""
+    """Return a run with all records that a report can show."""
     run = shutil.copytree(fitted, tmp_path_factory.mktemp("scored") / "run")
     assert main(["evaluate", str(run), "--samples", "2"]) == 0
     assert main(["check", "calibration", str(run), "--simulations", "20", "--draws", "9", "--ranked-steps", "1"]) == 0
@@ -160,18 +160,18 @@ def scored(fitted, tmp_path_factory):
     return run
 
 
-def test_records_beside_a_run_are_shown(scored, tmp_path):
+def test_records_of_a_run_are_reported(scored, tmp_path):
     run = {"a": dvae.load(scored)}
     evaluation = dvae.Evaluation.load(scored / "evaluation.json")
-    made = (
+    makers = (
         sections.overview,
         sections.evaluated,
         sections.calibration,
         sections.bracketed,
         sections.reference_posteriors,
     )
-    facts, scores, criticism, bracket, beside, bands = (
-        Tags(document("a", [make(run)])).text for make in (*made, sections.prediction_bands)
+    facts, scores, criticism, bracket, posterior, bands = (
+        Tags(document("a", [make(run)])).text for make in (*makers, sections.prediction_bands)
     )
     assert str(evaluation["vae"]["ADE"]) in facts
     assert "lowest" in facts or "best bound" in facts
@@ -182,8 +182,8 @@ def test_records_beside_a_run_are_shown(scored, tmp_path):
     assert "bone stretch (%)" in criticism
     assert "AIS, L = 2, K = 2" in bracket
     assert "amortisation" in bracket
-    assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in beside
-    assert "compared with the posterior of 1 sequences" in beside
+    assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in posterior
+    assert "compared with the posterior of 1 sequences" in posterior
     assert "held 40 %" in bands
     pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
     dvae.ablate(pair, steps=2, surrogates=1).save(tmp_path / "a.json")
@@ -194,35 +194,35 @@ def test_records_beside_a_run_are_shown(scored, tmp_path):
     assert main(["report", str(scored), "--out", "a.html", "--edges", str(tmp_path / "none.json")]) == 2
 
 
-def test_scores_of_another_state_of_the_run_are_told_apart(scored, tmp_path):
+def test_scores_of_an_older_state_of_the_run_are_marked(scored, tmp_path):
     run = shutil.copytree(scored, tmp_path / "run")
     config = json.loads((run / "config.json").read_text())
     config["training"]["steps"] += 1  # as `dvae resume --steps` does
     (run / "config.json").write_text(json.dumps(config))
-    loaded = {"a": dvae.load(run)}
-    assert "The run has changed since it was scored" in document("a", [sections.evaluated(loaded)])
-    assert "ADE" not in document("a", [sections.overview(loaded)])
+    runs = {"a": dvae.load(run)}
+    assert "The run has changed since it was scored" in document("a", [sections.evaluated(runs)])
+    assert "ADE" not in document("a", [sections.overview(runs)])
 
 
-def test_runs_stand_side_by_side_with_a_table_first(people, fitted, tmp_path):
+def test_several_runs_are_compared_in_one_page(people, fitted, tmp_path):
     other = tmp_path / "other"
     training = dvae.Training(steps=1, batch_size=4, progress=False)
     dvae.fit(dvae.method("storn", latent=3, warm_up=1), MotionData.open(people), out=other, **vars(training))
     report(fitted, other, "--out", tmp_path / "a.html")
-    found = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8"))
-    titles = [place.start() for place in re.finditer("Runs|Equations|Scores|Futures", found.text)]
+    tags = assert_harmless((tmp_path / "a.html").read_text(encoding="utf-8"))
+    titles = [match.start() for match in re.finditer("Runs|Equations|Scores|Futures", tags.text)]
     assert titles == sorted(titles)
-    assert sum(attributes.get("class") == "player" for _, attributes in found.tags) == 2
-    assert "difference to the best" in found.text
+    assert sum(attributes.get("class") == "player" for _, attributes in tags.tags) == 2
+    assert "difference to the best" in tags.text
 
 
-def test_of_a_model_without_a_likelihood_it_is_said():
+def test_a_model_without_a_likelihood_gets_a_note():
     windows = dvae.ArrayWindows(np.zeros((2, 4, 1), np.float32), 2)
     run = SimpleNamespace(model=SimpleNamespace(likelihood=False))
     assert "The model has no likelihood" in sections.weighed({"a": run}, windows).cells["a"]
 
 
-def test_what_runs_share_is_shown_once():
+def test_content_shared_by_runs_is_shown_once():
     page = document(
         "a",
         [Section("b", {"first": missing_part("same"), "second": missing_part("same"), "third": missing_part("else")})],
@@ -232,7 +232,7 @@ def test_what_runs_share_is_shown_once():
     assert "first, second" in text
 
 
-def test_a_run_without_its_data_or_its_log_is_shown_as_far_as_it_goes(run, tmp_path):
+def test_a_run_without_data_or_log_gets_a_partial_report(run, tmp_path):
     config = json.loads((run / "config.json").read_text())
     config["data"]["path"] = str(tmp_path / "gone.npz")
     (run / "config.json").write_text(json.dumps(config))
@@ -240,12 +240,12 @@ def test_a_run_without_its_data_or_its_log_is_shown_as_far_as_it_goes(run, tmp_p
     (run / "evaluation.json").write_text("[1")
     (run / "calibration.json").symlink_to(run / "config.json")
     report(run, "--out", tmp_path / "a.html")
-    text = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
-    for said in ("give their path with --data", "no log.jsonl", "not written by Evaluation", "is a link"):
-        assert said in text
+    text = assert_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
+    for text_part in ("give their path with --data", "no log.jsonl", "not written by Evaluation", "is a link"):
+        assert text_part in text
 
 
-def test_text_of_a_hostile_run_is_text(scored, tmp_path, tab):
+def test_text_of_a_hostile_run_is_escaped(scored, tmp_path, tab):
     run = shutil.copytree(scored, tmp_path / EVIL.replace("/", "⁄"))
 
     text = (run / "evaluation.json").read_text()
@@ -263,7 +263,7 @@ def test_text_of_a_hostile_run_is_text(scored, tmp_path, tab):
     rows = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     (run / "log.jsonl").write_text("".join(json.dumps({**row, f"kl/{EVIL}": 1.0}) + "\n" for row in rows))
     report(run, "--out", tmp_path / "a.html")
-    text = is_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
+    text = assert_harmless((tmp_path / "a.html").read_text(encoding="utf-8")).text
     assert text.count(EVIL) >= 8
     tab.open(tmp_path / "a.html", 1280)
     tab.wait("document.querySelector('.player').dataset.frames")
@@ -271,7 +271,7 @@ def test_text_of_a_hostile_run_is_text(scored, tmp_path, tab):
     assert (tab.said, tab.asked) == ([], [])
 
 
-def test_should_a_script_slip_through_it_does_not_run(tmp_path, tab):
+def test_an_injected_script_does_not_run(tmp_path, tab):
     (tmp_path / "a.html").write_text(document("a", [Section("b", before=Markup(EVIL))], [SCRIPT]), encoding="utf-8")
     tab.open(tmp_path / "a.html", 800)
     assert tab.ask("typeof said") == "undefined"
@@ -279,7 +279,7 @@ def test_should_a_script_slip_through_it_does_not_run(tmp_path, tab):
 
 
 @pytest.mark.parametrize("before", [None, b"an older page"])
-def test_an_interrupted_report_leaves_no_half_page(fitted, tmp_path, monkeypatch, before):
+def test_an_interrupted_report_leaves_no_partial_page(fitted, tmp_path, monkeypatch, before):
     class Torn(str):
         def encode(self, *_, **__):
             raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Bounds, diagnostics, evaluation and training refuse what they cannot do."""
+"""Wrong arguments of bounds, diagnostics, evaluation and training are errors."""
 
 import math
 
@@ -179,7 +179,7 @@ TRAINING = [
 @pytest.mark.parametrize(
     "table", [BOUNDS, DIAGNOSTICS, EVALUATION, TRAINING], ids=["bounds", "diagnostics", "evaluation", "training"]
 )
-def test_misuse_is_refused(table):
+def test_misuse_is_an_error(table):
     for call, word in table:
         with pytest.raises((TypeError, ValueError), match=word):
             call()

@@ -1,4 +1,4 @@
-"""Forecasts of every kind of model in chunks: the same distribution, and no more memory for more samples."""
+"""Forecasts in chunks, for every kind of model: the same draws, and constant memory."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def people():
 
 @pytest.fixture(params=METHODS)
 def forecaster(request, people):
-    """A model, and forecasts of some of the windows by it."""
+    """Return a function that forecasts a part of the windows."""
     paths = request.param == "trajevae"
     protocol = motion.PROTOCOLS["bandai2-trajectories" if paths else "bandai2-by-style"]
     protocol = replace(protocol, split_by="split", train=("train",), test=("test",), predicted=20)
@@ -38,17 +38,17 @@ def forecaster(request, people):
     return lambda part, samples, **options: model.forecast(past[part], 20, samples, **options)
 
 
-def test_a_chunk_is_a_forecast_of_its_own(forecaster):
+def test_chunks_equal_separate_forecasts(forecaster):
     torch.manual_seed(0)
-    whole = forecaster(slice(None), 2, chunk=2)
+    both = forecaster(slice(None), 2, chunk=2)
     torch.manual_seed(0)
     first, again, last = (forecaster(part, n) for part, n in ((slice(2), 1), (slice(2), 1), (slice(2, None), 2)))
-    for name, value in whole.items():
+    for name, value in both.items():
         torch.testing.assert_close(value, torch.cat([torch.cat([first[name], again[name]]), last[name]], 1))
 
 
-class Made(TorchDispatchMode):
-    """The sizes, in bytes, of all that operations make."""
+class TensorSizes(TorchDispatchMode):
+    """Records the sizes in bytes of all tensors that operations create."""
 
     def __init__(self):
         super().__init__()
@@ -60,10 +60,10 @@ class Made(TorchDispatchMode):
         return out
 
 
-def test_beside_its_result_a_forecast_is_as_large_for_any_number_of_samples(forecaster):
+def test_memory_of_a_chunked_forecast_does_not_grow_with_samples(forecaster):
     largest = []
     for samples in (7, 13):
-        with Made() as made:
+        with TensorSizes() as allocations:
             out = forecaster(slice(None), samples, chunk=3 * WINDOWS)
-        largest.append(max(made.sizes - {value.untyped_storage().nbytes() for value in out.values()}))
+        largest.append(max(allocations.sizes - {value.untyped_storage().nbytes() for value in out.values()}))
     assert largest[0] == largest[1]

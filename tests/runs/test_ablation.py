@@ -1,4 +1,4 @@
-"""Ablations: costs are those of the oracle, every edge has a run of its own, and a broken ablation is continued."""
+"""Ablations: costs equal the oracle's, every edge has its own run, and interrupted ablations are resumed."""
 
 import json
 import math
@@ -27,7 +27,7 @@ PAIR = "p(z_t | z_{t-1}) p(x_t | z_t, x_{t-1})", "q(z_t | x_t)"
 
 
 @pytest.fixture(scope="module")
-def priced():
+def ablation():
     return dvae.ablate((DKF, SMOOTHER), sizes={"z": 1, "x": 1}, steps=3, surrogates=2)
 
 
@@ -40,28 +40,28 @@ def command(people, out, *more):
 
 @pytest.fixture(scope="module")
 def fitted(people, tmp_path_factory):
-    """An ablation by the command line: its directory."""
+    """Return the directory of an ablation by the command line."""
     out = tmp_path_factory.mktemp("ablation") / "runs"
     assert main(command(people, out, "--figure", str(out.with_name("edges.png")))) == 0
     return out
 
 
-def test_prices_are_those_of_the_guide_and_of_the_model(priced):
+def test_costs_equal_those_of_edge_costs(ablation):
     sizes = {"z": 1, "x": 1}
     expected = {
         "q": dvae.edge_costs(DKF, SMOOTHER, sizes, steps=3, seeds=2),
         "p": dvae.model_edge_costs(DKF, sizes, steps=3, seeds=2),
     }
-    assert len(priced.edges) == sum(map(len, expected.values())) == 6
-    for edge in priced.edges:
-        assert priced.costs[edge.run].tolist() == expected[edge.kind][edge.name].tolist()
-    assert {edge.name for edge in priced.edges if max(priced.costs[edge.run]) < 1e-6} == {"x_{<t} to z_t"}
-    assert priced.notes == {"model-without-z_t-to-x_t": "without it, no data depend on z"}
+    assert len(ablation.edges) == sum(map(len, expected.values())) == 6
+    for edge in ablation.edges:
+        assert ablation.costs[edge.run].tolist() == expected[edge.kind][edge.name].tolist()
+    assert {edge.name for edge in ablation.edges if max(ablation.costs[edge.run]) < 1e-6} == {"x_{<t} to z_t"}
+    assert ablation.notes == {"model-without-z_t-to-x_t": "without it, no data depend on z"}
 
 
 @settings(max_examples=50)
 @given(factorizations())
-def test_every_edge_has_a_run_and_an_edge_of_its_own(pair):
+def test_every_edge_has_its_own_run(pair):
     parts = [*map(Factorization.parse, pair)]
     runs = [edge.run for edge in edges_of(*parts)]
     assert len({*runs, WHOLE}) == len(runs) + 1
@@ -72,62 +72,62 @@ def test_every_edge_has_a_run_and_an_edge_of_its_own(pair):
         assert all(edge in part.edges for edge in edges)
 
 
-def test_the_thicker_an_edge_the_higher_its_price(priced):
-    figure = priced.plot()
+def test_edges_are_drawn_by_their_cost(ablation):
+    figure = ablation.plot()
     for axes, kind in zip(figure.axes, "pq", strict=True):
         widths = {float(patch.get_linewidth()) for patch in axes.patches if isinstance(patch, FancyArrowPatch)}
-        costs = {round(np.mean(priced.costs[edge.run]), 3) for edge in priced.edges if edge.kind == kind}
-        written = sorted(float(text.get_text()) for text in axes.texts if "$" not in text.get_text())
-        assert {*written} == costs
+        costs = {round(np.mean(ablation.costs[edge.run]), 3) for edge in ablation.edges if edge.kind == kind}
+        labels = sorted(float(text.get_text()) for text in axes.texts if "$" not in text.get_text())
+        assert {*labels} == costs
         assert len(widths) == len(costs)
 
 
 @pytest.mark.parametrize("name", FAMILY)
-def test_a_method_of_the_family_becomes_its_equations(name):
+def test_a_family_method_equals_its_equations(name):
     method = dvae.method(name) if name == "vae" else dvae.method(name, width=4)
-    found = as_equations(method)
-    assert found.equations() == method.equations()
-    ours, theirs = found.build({"x": 3}), method.build({"x": 3})
-    assert ours.sizes == theirs.sizes
-    assert found.warm_up == getattr(method, "warm_up", found.warm_up)
+    equations = as_equations(method)
+    assert equations.equations() == method.equations()
+    built, expected = equations.build({"x": 3}), method.build({"x": 3})
+    assert built.sizes == expected.sizes
+    assert equations.warm_up == getattr(method, "warm_up", equations.warm_up)
 
 
-def test_factors_read_the_covariates_of_data_as_those_of_the_method_do():
+def test_equations_read_the_same_covariates_as_the_method():
     class Given(Schema):
         covariates = ("c",), ("s",)
 
     method, schema = dvae.method("dkf"), Given({"x": 2, "c": 1, "s": 1})
-    theirs = method.build(schema)
-    found = as_equations(method, schema).equations()
-    assert found == (theirs.generative, theirs.inference)
-    assert ("x", "c_t") in {(child, str(parent)) for child, parent in found[0].edges}
-    priced = dvae.ablate(as_equations(method, schema), steps=2, surrogates=1)
-    assert min(priced.costs["model-without-c_t-to-x_t"]) > 1e-3
+    expected = method.build(schema)
+    equations = as_equations(method, schema).equations()
+    assert equations == (expected.generative, expected.inference)
+    assert ("x", "c_t") in {(child, str(parent)) for child, parent in equations[0].edges}
+    ablation = dvae.ablate(as_equations(method, schema), steps=2, surrogates=1)
+    assert min(ablation.costs["model-without-c_t-to-x_t"]) > 1e-3
 
 
 def test_an_ablation_by_the_command_line(fitted):
-    found = dvae.Ablation.load(fitted / "edges.json")
-    runs = {edge.run for edge in found.edges}
+    ablation = dvae.Ablation.load(fitted / "edges.json")
+    runs = {edge.run for edge in ablation.edges}
     left_out = {"model-without-x_t-1-to-x_t"}
-    assert found.notes.keys() >= left_out
-    assert "residual" in found.notes[left_out.copy().pop()]
-    assert found.differences.keys() == runs - left_out
+    assert ablation.notes.keys() >= left_out
+    assert "residual" in ablation.notes[left_out.copy().pop()]
+    assert ablation.differences.keys() == runs - left_out
     assert {path.name for path in fitted.iterdir()} == {
         "edges.json",
         *(f"{run}-seed{seed}" for run in runs - left_out | {WHOLE} for seed in (0, 1)),
     }
-    for run, estimate in found.differences.items():
-        metric = "IWAE bound" if run.startswith("model") else "ELBO"  # as on surrogates: evidence, and its gap
-        whole, without = (found.comparison[name][metric].mean for name in (WHOLE, run))
-        assert estimate.mean == pytest.approx(whole - without, abs=1e-9)
-        assert estimate.p_value() <= found.p_values[run] <= 1
+    for run, estimate in ablation.differences.items():
+        metric = "IWAE bound" if run.startswith("model") else "ELBO"  # as for surrogates: the evidence, and the gap
+        full, without = (ablation.comparison[name][metric].mean for name in (WHOLE, run))
+        assert estimate.mean == pytest.approx(full - without, abs=1e-9)
+        assert estimate.p_value() <= ablation.p_values[run] <= 1
     reduced = dvae.load(fitted / "guide-without-x_t-to-z_t-seed1")
     assert (reduced.model.generative.text, reduced.model.inference.text) == (PAIR[0], "q(z_t)")
-    assert "not fitted" in str(found)
+    assert "not fitted" in str(ablation)
     assert fitted.with_name("edges.png").stat().st_size > 0
 
 
-def test_the_same_command_continues_it(fitted, people, tmp_path):
+def test_the_same_command_resumes_an_ablation(fitted, people, tmp_path):
     out = tmp_path / "runs"
     shutil.copytree(fitted, out)
     shutil.rmtree(out / "model-without-z_t-1-to-z_t-seed0")
@@ -138,10 +138,10 @@ def test_the_same_command_continues_it(fitted, people, tmp_path):
     assert again == first
 
 
-def test_it_comes_back_from_json(fitted, priced):
-    for found in (priced, Ablation.load(fitted / "edges.json")):
-        again = Ablation.from_json(found.to_json())
-        assert (str(again), again.to_json()) == (str(found), found.to_json())
+def test_an_ablation_is_read_back_from_json(fitted, ablation):
+    for result in (ablation, Ablation.load(fitted / "edges.json")):
+        again = Ablation.from_json(result.to_json())
+        assert (str(again), again.to_json()) == (str(result), result.to_json())
 
 
 @pytest.mark.parametrize(
@@ -156,24 +156,24 @@ def test_it_comes_back_from_json(fitted, priced):
         {"comparison": {"rows": {}}},
     ],
 )
-def test_what_is_no_ablation_is_refused(priced, damage):
-    document = priced.document()
+def test_an_invalid_document_is_an_error(ablation, damage):
+    document = ablation.document()
     with pytest.raises(ValueError, match="not written by Ablation"):
         Ablation.of({**document, "attributes": document["attributes"] | damage})
 
 
 @pytest.mark.parametrize("costs", [[], [0.1], [math.nan, 0.1]])
-def test_prices_that_do_not_belong_together_are_refused(priced, costs):
-    damaged = replace(priced, costs=priced.costs | {"model-without-z_t-to-x_t": np.array(costs)})
+def test_inconsistent_costs_are_errors(ablation, costs):
+    damaged = replace(ablation, costs=ablation.costs | {"model-without-z_t-to-x_t": np.array(costs)})
     with pytest.raises(ValueError, match="cost"):
         damaged.check()
 
 
-def test_a_comparison_of_other_models_is_refused(fitted):
-    found = Ablation.load(fitted / "edges.json")
-    rows = {"another" if name == WHOLE else name: row for name, row in found.comparison.rows.items()}
+def test_a_comparison_of_other_models_is_an_error(fitted):
+    ablation = Ablation.load(fitted / "edges.json")
+    rows = {"another" if name == WHOLE else name: row for name, row in ablation.comparison.rows.items()}
     with pytest.raises((KeyError, ValueError), match=r"whole|fits"):
-        replace(found, comparison=replace(found.comparison, rows=rows)).check()
+        replace(ablation, comparison=replace(ablation.comparison, rows=rows)).check()
 
 
 @pytest.mark.parametrize(
@@ -189,14 +189,14 @@ def test_a_comparison_of_other_models_is_refused(fitted):
         (["--generative", "p(z_t"], "expected"),
     ],
 )
-def test_wrong_arguments_are_told_before_any_work(arguments, message, tmp_path, monkeypatch, capsys):
+def test_wrong_arguments_exit_with_2_before_any_work(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["check", "edges", *arguments]) == 2
     assert message in capsys.readouterr().err
     assert not [*tmp_path.iterdir()]
 
 
-def test_fits_need_data_and_a_directory(tmp_path):
+def test_fits_require_data_and_a_directory(tmp_path):
     with pytest.raises(ValueError, match="give both `data` and `out`"):
         dvae.ablate((DKF, SMOOTHER), out=tmp_path)
     with pytest.raises(ValueError, match="the latent k has no factor in the guide"):

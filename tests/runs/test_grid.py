@@ -1,4 +1,4 @@
-"""Grids: what a file says is what a sweep fits, under the file's names, and the same command continues it."""
+"""Grids: a file defines the methods and run names of a sweep, and the same command resumes it."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def study(tmp_path):
     return file
 
 
-def test_a_grid_is_what_its_file_says(study):
+def test_a_grid_contains_the_methods_of_its_file(study):
     grid = Grid.read(study)
     assert list(grid.methods) == ["filter", "smoother-latent=2", "smoother-latent=3", "vae"]
     assert (grid.seeds, grid.training) == ((0, 1), {"steps": 2, "batch_size": 4})
@@ -66,7 +66,7 @@ def test_the_study_of_the_docs_is_a_grid(tmp_path):
         method.build({"x": 3})
 
 
-def test_options_of_all_give_way_to_those_of_the_file(study):
+def test_options_of_the_file_override_common_options(study):
     methods = Grid.read(study, {"latent": 7, "warm_up": 5}).methods
     assert {name: (method.latent, method.warm_up) for name, method in methods.items()} == {
         "filter": (2, 5),
@@ -76,7 +76,7 @@ def test_options_of_all_give_way_to_those_of_the_file(study):
     }
 
 
-def test_a_sweep_of_a_grid_is_fitted_and_continued(study, table, tmp_path, capsys):
+def test_a_sweep_of_a_grid_is_fitted_and_resumed(study, table, tmp_path, capsys):
     out = tmp_path / "runs"
     command = ["sweep", "--grid", str(study), "--data", str(table), "--out", str(out), "--jobs", "1", "--warm-up", "1"]
     assert main(command) == 0
@@ -100,7 +100,7 @@ def table(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("[a", "is not TOML"),
         ("", "names nothing to fit"),
@@ -122,21 +122,21 @@ def table(tmp_path):
         (f"[a]\nmethod='vae'\neach.latent={list(range(1, 102))}\neach.warm_up={list(range(100))}", "maximum of 1000"),
     ],
 )
-def test_what_is_no_grid_is_refused_by_table(study, text, told):
+def test_an_invalid_grid_is_an_error_with_its_table(study, text, message):
     study.write_text(text)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         Grid.read(study)
 
 
-def test_the_command_line_takes_methods_or_a_grid(study, tmp_path, capsys):
+def test_the_command_line_accepts_methods_or_a_grid(study, tmp_path, capsys):
     out = ["--out", str(tmp_path / "runs")]
-    for words, told in (
+    for arguments, message in (
         (["vae", "--grid", str(study)], "no method and --grid"),
         (["--grid", str(study), "--latent", "3"], "each.latent"),
         (["--grid", str(tmp_path / "none.toml")], "none.toml"),
     ):
-        assert main(["sweep", *words, *out]) != 0
-        assert told in capsys.readouterr().err
+        assert main(["sweep", *arguments, *out]) != 0
+        assert message in capsys.readouterr().err
     study.write_text(STUDY.replace("steps = 2", "steps = 0"))
     assert main(["sweep", "--grid", str(study), *out]) == 2
     assert "steps is 0" in capsys.readouterr().err

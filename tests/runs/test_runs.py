@@ -1,4 +1,4 @@
-"""Run directories that somebody else may have laid: what is no plain file, too large or out of range is refused."""
+"""Untrusted run directories: links, special files, oversized files and values out of range are errors."""
 
 import errno
 import json
@@ -59,7 +59,7 @@ def canary(tmp_path):
 
 
 def failure(capsys, *arguments, code=1):
-    """The sentence with which a command fails."""
+    """Return the error message of a failing command."""
     capsys.readouterr()
     assert main([str(each) for each in arguments]) == code
     error = capsys.readouterr().err
@@ -90,7 +90,7 @@ READ = (CONFIG, STATE, BEST, LAST, OPTIMISER, "log.jsonl")
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_nothing_is_written_through_a_link(run, canary, name):
+def test_links_are_never_written_through(run, canary, name):
     (run / name).unlink(missing_ok=True)
     (run / name).symlink_to(canary)
     if name == ".lock":
@@ -106,7 +106,7 @@ def test_nothing_is_written_through_a_link(run, canary, name):
 
 
 @pytest.mark.parametrize("names", [["evaluation.json", "scores.png"], ["calibration.json"]])
-def test_results_take_the_place_of_a_link(run, canary, names):
+def test_results_replace_links(run, canary, names):
     for name in names:
         (run / name).symlink_to(canary)
     if "calibration.json" in names:
@@ -121,7 +121,7 @@ def test_results_take_the_place_of_a_link(run, canary, names):
 
 @pytest.mark.parametrize("name", READ)
 @pytest.mark.parametrize("kind", ["link", "device", "fifo", "directory"])
-def test_what_is_no_plain_file_is_refused_at_once(run, canary, name, kind):
+def test_special_files_are_errors(run, canary, name, kind):
     path = run / name
     path.unlink()
     if kind == "directory":
@@ -138,7 +138,7 @@ def test_what_is_no_plain_file_is_refused_at_once(run, canary, name, kind):
 
 
 @pytest.mark.parametrize("path", [None, 3, b"run"])
-def test_a_run_is_named_by_a_path(path):
+def test_a_run_must_be_a_path(path):
     with pytest.raises(TypeError, match=f"a run must be the path of a folder that fit wrote, got {path!r}"):
         dvae.load(path)
 
@@ -148,17 +148,17 @@ def test_the_directory_that_the_user_names_may_be_a_link(run, tmp_path):
     assert runs.resume(tmp_path / "latest", steps=5, progress=False).step == 5
 
 
-def test_a_fit_in_memory_is_that_of_a_run_of_the_same_seed(fitted, people):
-    kept, before = dvae.load(fitted).model, torch.random.get_rng_state()
+def test_a_fit_in_memory_equals_a_run_with_the_same_seed(fitted, people):
+    expected, before = dvae.load(fitted).model, torch.random.get_rng_state()
     fit = dvae.fit(METHOD, MotionData.open(people), **vars(TRAINING))
     assert torch.equal(torch.random.get_rng_state(), before)
     assert not fit.model.training
     assert fit.run is None
-    for name, value in kept.state_dict().items():
+    for name, value in expected.state_dict().items():
         assert torch.equal(value, fit.model.state_dict()[name]), name
 
 
-def test_a_run_of_a_sweep_is_no_link(fitted, people, tmp_path):
+def test_a_link_as_run_directory_of_a_sweep_is_an_error(fitted, people, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (tmp_path / "out").mkdir()
@@ -169,7 +169,7 @@ def test_a_run_of_a_sweep_is_no_link(fitted, people, tmp_path):
 
 
 @pytest.mark.parametrize("name", READ)
-def test_a_file_larger_than_it_can_be_is_not_read(run, name, monkeypatch):
+def test_an_oversized_file_is_an_error_before_reading(run, name, monkeypatch):
     with (run / name).open("r+b") as file:
         file.truncate(2**40)  # takes no space
     monkeypatch.setattr(trackers, "LARGEST_LOG", 2**20)
@@ -177,7 +177,7 @@ def test_a_file_larger_than_it_can_be_is_not_read(run, name, monkeypatch):
         runs.resume(run, steps=6, progress=False)
 
 
-def test_a_state_names_no_file_but_those_of_a_checkpoint(run, canary):
+def test_a_state_with_a_foreign_file_is_an_error(run, canary):
     change(run, STATE, "fingerprints", "../mine.txt", value="0" * 64)
     with pytest.raises(CheckpointError, match=r"a fingerprint of '../mine.txt', which is not a file of a checkpoint"):
         Run(run).commit(json.loads((run / STATE).read_text()), {})
@@ -224,16 +224,16 @@ def test_a_state_names_no_file_but_those_of_a_checkpoint(run, canary):
         (("data", "path"), ["people.npz"], "path is .*; it must be of type str"),
     ],
 )
-def test_a_config_out_of_range_is_refused_by_file_key_and_value(run, keys, value, message):
+def test_a_config_out_of_range_is_an_error_with_file_and_key(run, keys, value, message):
     change(run, CONFIG, *keys, value=value)
-    with pytest.raises(CheckpointError, match=message) as caught:
+    with pytest.raises(CheckpointError, match=message) as error:
         dvae.load(run)
-    assert str(run) in str(caught.value)
-    assert len(str(caught.value)) < 2000
+    assert str(run) in str(error.value)
+    assert len(str(error.value)) < 2000
 
 
 @pytest.mark.parametrize("key", ["steps", "seed", "devices"])
-def test_an_option_that_a_run_does_not_tell_is_at_its_default(run, capsys, key):
+def test_a_missing_option_of_a_run_has_its_default(run, capsys, key):
     config = json.loads((run / CONFIG).read_text())
     del config["training"][key]
     (run / CONFIG).write_text(json.dumps(config))
@@ -248,14 +248,14 @@ def test_nesting_is_bounded(run):
             Run(run).config
 
 
-def test_every_option_of_a_method_has_a_type_that_is_checked():
+def test_every_option_of_a_method_is_type_checked():
     for kind in dvae.methods().values():
         for name in vars(kind()):
             with pytest.raises((TypeError, ValueError), match=f"{name} .*(must be|known:)"):
                 kind(**{name: object()})
 
 
-def test_a_range_says_what_it_holds():
+def test_a_range_contains_its_values_and_prints_its_ends():
     for low, high, above, below in ((0, 1, False, False), (1, 5, True, False), (1, 5, False, True)):
         allowed = Range(low, high, above, below)
         assert (low in allowed, high in allowed) == (not above, not below)
@@ -264,7 +264,7 @@ def test_a_range_says_what_it_holds():
         assert str(high) in str(allowed)
 
 
-def test_a_model_is_no_larger_than_its_weights():
+def test_a_model_larger_than_its_weights_is_an_error():
     with at_most(2**12, "this"):
         torch.nn.Linear(64, 16)
     with (
@@ -294,12 +294,12 @@ def weights_with(run, name, make):
         (lambda value: value[:1], "holds the weights of another model"),
     ],
 )
-def test_weights_of_another_kind_or_without_a_value_are_refused(run, name, make, message):
+def test_weights_with_wrong_types_shapes_or_values_are_errors(run, name, make, message):
     first = weights_with(run, name, make)
-    with pytest.raises(CheckpointError, match=message) as caught:
+    with pytest.raises(CheckpointError, match=message) as error:
         runs.resume(run, steps=6, progress=False)
-    assert f"{run / name}" in str(caught.value)
-    assert first in str(caught.value)
+    assert f"{run / name}" in str(error.value)
+    assert first in str(error.value)
 
 
 def damage(name, value):
@@ -335,13 +335,13 @@ MEAN, SQUARE, STEP = (f"optimizer/0/{key}" for key in ("exp_avg", "exp_avg_sq", 
         (lambda content: content["random/generator"].fill_(255), "mt19937"),
     ],
 )
-def test_a_state_that_no_run_writes_is_refused_by_its_key(run, change, message):
+def test_an_impossible_optimizer_state_is_an_error_with_its_key(run, change, message):
     content = Run(run).optimiser_state()
     change(content)
     recommit(run, OPTIMISER, save(content))
-    with pytest.raises(CheckpointError, match=message) as caught:
+    with pytest.raises(CheckpointError, match=message) as error:
         runs.resume(run, steps=6, progress=False)
-    assert str(run / OPTIMISER) in str(caught.value)
+    assert str(run / OPTIMISER) in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -355,14 +355,14 @@ def test_a_state_that_no_run_writes_is_refused_by_its_key(run, change, message):
         ("best_step", 1.5),
     ],
 )
-def test_a_state_out_of_range_is_refused_wherever_it_is_read(run, capsys, key, value):
+def test_a_state_out_of_range_is_an_error_for_every_command(run, capsys, key, value):
     change(run, STATE, key, value=value)
     for command in (("resume", run), ("evaluate", run), ("forecast", run, "--out", run / "f.npz")):
         assert f"{run / STATE} is damaged: {key} missing or not" in failure(capsys, *command)
 
 
 @pytest.mark.parametrize("line", ["3", "[]", "{}", '{"step": "one"}', '{"step": 1, "loss": "low"}', '{"step"', "\0"])
-def test_a_damaged_log_is_refused_by_its_line(run, line):
+def test_a_damaged_log_is_an_error_with_its_line(run, line):
     path = run / "log.jsonl"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0], line, *lines[1:]]) + "\n")
@@ -370,12 +370,12 @@ def test_a_damaged_log_is_refused_by_its_line(run, line):
         runs.resume(run, steps=6, progress=False)
 
 
-def test_a_log_of_more_rows_than_a_run_writes_is_refused_at_the_first_beyond(tmp_path, monkeypatch):
+def test_a_log_with_too_many_rows_is_an_error_at_the_first_excess_row(tmp_path, monkeypatch):
     path = tmp_path / "log.jsonl"
     row = b'{"step": 1}\n'
     path.write_bytes(row * trackers.MOST_ROWS)
     assert len(JSONLines(path).read()) == trackers.MOST_ROWS
-    path.write_bytes(row * trackers.MOST_ROWS + b"no row\n")  # is not come to
+    path.write_bytes(row * trackers.MOST_ROWS + b"no row\n")  # is not read
     with pytest.raises(CheckpointError, match=f"{path} has more than 200,000 rows; remove some, or move the file"):
         JSONLines(path).read()
     path.write_bytes(row * (2**25 // len(row) + 1))
@@ -384,7 +384,7 @@ def test_a_log_of_more_rows_than_a_run_writes_is_refused_at_the_first_beyond(tmp
         JSONLines(path).read()
 
 
-def test_a_forecast_that_is_not_finite_is_refused_by_its_clip(run, capsys):
+def test_a_nonfinite_forecast_is_an_error_with_its_clip(run, capsys):
     huge = {name: value * 0 + 3e38 for name, value in load_file(run / BEST).items()}
     recommit(run, BEST, save(huge))
     out = run / "futures.npz"
@@ -393,22 +393,22 @@ def test_a_forecast_that_is_not_finite_is_refused_by_its_clip(run, capsys):
     assert not out.exists()
 
 
-def test_futures_are_finite():
+def test_nonfinite_futures_are_errors():
     walks = motion.simulate(clips=2, frames=30)
     joints = walks.skeleton.joints
     arrays = [np.zeros((3, 2, 4, joints, 3)), np.zeros((2, 5, joints, 3)), np.zeros((2, 4, joints, 3))]
-    for place, array in enumerate(arrays):
-        arrays[place] = array.copy()
-        arrays[place][..., 1, 2, 3, 1] = np.inf if place else np.nan  # NaN is a joint that was not observed
+    for n, array in enumerate(arrays):
+        arrays[n] = array.copy()
+        arrays[n][..., 1, 2, 3, 1] = np.inf if n else np.nan  # NaN is a joint that was not observed
         with pytest.raises(FloatingPointError, match=r"clip 'b' \(test\), frame 7, are NaN"):
             motion.Forecasts(walks.skeleton, [("test", "a", 0), ("test", "b", 7)], *arrays)
-        arrays[place] = array
+        arrays[n] = array
 
 
 # A full disk --------------------
 
 
-def test_a_full_disk_names_the_file(run, tmp_path, monkeypatch, capsys):
+def test_a_full_disk_is_an_error_with_the_file(run, tmp_path, monkeypatch, capsys):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -435,23 +435,23 @@ def test_a_full_disk_names_the_file(run, tmp_path, monkeypatch, capsys):
         log.log(5, {"loss": 1.0})
 
 
-def test_what_killed_processes_left_is_removed_by_the_next_one(tmp_path, monkeypatch):
+def test_temporary_files_of_killed_processes_are_removed_by_the_next(tmp_path, monkeypatch):
     dead = subprocess.Popen(["true"])
     dead.wait()
-    own = tmp_path / f"{files.temporary()}a"
+    live = tmp_path / f"{files.temporary()}a"
     monkeypatch.setattr(files.os, "getpid", lambda: dead.pid)
-    left = [tmp_path / f"{files.temporary()}{name}" for name in "abcd"]
+    stale = [tmp_path / f"{files.temporary()}{name}" for name in "abcd"]
     monkeypatch.undo()
-    for path in (own, *left[1:]):
+    for path in (live, *stale[1:]):
         path.touch()
-    left[0].mkdir()
-    (left[0] / "walk.csv").touch()
+    stale[0].mkdir()
+    (stale[0] / "walk.csv").touch()
     with files.atomic_write(tmp_path / "a.txt"):
         pass
-    assert {path.name for path in tmp_path.iterdir()} == {own.name, "a.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == {live.name, "a.txt"}
 
 
-def test_what_a_killed_process_left_of_a_checkpoint_is_removed_with_the_next_one(run):
+def test_partial_checkpoints_of_killed_processes_are_removed_by_the_next(run):
     (run / f"{BEST}.new").write_bytes(b"cut off")
     Run(run).commit(Run(run).state, {})
     assert not list(run.glob("*.new"))
@@ -460,7 +460,7 @@ def test_what_a_killed_process_left_of_a_checkpoint_is_removed_with_the_next_one
 # The command line --------------------
 
 
-def test_a_run_that_is_longer_than_asked_for_says_so(run, capsys):
+def test_resuming_to_fewer_steps_than_taken_is_an_error(run, capsys):
     error = failure(capsys, "resume", run, "--steps", "2")
     assert f"steps is 2, but {run} has taken 4 steps already" in error
     assert "give more than 4" in error
@@ -468,7 +468,7 @@ def test_a_run_that_is_longer_than_asked_for_says_so(run, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "meant"),
+    ("arguments", "suggestion"),
     [
         ("fitt", "unknown command 'fitt' (did you mean 'fit'?)"),
         ("fit srn --out x", "'srn' is unknown (did you mean 'srnn'?)"),
@@ -479,11 +479,11 @@ def test_a_run_that_is_longer_than_asked_for_says_so(run, capsys):
         ("data inf", "did you mean 'data info'?"),
     ],
 )
-def test_the_name_that_was_meant_is_told(capsys, arguments, meant):
-    assert meant in failure(capsys, *arguments.split(), code=2)
+def test_a_misspelled_name_gets_a_suggestion(capsys, arguments, suggestion):
+    assert suggestion in failure(capsys, *arguments.split(), code=2)
 
 
-def test_nothing_is_suggested_where_nothing_is_near(capsys):
+def test_an_unrelated_name_gets_no_suggestion(capsys):
     assert "did you mean" not in failure(capsys, "fit", "qqqqqq", "--out", "x", code=2)
 
 
@@ -498,27 +498,27 @@ def test_nothing_is_suggested_where_nothing_is_near(capsys):
         ("animate RUN --out f.png", ".html"),
     ],
 )
-def test_a_file_ends_in_what_is_written(fitted, capsys, tmp_path, monkeypatch, arguments, end):
+def test_a_wrong_suffix_of_an_output_file_is_an_error(fitted, capsys, tmp_path, monkeypatch, arguments, end):
     monkeypatch.chdir(tmp_path)
     assert f"end the name in {end}" in failure(capsys, *arguments.replace("RUN", str(fitted)).split(), code=2)
     assert not list(tmp_path.iterdir())
 
 
-def test_pyros_table_of_shapes_is_cut():
+def test_error_messages_omit_pyros_table_of_shapes():
     model = dvae.DynamicalVAE("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 2, "c": 1})
     for act in (dvae.SequenceELBO().terms, partial(dvae.fit, steps=1, progress=False)):
-        with pytest.raises(ValueError, match="reads c") as caught:
+        with pytest.raises(ValueError, match="reads c") as error:
             act(model, {"x": torch.zeros(2, 3, 2)})
-        assert "Trace Shapes:" not in str(caught.value)
+        assert "Trace Shapes:" not in str(error.value)
 
     def program():
         pyro.sample("x", pyro.distributions.Normal(torch.zeros(2), -torch.ones(2)))
 
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError) as error:
         pyro.poutine.trace(program).get_trace()
-    assert "Trace Shapes:" in str(caught.value)
-    assert "parameter scale" in error_message(caught.value)
-    assert "Trace Shapes:" not in error_message(caught.value)
+    assert "Trace Shapes:" in str(error.value)
+    assert "parameter scale" in error_message(error.value)
+    assert "Trace Shapes:" not in error_message(error.value)
 
 
 PROGRAM = str(ROOT / "dvae" / "command" / "__init__.py")
@@ -530,11 +530,11 @@ def python(*arguments, path=ROOT):
     return subprocess.Popen([sys.executable, *arguments], env=environment, text=True, **pipes)
 
 
-@pytest.mark.parametrize("where", ["", "def main(): pass\ndef command(given):\n    "], ids=["dvae.cli", "its command"])
-def test_ctrl_c_while_importing_is_a_sentence(tmp_path, where):
+@pytest.mark.parametrize("source", ["", "def main(): pass\ndef command(given):\n    "], ids=["dvae.cli", "its command"])
+def test_ctrl_c_while_importing_prints_no_traceback(tmp_path, source):
     (tmp_path / "dvae").mkdir()
     (tmp_path / "dvae" / "__init__.py").write_text("")
-    (tmp_path / "dvae" / "cli.py").write_text(f"{where}import time; print('importing', flush=True); time.sleep(60)\n")
+    (tmp_path / "dvae" / "cli.py").write_text(f"{source}import time; print('importing', flush=True); time.sleep(60)\n")
     program = python(PROGRAM, "list", path=tmp_path)
     assert program.stdout.readline() == "importing\n"
     program.send_signal(signal.SIGINT)
@@ -542,7 +542,7 @@ def test_ctrl_c_while_importing_is_a_sentence(tmp_path, where):
     assert (program.returncode, error) == (130, "interrupted\n")
 
 
-def test_without_docstrings_pyro_is_missed_in_a_sentence():
+def test_python_without_docstrings_is_an_error():
     program = python("-OO", PROGRAM, "list")
     _, error = program.communicate(timeout=120)
     assert program.returncode == 1
@@ -553,8 +553,8 @@ def test_without_docstrings_pyro_is_missed_in_a_sentence():
 # Threads --------------------
 
 
-def test_threads_take_turns(people, fitted, tmp_path):
-    """Two fits, and a forecast amid them, give what they give one after the other."""
+def test_fits_in_threads_equal_fits_in_sequence(people, fitted, tmp_path):
+    """Two fits and a forecast in threads give the same results as in sequence."""
     data = MotionData.open(people)
     model, x = dvae.load(fitted).model, data.windows("test").all()["x"][:2, :15]
 
@@ -562,11 +562,11 @@ def test_threads_take_turns(people, fitted, tmp_path):
         torch.manual_seed(0)
         return model.forecast({"x": x}, 4, 2)["x"]
 
-    found, errors = {}, []
+    results, errors = {}, []
 
     def work(name, action):
         try:
-            found[name] = action()
+            results[name] = action()
         except BaseException as error:
             errors.append(error)
 
@@ -580,13 +580,13 @@ def test_threads_take_turns(people, fitted, tmp_path):
     for thread in threads:
         thread.join()
     assert not errors
-    assert found["forecast"] == forecast().shape
+    assert results["forecast"] == forecast().shape
     for name in ("a", "b"):
         assert (tmp_path / name / LAST).read_bytes() == (fitted / LAST).read_bytes()
 
 
-def test_what_was_valid_stays_valid():
-    """A limit of the gradient that is none, and layers as wide as a user of a large machine has them."""
+def test_previously_valid_options_stay_valid():
+    """Old configs may have an infinite gradient clip, and layers as wide as large machines allow."""
     assert dvae.Training(gradient_clip=math.inf).gradient_clip is None
     assert dvae.method("vae", hidden=(8192,)).hidden == (8192,)
     with pytest.raises(ValueError, match=r"unknown accelerator 'tpu' .*known: auto, cpu"):

@@ -1,4 +1,4 @@
-"""Sweeps: a run is what it would be alone, on any backend, and a sweep that was stopped is continued, not repeated."""
+"""Sweeps: a run equals a separate fit on every backend, and an interrupted sweep is resumed."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def data(people):
 
 @pytest.fixture(scope="module")
 def swept(data, tmp_path_factory):
-    """A sweep over processes: its directory and results."""
+    """Return a sweep over processes: its directory and results."""
     out = tmp_path_factory.mktemp("runs") / "swept"
     methods = [VAE, replace(VAE, latent=2)]
     return out, methods, sweep(methods, data, out, seeds=(0, 1), training=TRAINING)
@@ -60,24 +60,24 @@ def printed(capsys):
 
 
 @pytest.mark.slow
-def test_a_run_of_a_sweep_is_bit_for_bit_what_it_is_alone(swept, data, tmp_path, one_thread):
+def test_a_run_of_a_sweep_equals_a_separate_fit_bit_for_bit(swept, data, tmp_path, one_thread):
     out, methods, results = swept
     assert [result.path.name for result in results] == ["vae-z3-seed0", "vae-z2-seed0", "vae-z3-seed1", "vae-z2-seed1"]
     for result in results:
-        alone = dvae.fit(
+        single = dvae.fit(
             result.method, data, out=tmp_path / result.path.name, **vars(replace(TRAINING, seed=result.seed))
         )
-        assert weights(result.path) == weights(alone.run)
-        assert (result.status, result.step, result.best_bound) == ("finished", 6, alone.best_bound)
+        assert weights(result.path) == weights(single.run)
+        assert (result.status, result.step, result.best_bound) == ("finished", 6, single.best_bound)
         assert result.path.parent == out
         assert result.seconds > 0
     assert [result.method for result in results] == methods * 2
     assert len({result.best_bound for result in results}) == 4
-    assert {path.name for path in out.iterdir()} == {result.path.name for result in results}  # no lease is left
+    assert {path.name for path in out.iterdir()} == {result.path.name for result in results}  # no lease remains
     assert dvae.load(results[0].path).method == VAE
 
 
-def test_what_is_finished_is_left_as_it_is(swept, data, capsys):
+def test_finished_runs_are_not_repeated(swept, data, capsys):
     out, methods, results = swept
     before = written(out)
     again = sweep(methods, data, out, seeds=(0, 1), training=replace(TRAINING, accelerator="cpu"))  # or elsewhere
@@ -96,7 +96,7 @@ def test_what_is_finished_is_left_as_it_is(swept, data, capsys):
         (lambda m, d, t: (m, replace(d, motion=motion.simulate(14, 90, seed=2)), t), "its data's fingerprint is"),
     ],
 )
-def test_a_run_of_other_options_is_refused_before_any_work(swept, data, change, message):
+def test_a_run_with_other_options_is_an_error_before_any_work(swept, data, change, message):
     out, _, _ = swept
     before = written(out)
     method, other, training = change(VAE, data, TRAINING)
@@ -105,7 +105,7 @@ def test_a_run_of_other_options_is_refused_before_any_work(swept, data, change, 
     assert written(out) == before
 
 
-def test_a_sweep_that_makes_no_sense_is_refused(data, tmp_path):
+def test_wrong_arguments_are_errors(data, tmp_path):
     for methods, seeds, message in (
         ([], [0], "at least one method"),
         ([VAE], [], "at least one method and one seed"),
@@ -130,8 +130,8 @@ def test_a_sweep_that_makes_no_sense_is_refused(data, tmp_path):
 
 
 class Breaks(RuntimeError):
-    def __init__(self, what, how):  # of two arguments, so that it cannot be unpickled
-        super().__init__(f"{what} {how}")
+    def __init__(self, first, second):  # with two arguments it cannot be unpickled
+        super().__init__(f"{first} {second}")
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,9 @@ class Broken(type(VAE)):
         raise Breaks("no", "objective")
 
 
-def test_a_run_that_fails_is_reported_and_the_others_go_on(data, tmp_path, capsys):
-    broken, whole = sweep([Broken(), VAE], data, tmp_path, [0], TRAINING, jobs=1)
-    assert (broken.status, broken.error, whole.status) == ("failed", "Breaks: no objective", "finished")
+def test_a_failed_run_is_reported_and_the_others_continue(data, tmp_path, capsys):
+    broken, finished = sweep([Broken(), VAE], data, tmp_path, [0], TRAINING, jobs=1)
+    assert (broken.status, broken.error, finished.status) == ("failed", "Breaks: no objective", "finished")
     assert "broken-seed0 failed: Breaks: no objective" in printed(capsys)
 
 
@@ -157,10 +157,10 @@ def test_the_command_fails_if_a_run_does(people, tmp_path, capsys):
     assert "vae-seed1 failed" in third
 
 
-def test_what_a_run_warns_of_is_told_once(data, tmp_path):
-    with pytest.warns(UserWarning, match="shortened to 2") as caught:
+def test_a_warning_of_several_runs_is_shown_once(data, tmp_path):
+    with pytest.warns(UserWarning, match="shortened to 2") as warnings:
         sweep([replace(VAE, warm_up=50)], data, tmp_path, [0, 1], replace(TRAINING, steps=2))
-    assert len(caught) == 1
+    assert len(warnings) == 1
 
 
 def test_wrong_arguments_exit_with_2_before_any_work(tmp_path, capsys):
@@ -192,7 +192,7 @@ def test_the_table_is_read_from_the_logs(tmp_path):
     run = tmp_path / "vae-seed0"
     run.mkdir()
     file = run / "log.jsonl"
-    file.write_text('{"step": 80, "bound": 0}\n')  # of an earlier sweep
+    file.write_text('{"step": 80, "bound": 0}\n')  # from an earlier sweep
     log = sweeps._Log(run, 100)
     assert not log.look()
     file.with_name("new").write_text('{"step": 40, "bound": 0}\n{"step": 50, "validation/bound": 2.5}\n{"step": 6')
@@ -202,15 +202,15 @@ def test_the_table_is_read_from_the_logs(tmp_path):
     with file.open("a") as more:
         more.write('0, "validation/bound": 2.0, "validation/self_fed/bound": 1.5}\n')
     assert not log.look()
-    assert (log.step, log.bound) == (60, 1.5)  # as the best weights of such a run are chosen
+    assert (log.step, log.bound) == (60, 1.5)  # as for the choice of the best weights
     damaged = ["{", "[]", "7", '{"bound": 1}', '{"step": "7"}', "[" * 100_000, '{"step": 7, "validation/bound": 1%s}']
     with file.open("a") as more:
         more.write("\n".join(damaged) % ("0" * 400) + '\n\xff\n{"step": 70}\n')
-    assert not log.look()  # a damaged line is nobody's progress, and does not end the thread that looks
+    assert not log.look()  # damaged lines are skipped and do not end the thread
     assert (log.step, log.bound) == (70, 1.5)
 
 
-def test_the_callers_backend_is_used_and_threads_take_turns(swept, data, tmp_path, monkeypatch):
+def test_the_joblib_backend_of_the_caller_is_used(swept, data, tmp_path, monkeypatch):
     out, _, _ = swept
     with parallel_config(backend="threading"):
         results = sweep([VAE], data, tmp_path, seeds=(0, 1), training=TRAINING)
@@ -231,20 +231,23 @@ SMALL_GSPS = {
 @pytest.mark.parametrize(
     ("method", "best"),
     [
-        (dvae.method("gsps", **SMALL_GSPS), "lowest validation loss"),  # its other options are chosen by the skeleton
-        (ActionClassifier(label="activity", hidden=4, layers=1, features=3), "best bound"),  # its classes by the clips
+        (dvae.method("gsps", **SMALL_GSPS), "lowest validation loss"),  # the skeleton determines its other options
+        (
+            ActionClassifier(label="activity", hidden=4, layers=1, features=3),
+            "best bound",
+        ),  # the clips determine its classes
     ],
     ids=["gsps", "action-classifier"],
 )
-def test_a_method_that_the_data_complete_goes_on_too(data, tmp_path, method, best):
+def test_a_method_with_options_from_the_data_is_resumed(data, tmp_path, method, best):
     first, again = (sweep([method], data, tmp_path, [0], TRAINING, jobs=1) for _ in range(2))
     assert [outcome.status for outcome in (*first, *again)] == ["finished"] * 2
     assert again[0].seconds == 0
     assert first[0].best == again[0].best
-    assert first[0].best.startswith(best)  # as the objective selects
+    assert first[0].best.startswith(best)  # according to the objective
 
 
-def test_ctrl_c_in_a_sweep_of_one_job_is_the_sweeps(data, tmp_path):
+def test_a_signal_interrupts_a_sweep_with_one_job(data, tmp_path):
     @dataclass(frozen=True)
     class Stopped(type(VAE)):
         name: ClassVar[str] = "stopped"
@@ -283,8 +286,8 @@ def states(out):
 
 
 @pytest.mark.slow
-def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
-    """The signal goes to all processes, as from a terminal; no process stays, and runs go on from their checkpoints."""
+def test_a_sweep_stopped_by_ctrl_c_is_resumed(people, tmp_path, capsys):
+    """The signal goes to all processes, as from a terminal: all end, and runs resume from checkpoints."""
     arguments = ["sweep", "vae", "vrnn", "--seeds", "0", "1", "--data", str(people), "--out", str(tmp_path)]
     command = [sys.executable, "-m", "dvae.cli", *arguments, "--steps", "30", *SMALL]
     process = subprocess.Popen(
@@ -315,7 +318,7 @@ def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
     lines = printed(capsys)
     for name, state in stopped.items():
         if name in finished:
-            assert all(written(tmp_path / name)[path] == when for path, when in before.items() if name in path.parts)
+            assert all(written(tmp_path / name)[path] == mtime for path, mtime in before.items() if name in path.parts)
         elif state["step"]:
             assert f"{name} continues after step {state['step']}" in lines
     ended = states(tmp_path)
@@ -323,7 +326,7 @@ def test_a_sweep_that_ctrl_c_stopped_is_continued(people, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_runs_on_a_dask_cluster_are_those_of_this_machine(swept, data, people, tmp_path, capsys):
+def test_runs_on_a_dask_cluster_equal_local_runs(swept, data, people, tmp_path, capsys):
     distributed = pytest.importorskip("distributed")
     out, _, _ = swept
     options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
@@ -338,6 +341,6 @@ def test_runs_on_a_dask_cluster_are_those_of_this_machine(swept, data, people, t
     assert states(tmp_path / "command")["vae-seed0"]["status"] == "finished"
 
 
-def test_a_result_reads_as_a_line(tmp_path):
+def test_a_result_prints_as_one_line(tmp_path):
     result = Outcome(tmp_path / "vae-seed0", VAE, 0, "stopped early", 300, -1.25, "the best", 61.4)
     assert str(result) == "vae-seed0 stopped early at step 300 in 0:01:01, the best"

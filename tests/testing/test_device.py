@@ -1,4 +1,4 @@
-"""Steps and evaluations of every method on a GPU, or, without one, on a device that is only said to be one."""
+"""Steps and evaluations of every method on a GPU, or without one on a stand-in device."""
 
 import warnings
 from dataclasses import replace
@@ -43,21 +43,21 @@ SMALL = {
     **{n: {**DENSE, "modes": 3, "sampler_width": 8, "sampler_hidden": (8,)} for n in ("dlow", "dsf")},
 }
 STEP = {
-    "program/batch.py": 1,  # one verdict on the whole batch: values finite and in the support, lengths valid
-    "training/svi.py": 1,  # loss and norm of the gradient, by which a step is taken, clipped or refused
+    "program/batch.py": 1,  # one check of the whole batch: finite values in the support, valid lengths
+    "training/svi.py": 1,  # loss and gradient norm decide whether a step is taken, clipped or an error
 }
-"""For what any step waits, and how often."""
+"""Number of synchronisations of each step, by file."""
 BESIDE = {
     "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of each coupling
-    "hit-dvae": {"scoring/energies.py": 1},  # how many futures are admissible is a shape
+    "hit-dvae": {"scoring/energies.py": 1},  # the number of admissible futures is a shape
     "gsps": {"scoring/energies.py": 1},
-    "dlow": {"program/groups.py": 1, "motion/modes.py": 1},  # how many windows there are, and that histories recur
+    "dlow": {"program/groups.py": 1, "motion/modes.py": 1},  # the number of windows, and repeated histories
     "dsf": {"motion/modes.py": 1},
-    "mix-and-match": {"program/rollout.py": 1},  # which frames chance has fed, so that a loop passes over the others
-    "motion-latent": {"training/gradnorm.py": 1},  # losses and gradients' norms, by which the weights adapt
+    "mix-and-match": {"program/rollout.py": 1},  # which frames are sampled, so that a loop skips the others
+    "motion-latent": {"training/gradnorm.py": 1},  # losses and gradient norms, which determine the weights
 }
 BROUGHT = {"mix-and-match": 1}
-"""Tensors brought to the device in a step, beside the batch: the indices that all sequences share."""
+"""Tensors uploaded in each step in addition to the batch: indices shared by all sequences."""
 
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU is here")
@@ -74,8 +74,8 @@ def segments():
 
 
 @pytest.fixture
-def trained(request, people):
-    """By the name of a method: a small model of it, its recipe, and its windows for training and for testing."""
+def small_method(request, people):
+    """Return a function of a method's name: a small model, its recipe, training windows and test windows."""
 
     def make(name):
         torch.manual_seed(0)
@@ -97,7 +97,7 @@ def trained(request, people):
 
 
 def two_steps(model, recipe, before_the_second=lambda: None, accelerator="cpu"):
-    """The terms of two steps of the recipe, the number of tensors of the batch, and what took them."""
+    """Return the terms of two steps of the recipe, the number of tensors in the batch, and the SVI loop."""
     options = {"steps": 4, "scheduled_sampling": recipe.feeding, "accelerator": accelerator, "progress": False}
     svi = dvae.SVI(model, stages=recipe.stages, **options)
     svi.init()
@@ -113,20 +113,20 @@ def numbers(terms):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_method_stays_on_its_device_and_a_step_waits_for_it_as_often_as_is_said(name, trained, monkeypatch):
-    """What it does there is what it does on the processor: training, validation, forecasts and their scores."""
-    model, recipe, _, _ = trained(name)
+def test_a_step_on_a_device_equals_the_cpu_with_the_listed_synchronizations(name, small_method, monkeypatch):
+    """Training, validation, forecasts and scores equal those on the CPU."""
+    model, recipe, _, _ = small_method(name)
     expected, _, _ = two_steps(model.double(), recipe)
-    model, recipe, train, test = trained(name)
+    model, recipe, train, test = small_method(name)
     monkeypatch.setattr(SingleDeviceStrategy, "root_device", OnDevice.device)
     monkeypatch.setattr(CPUAccelerator, "setup_device", lambda *_: None)
     with on_device() as traffic:
-        found, tensors, svi = two_steps(move(model.double()), recipe, traffic.clear)
-        places = [read.partition(":")[0] for read in traffic.reads]
+        terms, tensors, svi = two_steps(move(model.double()), recipe, traffic.clear)
+        places = [entry.partition(":")[0] for entry in traffic.reads]
         assert {place: places.count(place) for place in places} == STEP | BESIDE.get(name, {}), traffic.reads
         assert len(traffic.uploads) == tensors + BROUGHT.get(name, 0), traffic.uploads
         validate_and_score(svi, train, test)
-        assert_same(found, expected)
+        assert_same(terms, expected)
 
 
 def validate_and_score(svi, train, test):
@@ -136,31 +136,31 @@ def validate_and_score(svi, train, test):
         dvae.evaluate(svi.model, test, batch_size=500, bound_particles=2 * svi.model.likelihood, **options)
 
 
-def assert_same(found, expected):
-    """The terms of steps there and here."""
-    for there, here in zip(found, expected, strict=True):
-        got = {key: value.cpu() for key, value in numbers(there).items()}
+def assert_same(terms, expected):
+    """Compare the terms of steps on the device and on the CPU."""
+    for on_device_terms, here in zip(terms, expected, strict=True):
+        got = {key: value.cpu() for key, value in numbers(on_device_terms).items()}
         torch.testing.assert_close(got, numbers(here), rtol=1e-9, atol=1e-9)
 
 
 @on_gpu
 @pytest.mark.parametrize("name", METHODS)
-def test_a_gpu_does_what_the_processor_does(name, trained):
-    """In double precision, with the processor's noise."""
-    model, recipe, _, _ = trained(name)
+def test_a_step_on_a_gpu_equals_the_cpu(name, small_method):
+    """Compare in double precision, with the noise of the CPU."""
+    model, recipe, _, _ = small_method(name)
     expected, _, _ = two_steps(model.double(), recipe)
-    model, recipe, train, test = trained(name)
+    model, recipe, train, test = small_method(name)
     with SameNoise():
-        found, _, svi = two_steps(model.double(), recipe, accelerator="cuda")
+        terms, _, svi = two_steps(model.double(), recipe, accelerator="cuda")
     validate_and_score(svi, train, test)
-    assert_same(found, expected)
+    assert_same(terms, expected)
 
 
 @on_gpu
 @pytest.mark.parametrize("name", METHODS)
-def test_a_step_waits_for_a_gpu_as_often_as_for_the_stand_in(name, trained):
-    """CUDA itself tells when it is waited for, as it is with a tensor that is brought, but not with the batch."""
-    model, recipe, _, _ = trained(name)
+def test_a_gpu_synchronizes_as_often_as_the_stand_in(name, small_method):
+    """CUDA reports synchronisations, including those for uploaded tensors other than the batch."""
+    model, recipe, _, _ = small_method(name)
 
     def listen():
         waited.clear()
@@ -172,16 +172,18 @@ def test_a_step_waits_for_a_gpu_as_often_as_for_the_stand_in(name, trained):
             two_steps(model, recipe, listen, accelerator="cuda")
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    told = [f"{each.filename}:{each.lineno}" for each in waited if "synchronizing CUDA" in str(each.message)]
-    assert len(told) == sum((STEP | BESIDE.get(name, {})).values()) + BROUGHT.get(name, 0), told
+    synchronizations = [
+        f"{warning.filename}:{warning.lineno}" for warning in waited if "synchronizing CUDA" in str(warning.message)
+    ]
+    assert len(synchronizations) == sum((STEP | BESIDE.get(name, {})).values()) + BROUGHT.get(name, 0), synchronizations
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=on_gpu)])
 @pytest.mark.parametrize("name", METHODS)
-def test_terms_have_the_precision_of_the_model_under_autocast(name, device, trained):
-    """A bound in mixed precision is off by no more than weights would have it be that have bfloat16's digits."""
-    model, recipe, _, _ = trained(name)
-    model.train(name == "gsps").requires_grad_(False).to(device)  # which normalises over a batch
+def test_terms_have_the_precision_of_the_model_under_autocast(name, device, small_method):
+    """The error in mixed precision is at most the error due to rounding the weights to bfloat16."""
+    model, recipe, _, _ = small_method(name)
+    model.train(name == "gsps").requires_grad_(False).to(device)  # gsps normalises over a batch
     batch = on_device_of(model, recipe.batches.sample(3, torch.Generator().manual_seed(1)))
     drawing = {"draws": recipe.objective.draws} if getattr(recipe.objective, "draws", None) else {}
 
@@ -189,53 +191,55 @@ def test_terms_have_the_precision_of_the_model_under_autocast(name, device, trai
         torch.manual_seed(3)
         return dvae.SequenceELBO().terms(model, batch, **drawing)
 
-    def value(found):
-        return float((found.bound - sum(found.energies.values())).double().sum())
+    def value(result_terms):
+        return float((result_terms.bound - sum(result_terms.energies.values())).double().sum())
 
     exact = value(terms())
     with torch.autocast(device, torch.bfloat16):
-        mixed = terms()
-    assert {part.dtype for part in (mixed.bound, mixed.frames, *numbers(mixed).values())} == {torch.float32}
+        mixed_terms = terms()
+    assert {part.dtype for part in (mixed_terms.bound, mixed_terms.frames, *numbers(mixed_terms).values())} == {
+        torch.float32
+    }
     weights, squares = [parameter.clone() for parameter in model.parameters()], []
     for seed in range(4):
         torch.manual_seed(seed)
         for parameter, weight in zip(model.parameters(), weights, strict=True):
             parameter.copy_(weight * (1 + 2**-8 * torch.randn_like(weight)))
         squares.append((value(terms()) - exact) ** 2)
-    assert abs(value(mixed) - exact) <= 4 * (sum(squares) / len(squares)) ** 0.5
+    assert abs(value(mixed_terms) - exact) <= 4 * (sum(squares) / len(squares)) ** 0.5
 
 
-def drawn(cell):
-    """The chain of an SRNN's guide, or of a VRNN's with its LSTM."""
+def recurrent_chain(cell):
+    """Return the chain of an SRNN's guide, or of a VRNN's guide with its LSTM, and its inputs."""
     base, noise, gates = (torch.randn(5, 2, size).to("cuda") for size in (4, 3, 24))
     sizes = (24, 9), (4, 6 if cell else 3), (6, 4), (6,)
     recurrent, first, out, bias = (torch.randn(*shape).to("cuda") for shape in sizes)
-    given = [value.requires_grad_() for value in (base, gates, recurrent, first, out, bias)]
+    inputs = [value.requires_grad_() for value in (base, gates, recurrent, first, out, bias)]
     layers, state = [(first, None), (out, bias)], (gates, recurrent) if cell else None
-    return lambda: gaussian_chain(base, noise, layers, cell=state), given
+    return lambda: gaussian_chain(base, noise, layers, cell=state), inputs
 
 
-def filtered(steps):
-    """A Kalman filter, of so many steps."""
+def kalman_filter(steps):
+    """Return a Kalman filter over so many steps, and its inputs."""
     one, mean = torch.eye(2).to("cuda"), torch.zeros(1, 2).to("cuda")
     transition, information = (0.5 * one.expand(n, 1, 2, 2) for n in (steps - 1, steps))
     offset, potential = (torch.randn(n, 1, 2).to("cuda") for n in (steps - 1, steps))
-    given = [value.requires_grad_() for value in (transition, offset, potential)]
+    inputs = [value.requires_grad_() for value in (transition, offset, potential)]
     chain = LinearGaussianChain(transition, offset, one, mean, one[None], information, potential)
-    return lambda: replace(chain).predicted, given
+    return lambda: replace(chain).predicted, inputs
 
 
 @pytest.mark.parametrize(
     ("loop", "option"),
-    [(drawn, False), (drawn, True), (filtered, 6), (filtered, 200)],
+    [(recurrent_chain, False), (recurrent_chain, True), (kalman_filter, 6), (kalman_filter, 200)],
     ids=["chain", "chain with a cell", "filter", "filter in blocks"],
 )
-def test_a_loop_over_time_waits_for_nothing_and_brings_nothing(loop, option):
-    """As it has to, to be captured as a graph: it goes by its arguments alone, forward and backward."""
+def test_a_loop_over_time_neither_synchronizes_nor_uploads(loop, option):
+    """Capture as a CUDA graph requires this, forward and backward."""
     with on_device() as traffic:
-        run, given = loop(option)
+        run, inputs = loop(option)
         traffic.clear()
-        torch.autograd.grad(sum(part.sum() for part in run() if part is not None), given, allow_unused=True)
+        torch.autograd.grad(sum(part.sum() for part in run() if part is not None), inputs, allow_unused=True)
         assert not traffic.reads
         assert not traffic.uploads
 
@@ -263,26 +267,26 @@ class TestOnDevice:
             (lambda x: torch.arange(3, device=x.device) * x, 0, 0),
         ],
     )
-    def test_it_lists_what_is_brought_and_waited_for(self, run, reads, uploads):
+    def test_it_lists_uploads_and_synchronizations(self, run, reads, uploads):
         expected = run(self.here)
         with on_device() as traffic:
             x = self.here.to("cuda")
             traffic.clear()
-            found = run(x)
+            output = run(x)
             assert (len(traffic.reads), len(traffic.uploads)) == (reads, uploads)
             assert all(place.startswith("testing/test_device.py:") for place in (*traffic.reads, *traffic.uploads))
-            as_here = [value.cpu() if isinstance(value, torch.Tensor) else value for value in tree_leaves(found)]
+            as_here = [value.cpu() if isinstance(value, torch.Tensor) else value for value in tree_leaves(output)]
         torch.testing.assert_close(as_here, tree_leaves(expected))
 
     @pytest.mark.parametrize(
         "run",
         [lambda x: x + torch.ones(3), lambda x: torch.cat([x, torch.zeros(2, 3)])],
     )
-    def test_it_refuses_what_is_on_both_sides(self, run):
+    def test_mixing_devices_is_an_error(self, run):
         with on_device(), pytest.raises(RuntimeError, match=r"on cuda:127 and on the CPU \("):
             run(self.here.to("cuda"))
 
-    def test_gradients_are_those_of_the_processor(self):
+    def test_gradients_equal_those_on_the_cpu(self):
         lstm = torch.nn.LSTM(3, 4, batch_first=True)
         x = torch.randn(2, 5, 3)
         expected = torch.autograd.grad(lstm(x)[0].square().sum(), list(lstm.parameters()))
@@ -291,21 +295,27 @@ class TestOnDevice:
             assert not traffic.reads
             torch.testing.assert_close([p.grad.cpu() for p in lstm.parameters()], list(expected))
 
-    def test_the_same_noise_is_the_processors(self):
+    def test_same_noise_is_that_of_the_cpu(self):
         def noise(device):
             torch.manual_seed(1)
-            made = torch.randn(3, device=device)
-            moved = torch.empty(3).to(device).uniform_()
-            return [made, moved, torch.bernoulli(moved), torch.randperm(4, device=device), torch.normal(made, moved)]
+            normal = torch.randn(3, device=device)
+            uniform = torch.empty(3).to(device).uniform_()
+            return [
+                normal,
+                uniform,
+                torch.bernoulli(uniform),
+                torch.randperm(4, device=device),
+                torch.normal(normal, uniform),
+            ]
 
         expected = noise("cpu")
         with on_device(), SameNoise():
-            found = noise("cuda")
-            assert all(isinstance(value, OnDevice) for value in found)
-            found = [value.cpu() for value in found]
-        torch.testing.assert_close(found, expected, rtol=0, atol=0)
+            values = noise("cuda")
+            assert all(isinstance(value, OnDevice) for value in values)
+            values = [value.cpu() for value in values]
+        torch.testing.assert_close(values, expected, rtol=0, atol=0)
 
-    def test_it_is_there_within_alone(self):
+    def test_use_outside_the_block_is_an_error(self):
         with on_device():
             x = self.here.to("cuda")
         with pytest.raises(RuntimeError, match="exists only in a block of on_device"):

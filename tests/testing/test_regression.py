@@ -1,4 +1,4 @@
-"""elbo_regression: the rate of its false alarms, its power, its records, and the plugin that brings it."""
+"""`elbo_regression`: its rate of false alarms, power, records, and the pytest plugin."""
 
 import json
 import math
@@ -39,13 +39,13 @@ def regression(folder, notes=None, test="test_it", **options):
 
 
 def repeated(model, x, times, particles, seed):
-    """Records of independent measurements of the same bounds."""
+    """Return records of independent measurements of the same bounds."""
     bounds = measure(model.model, model.guide, x.repeat(times, 1, 1), particles, seed)
     return [Record.of(part, {}) for part in np.split(bounds, times, axis=1)]
 
 
 def worsen(model, by):
-    """The model with a guide whose scales are exp(by) times as large."""
+    """Return the model with a guide whose scales are exp(by) times as large."""
     other = linear_gaussian_surrogate(*PAIR, {"z": 1, "x": 1}, 3)
     other.load_state_dict(model.state_dict())
     with torch.no_grad():
@@ -57,19 +57,19 @@ def worsen(model, by):
 
 
 @pytest.mark.parametrize("particles", [20, 100])
-def test_false_alarms_are_rare_where_skewed_draws_become_exact(particles):
-    """Of one sequence, as where a sampled KL becomes analytic: old draws miss a long lower tail, or upper one."""
+def test_false_alarms_are_rare_after_skewed_draws_become_exact(particles):
+    """With one sequence, as if a sampled KL became analytic: old draws have a long lower or upper tail."""
     n, alpha = 1000, 0.01
     old = np.exp(1.5 * np.random.default_rng(0).normal(size=(n, particles))) - math.exp(1.125)
     exact = Record(np.zeros(1), np.zeros(1), np.zeros(particles), {})
     for sign in (-1, 1):
-        found = [Change(Record(row[:1], row[:1], row, {}), exact, alpha) for row in sign * old]
-        for alarms in ([change.worse for change in found], [change.better for change in found]):
+        changes = [Change(Record(row[:1], row[:1], row, {}), exact, alpha) for row in sign * old]
+        for alarms in ([change.worse for change in changes], [change.better for change in changes]):
             assert np.mean(alarms) < 2 * alpha + 4 * math.sqrt(alpha / n)
 
 
 @pytest.mark.parametrize(("particles", "coupling", "noise"), [(4, -1.0, 1e-2), (4, 0.0, 1e2), (100, 0.9, 1e-2)])
-def test_false_alarms_are_as_rare_however_draws_are_coupled_and_sequences_spread(particles, coupling, noise):
+def test_false_alarms_are_rare_for_every_coupling_and_spread(particles, coupling, noise):
     random = np.random.default_rng(0)
     n, alpha, size = 2000, 0.05, 5
     level = random.normal(scale=10.0, size=size)  # of the sequences
@@ -83,33 +83,33 @@ def test_false_alarms_are_as_rare_however_draws_are_coupled_and_sequences_spread
     assert np.mean(alarms) < alpha + 4 * math.sqrt(alpha * (1 - alpha) / n)
 
 
-def test_the_note_tells_the_fall_that_is_found_nine_times_in_ten(tmp_path, exact):
-    """By simulation of the test, for draws that have nothing in common."""
+def test_the_noted_loss_is_found_with_probability_ninety_percent(tmp_path, exact):
+    """Simulate the test with independent draws."""
     model, x, _ = exact
     notes, particles, n = [], 100, 1000
     regression(tmp_path, notes).check(model.model, model.guide, x, particles=particles, alpha=0.05)
     fall = float(re.search(r"a loss of (\S+) would be detected with probability 0.9", notes[0])[1])
     scale = Record.loads((tmp_path / "test_it.json").read_text()).mean_error * math.sqrt(particles)
     old, new = np.random.default_rng(0).normal(scale=scale, size=(2, n, particles, 1))
-    found = [Change(Record.of(a, {}), Record.of(b - fall, {}), 0.05).worse for a, b in zip(old, new, strict=True)]
-    assert 0.88 < np.mean(found) < 0.97
+    detections = [Change(Record.of(a, {}), Record.of(b - fall, {}), 0.05).worse for a, b in zip(old, new, strict=True)]
+    assert 0.88 < np.mean(detections) < 0.97
 
 
-def test_a_worse_guide_is_found_as_often_as_its_nats_and_their_error_say(exact):
+def test_the_power_equals_the_noncentral_t_formula(exact):
     model, x, oracle = exact
     n, alpha, particles = 500, 0.05, 40
     poor = worsen(model, 0.15)
     fall = (Oracle(poor, 3).bound(x) - oracle.bound(x)).mean().item()
     assert fall < 0
     pairs = zip(repeated(model, x, n, particles, seed=1), repeated(poor, x, n, particles, seed=2), strict=True)
-    found = [Change(old, new, alpha) for old, new in pairs]
-    differences = np.array([change.difference for change in found])
+    changes = [Change(old, new, alpha) for old, new in pairs]
+    differences = np.array([change.difference for change in changes])
     error = differences.std()
     assert abs(differences.mean() - fall) < 4 * error / math.sqrt(n)
-    assert np.mean([change.error for change in found]) == pytest.approx(error, rel=0.15)
+    assert np.mean([change.error for change in changes]) == pytest.approx(error, rel=0.15)
     power = stats.nct.cdf(stats.t.ppf(alpha, particles - 1), particles - 1, fall / error)
     assert 0.2 < power < 0.99
-    rate = np.mean([change.worse for change in found])
+    rate = np.mean([change.worse for change in changes])
     assert abs(rate - power) < 4 * math.sqrt(power * (1 - power) / n)
 
 
@@ -124,7 +124,7 @@ def test_coupled_draws_find_a_loss_below_the_error_of_either_bound(tmp_path, exa
     assert abs(change.difference - fall) < 5 * change.error
 
 
-def test_one_random_number_more_uncouples_one_draw_only():
+def test_an_additional_random_number_uncouples_one_draw_only():
     x, more = torch.linspace(-1, 2, 6, dtype=torch.float64), []
     model, guide = normal(0.3, 0.9)
 
@@ -138,7 +138,7 @@ def test_one_random_number_more_uncouples_one_draw_only():
     assert (after[0] != before[0]).all()
 
 
-def test_rounding_is_no_fall_and_an_exact_bound_needs_no_error():
+def test_rounding_is_no_loss_and_an_exact_bound_has_no_error():
     def compare(fall):
         old = Record.of(np.full((10, 3), -1000.0), {})
         return Change(old, Record.of(np.full((10, 3), -1000.0 - fall), {}), 0.001)
@@ -172,18 +172,18 @@ def test_the_first_use_writes_and_the_same_model_passes(tmp_path, exact):
     assert stored.mean == pytest.approx(stored.bound.mean(), abs=1e-5)
 
 
-def test_a_fall_is_told_with_the_worst_sequences(tmp_path, exact):
+def test_a_loss_is_an_error_that_lists_the_worst_sequences(tmp_path, exact):
     model, x, _ = exact
     regression(tmp_path).check(model.model, model.guide, x)
     poor = worsen(model, 1.0)
-    with pytest.raises(AssertionError) as caught:
+    with pytest.raises(AssertionError) as error:
         regression(tmp_path).check(poor.model, poor.guide, x)
-    text = str(caught.value)
-    said = ("fell significantly", "old  ", "new  ", "difference  -", "standard error", "--update-elbo and commit")
-    assert all(part in text for part in said)
-    listed = re.findall(r"^ +(\d) +\S+ +\S+ +(-\S+) +\S+$", text, re.MULTILINE)
-    assert sorted(int(i) for i, _ in listed) == [0, 1, 2, 3]
-    assert [float(d) for _, d in listed] == sorted(float(d) for _, d in listed)
+    text = str(error.value)
+    parts = ("fell significantly", "old  ", "new  ", "difference  -", "standard error", "--update-elbo and commit")
+    assert all(part in text for part in parts)
+    rows = re.findall(r"^ +(\d) +\S+ +\S+ +(-\S+) +\S+$", text, re.MULTILINE)
+    assert sorted(int(i) for i, _ in rows) == [0, 1, 2, 3]
+    assert [float(d) for _, d in rows] == sorted(float(d) for _, d in rows)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_a_fall_is_told_with_the_worst_sequences(tmp_path, exact):
         (lambda batch: {"x": batch["x"]}, "it has lengths, x, the test has x"),
     ],
 )
-def test_other_data_are_refused(tmp_path, exact, change, message):
+def test_other_data_are_an_error(tmp_path, exact, change, message):
     model, x, _ = exact
     batch = {"x": x, "lengths": torch.tensor([3, 3, 3, 3])}
     regression(tmp_path).check(model.model, model.guide, batch, particles=5)
@@ -202,7 +202,7 @@ def test_other_data_are_refused(tmp_path, exact, change, message):
         regression(tmp_path).check(model.model, model.guide, change(batch), particles=5)
 
 
-def test_small_sequences_are_known_beside_large_ones(tmp_path, exact):
+def test_small_changes_are_detected_next_to_large_sequences(tmp_path, exact):
     model, x, _ = exact
     x = x * torch.tensor([1e6, 1.0, 0.0, 1.0], dtype=torch.float64)[:, None, None]
     regression(tmp_path).check(model.model, model.guide, x, particles=5)
@@ -216,7 +216,7 @@ def test_small_sequences_are_known_beside_large_ones(tmp_path, exact):
     ("text", "message"),
     [("[]", "TypeError"), ("{}", "KeyError"), ("<<<<<<< HEAD\n{}", "not a record of bounds")],
 )
-def test_a_damaged_record_is_refused_and_can_be_renewed(tmp_path, exact, text, message):
+def test_a_damaged_record_is_an_error_and_can_be_renewed(tmp_path, exact, text, message):
     model, x, _ = exact
     (tmp_path / "test_it.json").write_text(text)
     with pytest.raises(ValueError, match=f"damaged .*{message}"):
@@ -225,7 +225,7 @@ def test_a_damaged_record_is_refused_and_can_be_renewed(tmp_path, exact, text, m
     regression(tmp_path).check(model.model, model.guide, x, particles=3)
 
 
-def test_what_cannot_be_compared_is_refused(tmp_path, exact):
+def test_wrong_arguments_are_errors(tmp_path, exact):
     model, x, _ = exact
     check = regression(tmp_path).check
     with pytest.raises(ValueError, match="particles must be at least 2"):
@@ -250,7 +250,7 @@ def test_a_record_has_one_owner(tmp_path, exact):
             other.check(model.model, model.guide, x, name="same", particles=3)
 
 
-# ------------------------------------------------------------------------------------------------- pairs of one's own
+# ------------------------------------------------------------------------------------------- custom models and bounds
 
 
 def normal(location, scale, dim=-1):
@@ -268,8 +268,8 @@ def normal(location, scale, dim=-1):
     return model, guide
 
 
-def test_another_bound_is_held_by_its_own_draws(tmp_path):
-    """With particles there is less to lose by a guide that is too wide than the ELBO loses, and it is found as well."""
+def test_another_bound_is_tested_by_its_own_draws(tmp_path):
+    """With particles, a wide guide loses less than in the ELBO, and the loss is still found."""
     model = linear_gaussian_surrogate(*PAIR, {"z": 1, "x": 1}, 3)
     Oracle(model, 3).fit_guide()
     x = model.sample(4, 3)["x"]
@@ -291,7 +291,7 @@ def test_another_bound_is_held_by_its_own_draws(tmp_path):
         regression(tmp_path).check(model.model, model.guide, x, bound=lambda data, seed: torch.zeros(3))
 
 
-def test_bounds_are_one_for_each_sequence_and_finite(tmp_path):
+def test_bounds_must_be_finite_and_one_per_sequence(tmp_path):
     x = torch.linspace(-1, 2, 6)
     with pytest.raises(ValueError, match=r"the bound is \(3,\), expected one for each sequence; data have \[2\] rows"):
         regression(tmp_path).check(
@@ -309,7 +309,7 @@ def test_bounds_are_one_for_each_sequence_and_finite(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_bounds_are_those_of_evaluation_mode(tmp_path):
+def test_bounds_are_computed_in_evaluation_mode(tmp_path):
     model = DynamicalVAE(*PAIR, {"z": 1, "x": 1}, networks.Recurrent(3, hidden=(3,)))
     model.encoder["z"].register_forward_pre_hook(lambda module, _: None if not module.training else 1 / 0)
     model.train()
@@ -351,7 +351,7 @@ def run(pytester, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_life_of_a_record(pytester, run):
+def test_a_record_is_created_checked_and_updated(pytester, run):
     result = run(1.5, "--elbo-strict")
     result.assert_outcomes(failed=2)
     result = run(1.5)
@@ -369,7 +369,7 @@ def test_the_life_of_a_record(pytester, run):
     result.stdout.fnmatch_lines(
         ["E*the evidence bound fell significantly", "E*worst of 2 sequences:", "E*--update-elbo*"]
     )
-    result.stdout.no_fnmatch_line("*regression.py:*")  # the traceback ends at the user's line
+    result.stdout.no_fnmatch_line("*regression.py:*")  # the traceback ends in the user's test
 
     result = run(0.7)
     result.assert_outcomes(passed=2)
@@ -400,7 +400,7 @@ def test_pytest_finds_the_plugin_and_does_not_wait_for_torch():
 
 
 def test_the_price_of_a_mean_field_guide(elbo_regression):
-    """The best mean-field guide of a fixed model: its bound is the same wherever it is computed."""
+    """The best mean-field guide of a fixed model has the same bound on every machine."""
     model = linear_gaussian_surrogate("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 6)
     with torch.no_grad():
         for parameter in model.generator.parameters():
@@ -418,7 +418,7 @@ def test_the_documented_examples_run(pytester):
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "testing.md").read_text(encoding="utf-8"), re.DOTALL)
     pytester.makepyfile(test_documented="\n".join(blocks))
     pytester.makeconftest("from dvae.testing import FactorizationContract as contract\ncontract.training_steps = 2")
-    # in a process of its own: training loads modules of torch that a process can load only once
+    # in a separate process: training loads modules of torch that a process can load only once
     result = pytester.runpytest_subprocess("-p", "dvae.testing.plugin", "-W", "error")
     gpu = torch.cuda.is_available()
     result.assert_outcomes(passed=18 + gpu, skipped=1 - gpu)

@@ -1,4 +1,4 @@
-"""Bounds: agreement with Pyro's own, terms that add up, weights that are diagnosed, misuse that is refused."""
+"""Bounds: agreement with Pyro, sums of terms, importance weights and missing entries."""
 
 import pyro
 import pytest
@@ -27,7 +27,7 @@ def data(**more):
 
 
 def mean_field_loss(model, batch):
-    """Pyro's own: TraceMeanField_ELBO, for which a Sequence's conditionals at its value are plain normals."""
+    """Return the loss of Pyro's TraceMeanField_ELBO, with normals for the conditionals of a sequence."""
     guide_trace = poutine.trace(model.guide).get_trace(batch)
     model_trace = poutine.trace(poutine.replay(model.model, trace=guide_trace)).get_trace(batch)
     for trace in (guide_trace, model_trace):
@@ -44,22 +44,22 @@ def mean_field_loss(model, batch):
 
 
 @pytest.mark.parametrize(("network", "extra"), [("attention", {}), ("recurrent", {"lengths": torch.tensor([5, 2, 1])})])
-def test_the_bound_is_trace_mean_fields(network, extra):
+def test_the_bound_equals_trace_mean_field(network, extra):
     model, batch = build(network), data(**extra)
     pyro.set_rng_seed(4)
-    theirs = mean_field_loss(model, batch)
+    expected = mean_field_loss(model, batch)
     pyro.set_rng_seed(4)
-    ours = SequenceELBO().differentiable_loss(model.model, model.guide, batch)
-    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-9)
+    loss = SequenceELBO().differentiable_loss(model.model, model.guide, batch)
+    torch.testing.assert_close(loss, expected, rtol=0, atol=1e-9)
     for a, b in zip(
-        torch.autograd.grad(ours, list(model.parameters()), retain_graph=True),
-        torch.autograd.grad(theirs, list(model.parameters())),
+        torch.autograd.grad(loss, list(model.parameters()), retain_graph=True),
+        torch.autograd.grad(expected, list(model.parameters())),
         strict=True,
     ):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-8)
 
 
-def test_it_is_a_pyro_elbo():
+def test_pyro_accepts_the_bound_as_an_elbo():
     model, batch = build(), data()
 
     def seeded(run):
@@ -73,17 +73,17 @@ def test_it_is_a_pyro_elbo():
     assert all(p.grad is not None for p in model.parameters())
 
 
-def test_particles_average_to_pyros_trace_elbo():
-    """A Student t prior has no closed form, and its KL is a log-ratio then."""
+def test_the_mean_over_particles_is_pyros_trace_elbo():
+    """A Student t prior has no analytic KL, so its KL is a log-ratio."""
     model, batch = build(distributions={"p(x)": distributions.Normal(), "p(z)": distributions.StudentT()}), data()
     n = 150
     with torch.no_grad():
-        ours = torch.stack([SequenceELBO().terms(model, batch).bound.sum() for _ in range(n)])
-        theirs = -torch.tensor([Trace_ELBO().loss(model.model, model.guide, batch) for _ in range(n)])
-        error = ((ours.var() + theirs.var()) / n).sqrt()
+        bounds = torch.stack([SequenceELBO().terms(model, batch).bound.sum() for _ in range(n)])
+        expected = -torch.tensor([Trace_ELBO().loss(model.model, model.guide, batch) for _ in range(n)])
+        error = ((bounds.var() + expected.var()) / n).sqrt()
         many = SequenceELBO(num_particles=n).terms(model, batch).bound.sum()
-    assert abs(ours.mean() - theirs.mean()) < 5 * error
-    assert abs(many - ours.mean()) < 5 * (2 * ours.var() / n).sqrt()
+    assert abs(bounds.mean() - expected.mean()) < 5 * error
+    assert abs(many - bounds.mean()) < 5 * (2 * bounds.var() / n).sqrt()
 
 
 # ------------------------------------------------------------------------------------------------------------- terms
@@ -106,7 +106,7 @@ def test_steps_sum_to_terms_and_terms_to_the_bound():
     assert all((steps[pad] == 0).all() for steps in terms.steps.values())
 
 
-def test_penalties_of_a_wrapping_model_are_energies_and_no_part_of_the_bound():
+def test_penalties_of_a_wrapping_model_are_energies_outside_the_bound():
     model, batch = build(), data()
     penalty = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
 
@@ -131,7 +131,7 @@ def test_penalties_of_a_wrapping_model_are_energies_and_no_part_of_the_bound():
 # ------------------------------------------------------------------------------------------------ importance weights
 
 
-def test_khat_is_the_shape_of_a_pareto_tail_and_needs_25_particles():
+def test_khat_is_the_shape_of_a_pareto_tail_from_25_particles():
     exponential = -torch.rand(20_000, 20, dtype=torch.float64).log()
     for shape in (0.3, 0.9):
         assert abs(_khat(shape * exponential).mean() - shape) < 0.1
@@ -143,18 +143,21 @@ def test_khat_is_the_shape_of_a_pareto_tail_and_needs_25_particles():
 # ------------------------------------------------------------------------------------------------- missing entries
 
 
-def hiding(steps, *hidden):
-    seen = torch.ones(1, steps, 1, dtype=torch.bool)
-    seen[:, list(hidden)] = False
-    return seen
+def hide_entries(steps, *hidden):
+    mask = torch.ones(1, steps, 1, dtype=torch.bool)
+    mask[:, list(hidden)] = False
+    return mask
 
 
 @pytest.mark.parametrize(
     "run",
-    [{"seen": hiding(4, 1, 2)}, {"fed": torch.tensor([[False, True, True, False]]), "feeding": ScheduledSampling(0.5)}],
+    [
+        {"seen": hide_entries(4, 1, 2)},
+        {"fed": torch.tensor([[False, True, True, False]]), "feeding": ScheduledSampling(0.5)},
+    ],
 )
 def test_a_backward_guide_has_no_analytic_kl_where_the_model_reads_its_own_means(run):
-    """p(z_t | x_{t-1}) reads a function of z_{t-1} then, which the guide drew from z_t."""
+    """p(z_t | x_{t-1}) then reads a function of z_{t-1}, and the guide draws z_{t-1} from z_t."""
     model = linear_gaussian_surrogate(
         "p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | z_{t+1}, x_{1:T})", {"z": 1, "x": 1}, 4, scale=1.5
     )

@@ -1,4 +1,4 @@
-"""The FIVO bound: unbiased for the evidence, the textbook's filter, and every network's state moved with it."""
+"""The FIVO bound: unbiased for the evidence, equal to a textbook filter, with resampled network states."""
 
 import math
 
@@ -76,8 +76,8 @@ CASES = [
 ]
 
 
-def bounded(pair, seed=1):
-    """A surrogate whose guide is the best of its factorization, spread a little: its weights have light tails."""
+def light_tailed_surrogate(pair, seed=1):
+    """Return a surrogate whose guide is the best of its factorization, slightly wider for light-tailed weights."""
     model = linear_gaussian_surrogate(*PAIRS[pair], dict.fromkeys(names(PAIRS[pair][0]), 1), T, seed, scale=0.5)
     Oracle(model, T).fit_guide(100)
     with torch.no_grad():
@@ -90,9 +90,11 @@ def bounded(pair, seed=1):
 
 
 @pytest.mark.parametrize("pair", ["vrnn", "static drawn last"])
-def test_it_is_unbiased_for_the_evidence(pair):
-    model = bounded(pair)
-    x = model.sample(500, T)["x"].mean(0, keepdim=True)  # data far out give heavy tails, and errors without meaning
+def test_the_bound_is_unbiased_for_the_evidence(pair):
+    model = light_tailed_surrogate(pair)
+    x = model.sample(500, T)["x"].mean(
+        0, keepdim=True
+    )  # improbable data give heavy-tailed weights, whose standard errors mean nothing
     with torch.no_grad():
         evidence = Oracle(model, T).evidence(x)
     n = 3000
@@ -103,14 +105,14 @@ def test_it_is_unbiased_for_the_evidence(pair):
         assert (out.resamplings > 0).any() == (resample_below > 0)
 
 
-def test_the_exact_posterior_never_resamples_and_gives_the_evidence():
+def test_the_exact_posterior_gives_the_evidence_without_resampling():
     model = linear_gaussian_surrogate(*PAIRS["srnn"], {"z": 1, "x": 2}, T)
     assert Oracle(model, T).fit_guide() < 1e-10
     x = model.sample(5, T)["x"]
     out = fivo_bound(model, x, 8, chunk=16)
     torch.testing.assert_close(out.bound, Oracle(model, T).evidence(x).detach(), rtol=0, atol=1e-3)
     assert (out.resamplings == 0).all()
-    # On the way the particles are weighed for x_{1:t}, but drawn for x_{1:T}: only at the end are their weights equal.
+    # Before the last step weights are for x_{1:t}, but draws are for x_{1:T}: weights are equal at the end only.
     assert (out.effective[-1] > 7.9999).all()
 
 
@@ -118,7 +120,7 @@ def test_the_exact_posterior_never_resamples_and_gives_the_evidence():
 
 
 def textbook(model, batch, particles, resample_below):
-    """The same filter with every conditional evaluated from scratch at every step, on draws moved by hand."""
+    """Run the same filter, evaluating every conditional from scratch at every step."""
     everyone = repeat(model.read(batch), particles)
     latents, n = {}, len(everyone["x"])
 
@@ -179,7 +181,7 @@ def textbook(model, batch, particles, resample_below):
 
 @torch.no_grad()
 @pytest.mark.parametrize(("pair", "kind", "extra"), CASES)
-def test_it_is_the_textbooks_filter(pair, kind, extra):
+def test_the_bound_equals_the_textbook_filter(pair, kind, extra):
     model = build(pair, kind)
     batch = data(model, **BATCHES[extra]())
     for below in (0.6, 1.0):
@@ -197,7 +199,7 @@ def test_it_is_the_textbooks_filter(pair, kind, extra):
 # ----------------------------------------------------------------------------------------------------------- networks
 
 
-def test_systematic_resampling_keeps_every_particle_about_as_often_as_it_weighs():
+def test_systematic_resampling_copies_particles_in_proportion_to_weights():
     log_weights = torch.randn(6, 4, dtype=torch.float64)
     log_weights[2, 1] = -math.inf
     share = log_weights.softmax(0)

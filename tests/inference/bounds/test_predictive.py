@@ -1,4 +1,4 @@
-"""The log score: unbiased for the density of the model's own forecasts, exact where guides are, a bound elsewhere."""
+"""The log score: an unbiased estimate of the model's forecast density, exact for exact guides."""
 
 import math
 
@@ -21,7 +21,7 @@ EXACT = ("p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t, x_{t-1})", {"z": 1, "x": 
 
 
 def wide(pair):
-    """A model with a guide that is near the posterior, but wider, so that weights are bounded and not equal."""
+    """Return a model whose guide is slightly wider than the posterior, so that weights are bounded."""
     model = linear_gaussian_surrogate(*pair, T)
     Oracle(model, T).fit_guide(15)
     with torch.no_grad():
@@ -37,23 +37,23 @@ def draws(model, n):
 
 
 def distribution(model, x):
-    """Means (B, H D) and covariance of forecasts of x (B, T, D): the guide given the past, then the model."""
-    whole, past = Oracle(model, T), Oracle(model, SEEN)
+    """Return the mean (B, H D) and covariance of forecasts of x (B, T, D), with latents of the past from the guide."""
+    oracle, past = Oracle(model, T), Oracle(model, SEEN)
     names = (*model.latents, *model.observed)
     steps = [T if model.generative.local(name) else 1 for name in names]
     counts = [s * model.sizes[n] for n, s in zip(names, steps)]
     blocks = torch.arange(sum(counts)).split(counts)
-    known = torch.cat([block[: min(s, SEEN) * model.sizes[n]] for n, s, block in zip(names, steps, blocks)])
+    given = torch.cat([block[: min(s, SEEN) * model.sizes[n]] for n, s, block in zip(names, steps, blocks)])
     future = blocks[-1][SEEN * model.sizes["x"] :]
-    mean, precision = (value.detach() for value in whole._joint())
+    mean, precision = (value.detach() for value in oracle._joint())
     covariance = torch.linalg.inv(precision)
-    gain = torch.linalg.solve(covariance[known][:, known], covariance[known][:, future]).T
-    rest = covariance[future][:, future] - gain @ covariance[known][:, future]
+    gain = torch.linalg.solve(covariance[given][:, given], covariance[given][:, future]).T
+    rest = covariance[future][:, future] - gain @ covariance[given][:, future]
     weights, offset, root = (value[0].detach() for value in past._guide())
-    seen = x[:, :SEEN].flatten(1)
-    latents = seen @ weights.T + offset
-    read = gain[:, : latents.shape[1]] @ root
-    return mean[future] + (torch.cat([latents, seen], 1) - mean[known]) @ gain.T, rest + read @ read.T
+    observed = x[:, :SEEN].flatten(1)
+    latents = observed @ weights.T + offset
+    spread = gain[:, : latents.shape[1]] @ root
+    return mean[future] + (torch.cat([latents, observed], 1) - mean[given]) @ gain.T, rest + spread @ spread.T
 
 
 def log_density(model, x):
@@ -62,17 +62,17 @@ def log_density(model, x):
 
 
 @pytest.mark.parametrize("pair", [DKF, DRIVEN])
-def test_weights_are_unbiased_for_the_density_of_forecasts_and_their_log_is_below_it(pair):
+def test_weights_are_unbiased_for_the_forecast_density_and_their_log_is_a_lower_bound(pair):
     model = wide(pair)
     x = draws(model, 1)
     exact = log_density(model, x)
-    found = torch.stack(
+    log_weights = torch.stack(
         [predictive_bound(model, x.expand(2000, -1, -1), SEEN, particles).bound - exact for particles in (1, 8)]
     )
-    ratios, error = found.exp().mean(1), found.exp().std(1) / math.sqrt(2000)
+    ratios, error = log_weights.exp().mean(1), log_weights.exp().std(1) / math.sqrt(2000)
     assert ((ratios - 1).abs() < 4 * error).all()
     assert (error < 0.1).all()
-    bias, noise = found.mean(1), found.std(1) / math.sqrt(2000)
+    bias, noise = log_weights.mean(1), log_weights.std(1) / math.sqrt(2000)
     assert (bias < 4 * noise).all()
     assert bias[0] + 4 * noise[0] < bias[1]  # more particles, less bias
 
@@ -86,17 +86,17 @@ def test_with_exact_guides_one_particle_gives_the_exact_predictive_density():
 
 
 @pytest.mark.parametrize(("pair", "last"), [(DKF, False), (DRIVEN, True)])
-def test_a_log_score_with_gaps_is_of_what_was_observed(pair, last):
-    """A marginal of the density of forecasts: exact where no x reads a gap, and the guide reads it as 0."""
+def test_a_log_score_with_missing_values_scores_observed_values(pair, last):
+    """The score is a marginal of the forecast density. It is exact if no x reads a missing value."""
     model = wide(pair)
     x, mask = draws(model, 1), torch.ones(1, T, 2).bool()
     mask[0, -1, 0] = False
     if not last:
         mask[0, 1, 0] = mask[0, 2, 1] = mask[0, 3, 1] = False
     mean, covariance = distribution(model, torch.where(mask, x, 0.0))
-    kept = mask[0, SEEN:].flatten()
-    marginal = torch.distributions.MultivariateNormal(mean[:, kept], covariance[kept][:, kept])
-    exact = marginal.log_prob(x[:, SEEN:].flatten(1)[:, kept])
+    observed = mask[0, SEEN:].flatten()
+    marginal = torch.distributions.MultivariateNormal(mean[:, observed], covariance[observed][:, observed])
+    exact = marginal.log_prob(x[:, SEEN:].flatten(1)[:, observed])
     batch = {"x": torch.where(mask, x, torch.nan).expand(2000, -1, -1), "mask": mask.expand(2000, -1, -1)}
     ratios = (predictive_bound(model, batch, SEEN, 8).bound - exact).exp()
     error = ratios.std() / math.sqrt(2000)
@@ -104,7 +104,7 @@ def test_a_log_score_with_gaps_is_of_what_was_observed(pair, last):
     assert error < 0.05
 
 
-def test_an_evaluation_has_it_in_nats_a_predicted_frame():
+def test_an_evaluation_reports_the_log_score_in_nats_per_predicted_frame():
     model = linear_gaussian_surrogate(*DKF, T)
     x = draws(model, 6)
     windows = ArrayWindows(x, SEEN)

@@ -1,4 +1,4 @@
-"""The probe: forecasts with latents from elsewhere, by which one sees whether a model listens to them."""
+"""The probe: forecasts whose latents come from another distribution show whether a model uses its latents."""
 
 from dataclasses import replace
 
@@ -19,17 +19,17 @@ def windows():
     return motion.windows(motion.simulate(clips=8, frames=40, test=0.3), PROTOCOL, "test")
 
 
-def made(windows, **options):
+def build(windows, **options):
     torch.manual_seed(0)
     return dvae.method("mix-and-match", **{"width": 24, **options}).build(windows).eval()
 
 
 @pytest.mark.parametrize("noise", ["mix", "concatenate", "add", "step"])
-def test_latents_are_from_the_other_law_each_sample_its_own(windows, noise):
-    model, past = made(windows, noise=noise), {"x": windows.all()["x"][:3, :5]}
+def test_each_sample_draws_its_latents_from_the_other_distribution(windows, noise):
+    model, past = build(windows, noise=noise), {"x": windows.all()["x"][:3, :5]}
     z = RedrawnModel(model, {"z": FAR}).forecast(past, 7, samples=300)["z"]
     assert z.shape == model.forecast(past, 7, samples=300)["z"].shape
     assert z.mean() == pytest.approx(50, abs=0.3)
     assert z.std() == pytest.approx(50**0.5, rel=0.03)
     assert z.std(0).min() > 5
-    assert model.forecast(past, 7, samples=300)["z"].mean().abs() < 0.1  # which is as it was
+    assert model.forecast(past, 7, samples=300)["z"].mean().abs() < 0.1  # the model itself is unchanged

@@ -1,4 +1,4 @@
-"""Guides of single sequences: on linear-Gaussian surrogates the best ones, and so the parts of the gap, are known."""
+"""Semi-amortized guides: on linear-Gaussian surrogates the optimum, and so each part of the gap, is known."""
 
 import math
 
@@ -19,8 +19,8 @@ PAIRS = {
 T = 3
 
 
-def fitted(pair):
-    """A model with the best guide of its factorization, its oracle, and what that guide costs."""
+def best_guide(pair):
+    """Return a model with the best guide of its factorization, its oracle, and the cost of that guide in nats."""
     sizes = dict.fromkeys(dvae.Factorization.parse(PAIRS[pair][0]).variables, 1)
     model = linear_gaussian_surrogate(*PAIRS[pair], sizes, T, scale=0.6)
     oracle = Oracle(model, T)
@@ -29,55 +29,55 @@ def fitted(pair):
     return model, oracle, cost
 
 
-def moved(model, seed=1):
-    """Parameters of the guide off by a fifth or so."""
+def perturb(model, seed=1):
+    """Perturb the parameters of the guide by about a fifth."""
     torch.manual_seed(seed)
     for parameter in model.encoder.parameters():
         parameter.data += 0.2 * torch.randn_like(parameter)
 
 
 def elbo(model, x, draws=400):
-    """Mean and standard error, (B,), of log p(x, z) - log q(z | x)."""
+    """Return the mean and standard error, (B,), of log p(x, z) - log q(z | x)."""
     rows = repeat({"x": x}, draws)
     with torch.no_grad():
-        joint, own = joint_and_guide(model, rows, model.guide(rows))
-    weights = (joint - own).unflatten(0, (draws, -1))
+        joint, log_q = joint_and_guide(model, rows, model.guide(rows))
+    weights = (joint - log_q).unflatten(0, (draws, -1))
     return weights.mean(0), weights.std(0) / math.sqrt(draws)
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_the_best_guide_of_a_factorization_has_nothing_to_gain_but_its_missing_edges(pair):
-    """One that is off gets back what that cost, and with all edges the bound of every sequence is its evidence.
+def test_refining_regains_the_amortization_gap_and_missing_edges_the_rest(pair):
+    """A perturbed guide regains its loss; with all edges, the bound of every sequence is its evidence.
 
-    What the search has left, at a rate that falls to 0, is held below a hundredth of a nat.
+    The learning rate falls to 0, which leaves an error of less than 0.01 nats.
     """
-    model, oracle, cost = fitted(pair)
+    model, oracle, cost = best_guide(pair)
     assert cost > 0.02
     x = model.sample(3, T)["x"]
     evidence = oracle.evidence(x)
     best = evidence - oracle.bound(x)
-    moved(model)
+    perturb(model)
     assert (evidence - oracle.bound(x) - best).min() > 0.02
-    own = semi_amortized_guide(model, x, steps=100, rate=0.5)
-    bound, error = elbo(own, x)
+    refined = semi_amortized_guide(model, x, steps=100, rate=0.5)
+    bound, error = elbo(refined, x)
     torch.testing.assert_close((evidence - bound).mean(), best.mean(), rtol=0, atol=float(4 * error.max()) + 0.01)
-    everything = semi_amortized_guide(own, x, missing=True, steps=100, rate=0.5)
+    everything = semi_amortized_guide(refined, x, missing=True, steps=100, rate=0.5)
     bound, error = elbo(everything, x)
     assert ((evidence - bound).abs() < 4 * error + 0.01).all()
 
 
-def test_without_a_step_it_is_the_guide_and_programs_take_the_sequences_any_number_of_times():
-    """A rate of nothing moves nothing: draws and densities are the guide's, of ragged sequences with context too."""
+def test_at_rate_zero_the_refined_guide_is_the_guide_for_repeated_sequences_too():
+    """At a rate of 0, draws and densities are the guide's, also for ragged sequences with context."""
     pair = "p(w | c) p(z_t | z_{t-1}, w) p(x_t | z_t, c)", "q(w | x_{1:T}) q(z_t | z_{>t}, x_{1:T}, w)"
     model = dvae.DynamicalVAE(*pair, {"w": 2, "z": 3, "x": 2, "c": 1}).double()
     batch = {"x": torch.randn(3, 5, 2), "c": torch.randn(3, 1), "lengths": torch.tensor([5, 1, 3])}
     local = semi_amortized_guide(model, batch, steps=1, rate=1e-12, missing=True)
     rows = repeat(model.read(batch), 2)
     torch.manual_seed(0)
-    ours = local.guide(rows)
+    traced = local.guide(rows)
     torch.manual_seed(0)
-    theirs = model.guide(rows)
+    expected = model.guide(rows)
     for name in model.latents:
-        torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=1e-9)
-    for one, other in zip(joint_and_guide(local, rows, ours), joint_and_guide(model, rows, ours), strict=True):
+        torch.testing.assert_close(traced[name], expected[name], rtol=0, atol=1e-9)
+    for one, other in zip(joint_and_guide(local, rows, traced), joint_and_guide(model, rows, traced), strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-8)

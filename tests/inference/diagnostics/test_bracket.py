@@ -1,4 +1,4 @@
-"""The bracket of the evidence and the parts of its gap, where all of them are known."""
+"""The bracket of the evidence and the parts of its gap, on models where both are known."""
 
 import json
 import math
@@ -18,8 +18,8 @@ FEW = {"particles": 8, "temperatures": 3, "chains": 2, "fitting": 2, "progress":
 
 
 @pytest.fixture(scope="module")
-def known():
-    """The oracle of a model whose guide is off, the cost of the best one, sequences by clip, and their bracket."""
+def bracketed():
+    """Return the oracle of a perturbed guide, the cost of the best guide, shuffled sequences and their bracket."""
     model = linear_gaussian_surrogate(*DKF, {"z": 1, "x": 1}, T, seed=1, scale=0.6)
     oracle = Oracle(model, T)
     cost = oracle.fit_guide(300)
@@ -30,65 +30,65 @@ def known():
     x = model.sample(N, T)["x"]
     windows = ArrayWindows(x, 1, clips=[f"clip {n // 3}" for n in range(N)])
     many = {"particles": 1000, "temperatures": 20, "chains": 4, "fitting": 100, "batch_size": N, "progress": False}
-    found = bracket(model, windows, **many)
+    result = bracket(model, windows, **many)
     order = torch.randperm(N, generator=torch.Generator().manual_seed(0))
-    return oracle, cost, x[order], found
+    return oracle, cost, x[order], result
 
 
-def test_the_bracket_holds_the_evidence_and_is_narrow(known):
-    """Sequence by sequence on real data, to .1 nat; of simulated ones the two sides are as near to each other."""
-    oracle, _, x, found = known
+def test_the_bracket_contains_the_evidence_and_is_narrow(bracketed):
+    """It holds to 0.1 nats for each real sequence, and on average for simulated ones."""
+    oracle, _, x, result = bracketed
     evidence = oracle.evidence(x).numpy()
-    assert np.abs(found.bounds["real"]["AIS"] - evidence).max() < 0.1
-    gap = found.gap("simulated")["unknown"]
+    assert np.abs(result.bounds["real"]["AIS"] - evidence).max() < 0.1
+    gap = result.gap("simulated")["unknown"]
     assert abs(gap.mean) < 0.1
     assert gap.mean > -4 * gap.sequences - 1e-6
-    above = found.bounds["real"]["IWAE"] - evidence
+    above = result.bounds["real"]["IWAE"] - evidence
     assert above.mean() < 4 * above.std() / math.sqrt(N)
-    assert all(found.estimate(name, "ELBO", data).mean > 0.1 for name in ("IWAE", "AIS") for data in DATA)
+    assert all(result.estimate(name, "ELBO", data).mean > 0.1 for name in ("IWAE", "AIS") for data in DATA)
 
 
-def test_the_parts_of_the_gap_are_what_they_cost(known):
-    """Amortisation is what the guide lost by being off, missing edges the price of the best one, the family nothing.
+def test_the_parts_of_the_gap_are_the_known_costs(bracketed):
+    """Each part is known: the loss of the perturbation, the gap of the best guide, and 0 for the family.
 
-    Logarithms of weights have a variance of about twice the gap that they are of, and of ELBOs each is a mean of 1000.
+    The variance of log weights is about twice the gap; each ELBO is a mean of 1000 of them.
     """
-    oracle, cost, x, found = known
+    oracle, cost, x, result = bracketed
     evidence = oracle.evidence(x)
     total = (evidence - oracle.bound(x)).mean()
-    parts = found.gap()
+    parts = result.gap()
     error = 4 * math.sqrt(2 * float(total) / (1000 * N)) + 0.01
     assert min(cost, float(total) - cost) > 2 * error
-    # of the best guide, which reads all data, every sequence loses the same
+    # the best guide reads all data and loses the same on every sequence
     assert parts["missing edges"].mean == pytest.approx(cost, abs=error)
     assert parts["amortisation"].mean == pytest.approx(float(total) - cost, abs=error)
     assert parts["family"].mean == pytest.approx(0, abs=error)
-    assert found.added == {"z": ["z_{t-1}"]}
+    assert result.added == {"z": ["z_{t-1}"]}
 
 
-def test_it_is_shown_and_kept(known):
-    *_, found = known
-    again = Bracket.from_json(found.to_json())
-    assert str(again) == str(found)
+def test_a_bracket_is_printed_drawn_and_stored(bracketed):
+    *_, result = bracketed
+    again = Bracket.from_json(result.to_json())
+    assert str(again) == str(result)
     for change in (lambda d: d["bounds"]["real"].pop("AIS"), lambda d: d["bounds"]["real"].update(ELBO=[1])):
-        document = json.loads(found.to_json())
+        document = json.loads(result.to_json())
         change(document["attributes"])
         with pytest.raises(ValueError, match="not written by Bracket"):
             Bracket.from_json(json.dumps(document))
-    assert {name for name in PARTS if name in str(found)} == {*PARTS}
-    assert "z: z_{t-1}" in str(found)
-    panels = found.plot().axes
+    assert {name for name in PARTS if name in str(result)} == {*PARTS}
+    assert "z: z_{t-1}" in str(result)
+    panels = result.plot().axes
     assert [panel.get_title(loc="left") for panel in panels] == ["real data", "simulated data"]
     assert panels[1].get_legend_handles_labels()[1] == [name for name in PARTS if name != "unknown"]
 
 
-def test_a_guide_that_goes_backward_has_no_fivo_and_a_law_that_is_no_normal_no_parts():
+def test_a_backward_guide_has_no_fivo_bound_and_a_nonnormal_one_no_parts():
     model = linear_gaussian_surrogate(DKF[0], "q(z_t | z_{>t}, x_{1:T})", {"z": 1, "x": 1}, T).requires_grad_(False)
-    found = bracket(model, torch.randn(2, T, 1), **{**FEW, "fitting": 0})
-    assert "FIVO" not in found.bounds["real"]
-    assert "backward" in found.notes[0]
+    result = bracket(model, torch.randn(2, T, 1), **{**FEW, "fitting": 0})
+    assert "FIVO" not in result.bounds["real"]
+    assert "backward" in result.notes[0]
     model = dvae.DynamicalVAE(*DKF, {"z": 2, "x": 1}, distributions={"q": dvae.distributions.FAMILIES["correlated"]})
-    found = bracket(model, torch.randn(2, T, 1), **FEW)
-    assert "are normals" in found.notes[0]
-    assert list(found.gap("simulated")) == ["unknown"]
-    assert "family" not in str(found)
+    result = bracket(model, torch.randn(2, T, 1), **FEW)
+    assert "are normals" in result.notes[0]
+    assert list(result.gap("simulated")) == ["unknown"]
+    assert "family" not in str(result)

@@ -1,4 +1,4 @@
-"""Criticism: exact guides pass and wrong ones fail by name, exact p-values, statistics with known values."""
+"""Criticism: exact guides pass, wrong guides fail as described, p-values and statistics have known values."""
 
 import itertools
 import json
@@ -43,7 +43,7 @@ def from_ranks(ranks, draws):
 
 
 def posterior_guide(model, factor=1.0, shift=0.0):
-    """The exact posterior's marginals, independent of each other, widened and shifted by standard deviations."""
+    """Return the marginals of the exact posterior as a guide, scaled by a factor and shifted by deviations."""
     oracle = Oracle(model, T)
 
     def guide(batch):
@@ -83,7 +83,7 @@ def test_ranks_of_the_exact_guide_are_uniform_and_of_the_mean_field_guide_are_no
         ({"factor": 0.6, "shift": 0.8}, "is too narrow, draws too high"),
     ],
 )
-def test_the_shape_says_what_is_wrong(options, reading):
+def test_the_shape_of_the_histogram_names_the_error(options, reading):
     model = linear(STATIC, "q(w | x_{1:T})", w=1, x=2)
     right, wrong = (run(model, guide=posterior_guide(model, **o)) for o in ({}, options))
     assert right.names == ("w[0]", "TARP", "log joint")
@@ -96,7 +96,7 @@ def test_the_shape_says_what_is_wrong(options, reading):
     assert right.spread[0] == pytest.approx(1, rel=5 / math.sqrt(2000))
 
 
-def test_p_values_are_those_of_all_outcomes_counted():
+def test_p_values_equal_those_by_enumeration():
     count, draws = 5, 2
     outcomes = np.array(list(itertools.product(range(draws + 1), repeat=count))).T
     result = from_ranks(outcomes, draws)
@@ -113,7 +113,7 @@ def test_p_values_are_those_of_all_outcomes_counted():
         assert (outside == (expected <= alpha)).all()
 
 
-def test_calibration_prints_draws_and_writes():
+def test_a_calibration_is_printed_drawn_and_stored():
     result = run(linear(DKF, "q(z_t | x_{1:T})", z=1, x=1), 300)
     text = str(result)
     assert "z_2[0]" in text
@@ -138,42 +138,42 @@ class Motions(ArrayWindows):
         return x.unflatten(-1, (-1, 3))
 
 
-def test_a_calibration_is_read_back_with_all_that_it_says():
+def test_a_stored_calibration_is_read_unchanged():
     result = from_ranks(np.random.default_rng(0).binomial(9, 0.6, (40, 3)), 9)
-    read = Calibration.from_json(result.to_json())
-    assert read.to_json() == result.to_json()
-    assert str(read) == str(result)
+    loaded = Calibration.from_json(result.to_json())
+    assert loaded.to_json() == result.to_json()
+    assert str(loaded) == str(result)
     document = result.document()
     for damage in ({"names": ["z"]}, {"draws": 7}, {"draws": 10**9}, {"ranks": [41, 3]}):
         with pytest.raises(ValueError, match="not written by Calibration"):
             Calibration.of({**document, "attributes": document["attributes"] | damage})
 
 
-def test_statistics_of_any_sequences_have_their_known_values():
+def test_statistics_have_known_values():
     t = torch.arange(64, dtype=torch.float64)
     wave = torch.stack([2 + 3 * (2 * math.pi * t / 32).sin(), 0 * t], 1)
-    found = {name: float(statistic.function(wave)) for name, statistic in STATISTICS.items()}
-    assert found["mean"] == pytest.approx(1)
-    assert found["scale"] == pytest.approx(math.sqrt(3**2 / 2 / 2))
-    assert found["roughness"] == pytest.approx(2 * math.sin(math.pi / 32) * found["scale"], rel=0.02)
+    values = {name: float(statistic.function(wave)) for name, statistic in STATISTICS.items()}
+    assert values["mean"] == pytest.approx(1)
+    assert values["scale"] == pytest.approx(math.sqrt(3**2 / 2 / 2))
+    assert values["roughness"] == pytest.approx(2 * math.sin(math.pi / 32) * values["scale"], rel=0.02)
     centred = wave[:, 0].numpy() - 2
     correlation = np.correlate(centred, centred, "full")[63:] / (centred @ centred)
-    assert found["correlation length"] == np.flatnonzero(correlation < math.exp(-1))[0]
-    assert found["lag-1 correlation"] == pytest.approx(correlation[1] * 64 / 63)
-    assert found["zeros"] == pytest.approx(0.5)
-    assert (found["smallest"], found["largest"]) == (pytest.approx(-1), pytest.approx(5))
+    assert values["correlation length"] == np.flatnonzero(correlation < math.exp(-1))[0]
+    assert values["lag-1 correlation"] == pytest.approx(correlation[1] * 64 / 63)
+    assert values["zeros"] == pytest.approx(0.5)
+    assert (values["smallest"], values["largest"]) == (pytest.approx(-1), pytest.approx(5))
     still = torch.ones(5, 4, 2)
     assert (STATISTICS["correlation length"].function(still) == 4).all()
     assert (STATISTICS["lag-1 correlation"].function(still) == 1).all()
     assert all(statistic.function(torch.randn(2, 5, 4, 3)).shape == (2, 5) for statistic in STATISTICS.values())
     gaps = torch.tensor([0.0, torch.nan, 3.0, torch.nan, -2.0, 0.0])[:, None]
-    known = [float(STATISTICS[name].function(gaps)) for name in ("zeros", "smallest", "largest")]
-    assert known == [0.5, -2, 3]
+    observed_values = [float(STATISTICS[name].function(gaps)) for name in ("zeros", "smallest", "largest")]
+    assert observed_values == [0.5, -2, 3]
 
 
 @pytest.fixture(scope="module")
 def true_checks():
-    """Of windows that a model drew itself. Only x_{t-1} tells of the future: forecasts are exact whatever the guide."""
+    """Return checks of windows that the model drew; x_{t-1} alone predicts the future, so the guide is irrelevant."""
     model = linear_gaussian_surrogate("p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t, x_{t-1})", {"z": 1, "x": 9}, T)
     Oracle(model, T).fit_guide()
     with torch.random.fork_rng():
@@ -188,20 +188,20 @@ def test_tail_areas_of_the_true_model_are_uniform(true_checks, name, samples):
     forecast, posterior = (true_checks["model", program, name] for program in ("forecast", "posterior"))
     assert forecast.replicated.shape == (50, 1500)
     real, replicated = forecast.real, forecast.replicated[:samples]
-    ties = (replicated == real).sum(0)  # a foot that is always the lowest joint has height 0
+    ties = (replicated == real).sum(0)  # the height of a foot that is always the lowest joint is 0
     ranks = (replicated < real).sum(0) + np.random.default_rng(0).integers(0, ties + 1)
     assert stats.chisquare(np.bincount(ranks, minlength=samples + 1)).pvalue > 1e-3
-    # A real window is any one of 1 + S that are alike, so that the share to expect is known with ties, too.
+    # The 1 + S windows are exchangeable, so the expected share is known, also with ties.
     alike = np.concatenate([real[None], replicated])
-    turns = [Check(alike[s], np.delete(alike, s, 0), "") for s in range(samples + 1)]
-    expected = np.mean([check.outside for check in turns])
-    assert turns[0].outside == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / 1500))
+    leave_one_out = [Check(alike[s], np.delete(alike, s, 0), "") for s in range(samples + 1)]
+    expected = np.mean([check.outside for check in leave_one_out])
+    assert leave_one_out[0].outside == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / 1500))
     if name == "foot height":
-        assert expected < turns[0].expected_outside
+        assert expected < leave_one_out[0].expected_outside
     else:
         assert not ties.any()
-        assert expected == pytest.approx(turns[0].expected_outside, abs=1e-12)
-    # Replicates of a posterior have seen the window: tail areas vary less than uniform ones (Meng, 1994).
+        assert expected == pytest.approx(leave_one_out[0].expected_outside, abs=1e-12)
+    # Posterior replicates depend on the window, so tail areas vary less than uniform ones (Meng, 1994).
     areas = Check(posterior.real, posterior.replicated[:samples], "").tail_areas
     assert areas.mean() == pytest.approx(0.5, abs=4 * 0.3 / math.sqrt(1500))
     assert areas.var() < (1 + 2 / samples) / 12 * (1 + 4 * math.sqrt(0.8 / 1500))
@@ -210,26 +210,26 @@ def test_tail_areas_of_the_true_model_are_uniform(true_checks, name, samples):
 # Latent traversals
 
 
-def test_a_coordinate_that_x_does_not_read_moves_nothing_and_others_move_it_linearly():
+def test_x_moves_linearly_with_the_coordinates_that_it_reads_only():
     model = linear_gaussian_surrogate(STATIC, "q(w | x_{1:T})", {"w": 3, "x": 2}, T)
     weights = model.generator["x"].network.weights["w"]
     with torch.no_grad():
         weights[..., 1] = 0
     x = model.sample(2, T)["x"]
-    found = traverse(model, x, "w", span=(-2, 2), steps=5)
-    assert found.frames.shape == (3, 5, 2, T, 2)
-    # Rows of one product, which may round otherwise at another place or in another number.
-    torch.testing.assert_close(found.frames[1], found.frames[1, :1].expand(5, -1, -1, -1), rtol=0, atol=1e-12)
-    assert found.effect[1] == pytest.approx(0, abs=1e-12)
-    step = found.frames.diff(dim=1)
-    slope = found.scale[:, None, None] * weights.detach()[:, 0].permute(2, 0, 1)  # (coordinate, T, D)
+    result = traverse(model, x, "w", span=(-2, 2), steps=5)
+    assert result.frames.shape == (3, 5, 2, T, 2)
+    # The rounding of a matrix product may depend on the row and on the number of rows.
+    torch.testing.assert_close(result.frames[1], result.frames[1, :1].expand(5, -1, -1, -1), rtol=0, atol=1e-12)
+    assert result.effect[1] == pytest.approx(0, abs=1e-12)
+    step = result.frames.diff(dim=1)
+    slope = result.scale[:, None, None] * weights.detach()[:, 0].permute(2, 0, 1)  # (coordinate, T, D)
     torch.testing.assert_close(step, slope[:, None, None].expand_as(step))
-    assert found.scale == pytest.approx(1, abs=0.2)  # the prior is N(0, I)
-    chosen = traverse(model, x, "w", coordinates=[2], span=(-2, 2), steps=5)
-    torch.testing.assert_close(chosen.frames[0], found.frames[2], rtol=0, atol=1e-12)
-    own = traverse(model, model.sample(3, T)["x"], "w", unit="posterior", draws=4000).scale
+    assert result.scale == pytest.approx(1, abs=0.2)  # the prior is N(0, I)
+    selected = traverse(model, x, "w", coordinates=[2], span=(-2, 2), steps=5)
+    torch.testing.assert_close(selected.frames[0], result.frames[2], rtol=0, atol=1e-12)
+    in_deviations = traverse(model, model.sample(3, T)["x"], "w", unit="posterior", draws=4000).scale
     scale = model.encoder["w"].head.log_scale.exp().detach().flatten()
-    torch.testing.assert_close(own, scale, rtol=0.05, atol=0)
+    torch.testing.assert_close(in_deviations, scale, rtol=0.05, atol=0)
 
 
 # On motion, and from the command line
@@ -248,7 +248,7 @@ def test_methods_can_be_criticised(name):
         assert traverse(model, x, latent, [0], steps=3, draws=2).frames.shape == (1, 3, 3, 6, 9)
 
 
-def test_checks_and_traversals_of_motion_print_draw_and_write(people):
+def test_checks_and_traversals_of_motion_are_printed_drawn_and_stored(people):
     clips = motion.read_motion(people)
     windows = motion.windows(clips, motion.PROTOCOLS["simulated"], "test")
     equations = "p(w) p(z_t | z_{t-1}) p(x_t | z_t, w)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T})"
@@ -269,8 +269,8 @@ def test_checks_and_traversals_of_motion_print_draw_and_write(people):
     figure = checks.plot()
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["real", "one", "two"]
     figure.canvas.draw()
-    found = traverse(model, {"x": windows.all()["x"][:2]}, "w", steps=3)
-    figure = motion.draw_traversal(found, windows)
+    result = traverse(model, {"x": windows.all()["x"][:2]}, "w", steps=3)
+    figure = motion.draw_traversal(result, windows)
     labels = [axes.get_title("left").split(",")[0] for axes in figure.axes]
-    assert labels == [f"w[{c}]" for c in found.effect.argsort(descending=True).tolist()]
+    assert labels == [f"w[{c}]" for c in result.effect.argsort(descending=True).tolist()]
     figure.canvas.draw()

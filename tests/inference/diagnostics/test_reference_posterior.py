@@ -1,4 +1,4 @@
-"""Reference posteriors beside a guide: the oracle's where it is known, and what NUTS and Stein's identity say."""
+"""Reference posteriors: guides compared with the oracle, with NUTS and by Stein discrepancies."""
 
 import math
 from functools import partial
@@ -30,13 +30,13 @@ def simulated(count=2):
 
 
 def posterior_by_nuts(*arguments, **options):
-    """The reference posterior of a model as if it were not linear-Gaussian."""
+    """Return the reference posterior by NUTS, even of a linear-Gaussian model."""
     with mock.patch("dvae.inference.diagnostics.reference_posterior._exact", return_value=None):
         return dvae.reference_posterior(*arguments, progress=False, **options)
 
 
 def exact(oracle):
-    """The posterior as a Pyro guide, whatever the order of its latents."""
+    """Return the posterior as a Pyro guide, in any order of its latents."""
 
     def guide(batch):
         mean, covariance = oracle.posterior(batch)
@@ -50,53 +50,55 @@ def exact(oracle):
 
 
 @pytest.fixture(scope="module")
-def beside():
-    """What the oracle says of a mean-field guide, and what NUTS does."""
+def mean_field():
+    """Compare a mean-field guide with the oracle and with NUTS."""
     model, oracle, x = simulated()
-    known = dvae.reference_posterior(model, x, progress=False)
+    exact_result = dvae.reference_posterior(model, x, progress=False)
     by_nuts = posterior_by_nuts(model, x, [0], draws=100, chains=2, warmup=40)
-    return model, oracle, x, known, by_nuts
+    return model, oracle, x, exact_result, by_nuts
 
 
-def test_of_a_linear_gaussian_model_the_reference_is_the_oracles(beside):
-    _, oracle, x, known, _ = beside
+def test_the_reference_of_a_linear_gaussian_model_is_the_oracles(mean_field):
+    _, oracle, x, exact_result, _ = mean_field
     mean, covariance = oracle.posterior(x)
     deviation = covariance.diagonal().sqrt()
-    assert known.exact
-    np.testing.assert_allclose(known.reference.mean, mean.numpy(), rtol=1e-12)
+    assert exact_result.exact
+    np.testing.assert_allclose(exact_result.reference.mean, mean.numpy(), rtol=1e-12)
     for sequence in range(2):
-        scaled = known.reference.correlation[sequence] * np.outer(*[known.reference.deviation[sequence]] * 2)
+        scaled = exact_result.reference.correlation[sequence] * np.outer(
+            *[exact_result.reference.deviation[sequence]] * 2
+        )
         np.testing.assert_allclose(scaled, covariance.numpy(), rtol=1e-12, atol=1e-15)
-    assert (known.reference.deviation == deviation.numpy()).all()
+    assert (exact_result.reference.deviation == deviation.numpy()).all()
 
 
-def test_nuts_agrees_with_the_oracle_within_its_errors(beside):
-    """All numbers and all pairs at once, by the largest of so many standard normals, and by their spread."""
-    *_, known, by_nuts = beside
-    ours, theirs = by_nuts.reference, known.reference
-    above = np.triu_indices(len(known.names), 1)
+def test_nuts_agrees_with_the_oracle_within_its_errors(mean_field):
+    """Test all numbers and pairs at once, by the largest error and by the spread of the errors."""
+    *_, exact_result, by_nuts = mean_field
+    sampled, expected = by_nuts.reference, exact_result.reference
+    above = np.triu_indices(len(exact_result.names), 1)
     gaps = [
-        (ours.mean[0] - theirs.mean[0]) / ours.mean_error[0],
-        (ours.deviation[0] - theirs.deviation[0]) / ours.deviation_error[0],
-        (ours.correlation[0] - theirs.correlation[0])[above] / ours.correlation_error[0][above],
+        (sampled.mean[0] - expected.mean[0]) / sampled.mean_error[0],
+        (sampled.deviation[0] - expected.deviation[0]) / sampled.deviation_error[0],
+        (sampled.correlation[0] - expected.correlation[0])[above] / sampled.correlation_error[0][above],
     ]
     for gap in gaps:
         assert abs(gap).max() < stats.norm.isf(1e-3 / gap.size / 2)
-        independent = gap.size / 2  # at the least, as numbers depend on each other
+        independent = gap.size / 2  # a lower limit, because the numbers depend on each other
         assert gap.std() < math.sqrt(stats.chi2.isf(1e-3, independent) / independent)
 
 
-def test_a_guide_that_is_the_posterior_has_neither_bias_nor_another_scale(beside):
-    model, oracle, x, *_ = beside
-    found = dvae.reference_posterior(model, x, [1], guide=exact(oracle), progress=False)
-    assert found.sequences == (1,)
-    assert (abs(found.bias) < 4 * found.bias_error).all()
-    assert (abs(found.ratio - 1) < 4 * found.ratio_error).all()
+def test_the_exact_posterior_as_a_guide_has_no_bias_and_the_right_scale(mean_field):
+    model, oracle, x, *_ = mean_field
+    result = dvae.reference_posterior(model, x, [1], guide=exact(oracle), progress=False)
+    assert result.sequences == (1,)
+    assert (abs(result.bias) < 4 * result.bias_error).all()
+    assert (abs(result.ratio - 1) < 4 * result.ratio_error).all()
     off = ~np.eye(4, dtype=bool)
-    assert (abs(found.lack) < 4 * found.lack_error)[:, off].all()
+    assert (abs(result.lack) < 4 * result.lack_error)[:, off].all()
 
 
-def test_padding_has_no_posterior_and_changes_none():
+def test_padding_changes_no_posterior():
     model, _, x = simulated()
     few = {"draws": 8, "chains": 2, "warmup": 16, "guide_draws": 50}
     lengths = torch.tensor([2, 3])
@@ -105,38 +107,38 @@ def test_padding_has_no_posterior_and_changes_none():
     exact = dvae.reference_posterior(model, {"x": x, "lengths": lengths}, progress=False)
     assert exact.exact
     for posterior in (partial(dvae.reference_posterior, progress=False), posterior_by_nuts):
-        found, again = (posterior(model, {"x": data, "lengths": lengths}, [0], **few) for data in (x, other))
-        assert np.isnan(found.bias[0]).tolist() == [False, False, False, True]  # w, z_1, z_2, z_3
-        np.testing.assert_array_equal(found.reference.mean, again.reference.mean)
-        np.testing.assert_array_equal(found.lack, again.lack)
-        assert str(ReferencePosterior.from_json(found.to_json())) == str(found)
+        padded, again = (posterior(model, {"x": data, "lengths": lengths}, [0], **few) for data in (x, other))
+        assert np.isnan(padded.bias[0]).tolist() == [False, False, False, True]  # w, z_1, z_2, z_3
+        np.testing.assert_array_equal(padded.reference.mean, again.reference.mean)
+        np.testing.assert_array_equal(padded.lack, again.lack)
+        assert str(ReferencePosterior.from_json(padded.to_json())) == str(padded)
     np.testing.assert_allclose(
         exact.reference.mean[0, :3], dvae.Oracle(model, 2).posterior(x[:1, :2])[0][0], atol=1e-12
     )
 
 
-def test_results_are_seeded_kept_and_drawn(beside, tmp_path):
-    model, _, x, known, by_nuts = beside
+def test_results_are_reproducible_stored_and_drawn(mean_field, tmp_path):
+    model, _, x, exact_result, by_nuts = mean_field
     state = torch.random.get_rng_state()
     again = dvae.reference_posterior(model, x, progress=False)
     assert torch.equal(torch.random.get_rng_state(), state)
-    assert again.to_json() == known.to_json()
+    assert again.to_json() == exact_result.to_json()
     tested = dvae.stein_discrepancy(model, x, draws=20, bootstrap=19, progress=False)
-    for found in (known, by_nuts, tested):
-        found.save(tmp_path / "found.json")
-        read = type(found).load(tmp_path / "found.json")
-        assert str(read) == str(found)
-        assert read.to_json() == found.to_json()
-        found.plot().savefig(tmp_path / "found.png")
-    for found in (known, tested):
+    for result in (exact_result, by_nuts, tested):
+        result.save(tmp_path / "found.json")
+        loaded = type(result).load(tmp_path / "found.json")
+        assert str(loaded) == str(result)
+        assert loaded.to_json() == result.to_json()
+        result.plot().savefig(tmp_path / "found.png")
+    for result in (exact_result, tested):
         with pytest.raises(ValueError, match="not written by"):
-            type(found).of({**found.document(), "attributes": found.document()["attributes"] | {"sequences": [0]}})
+            type(result).of({**result.document(), "attributes": result.document()["attributes"] | {"sequences": [0]}})
 
 
 # ------------------------------------------------------------------------------------------------ Stein discrepancies
 
 
-def test_the_stein_kernel_is_made_of_the_derivatives_of_its_kernel():
+def test_the_stein_kernel_is_built_from_derivatives_of_its_base_kernel():
     u, score = torch.randn(2, 4, 3).double()
     pairs = _stein(u, score)
 
@@ -145,23 +147,23 @@ def test_the_stein_kernel_is_made_of_the_derivatives_of_its_kernel():
 
     for i, j in ((0, 1), (2, 0), (3, 2)):
         to_one, to_other = torch.autograd.functional.jacobian(kernel, (u[i], u[j]))
-        mixed = torch.autograd.functional.hessian(kernel, (u[i], u[j]))[0][1].trace()
-        right = score[i] @ score[j] * kernel(u[i], u[j]) + score[i] @ to_other + score[j] @ to_one + mixed
+        second_derivatives = torch.autograd.functional.hessian(kernel, (u[i], u[j]))[0][1].trace()
+        right = score[i] @ score[j] * kernel(u[i], u[j]) + score[i] @ to_other + score[j] @ to_one + second_derivatives
         torch.testing.assert_close(pairs[i, j], right)
 
 
-def rejected(model, x, draws, **options):
-    found = dvae.stein_discrepancy(model, x, draws=draws, bootstrap=99, progress=False, **options)
-    return int((found.p_values <= 0.05).sum()), found
+def rejection_count(model, x, draws, **options):
+    result = dvae.stein_discrepancy(model, x, draws=draws, bootstrap=99, progress=False, **options)
+    return int((result.p_values <= 0.05).sum()), result
 
 
-def test_draws_from_the_posterior_keep_the_level_and_those_of_a_mean_field_guide_do_not():
-    """Of 60 sequences; with more draws, more are told. Ratios of one guide's draws are the exact posterior's."""
+def test_posterior_draws_keep_the_level_and_mean_field_draws_are_rejected():
+    """Use 60 sequences; the test rejects more of them with more draws."""
     model, oracle, x = simulated(count=60)
-    count, found = rejected(model, x, 100, guide=exact(oracle))
+    count, rejections = rejection_count(model, x, 100, guide=exact(oracle))
     assert stats.binom.sf(count - 1, 60, 0.05) > 1e-3
-    assert found.p_value > 1e-3
-    (few, together), (many, _) = (rejected(model, x, draws) for draws in (50, 300))
+    assert rejections.p_value > 1e-3
+    (few, together), (many, _) = (rejection_count(model, x, draws) for draws in (50, 300))
     assert few < many
     assert stats.binom.sf(many - 1, 60, 0.05) < 1e-6
-    assert together.p_value <= 0.01  # all sequences together are told by the fewest draws
+    assert together.p_value <= 0.01  # all sequences together are rejected with the fewest draws

@@ -1,5 +1,4 @@
-"""Comparison: bounds against the oracle, standard errors against their formulas and against simulation, latents against
-closed forms."""
+"""Comparison: bounds against the oracle, standard errors against formulas and simulation, latents in closed form."""
 
 import json
 import math
@@ -41,7 +40,7 @@ def run(models, data, **options):
 
 
 def scores(result, name):
-    """The estimates of a model, with None for what is unknown."""
+    """Return the estimates of a model, with None for missing ones."""
     return json.loads(result.to_json())["summary"]["models"][name]["scores"]
 
 
@@ -73,15 +72,17 @@ def test_scores_are_those_of_an_evaluation_on_the_same_windows():
     same = {"samples": 4, "seed": 3, "bound_particles": 32, "references": False, "progress": False}
     expected = evaluate({"a": model}, windows, scores=motion.displacements, **same)["a"]
     for metric in ("ELBO", "IWAE bound", "KL z", "ADE", "FDE", "MMADE", "MMFDE", "energy score"):
-        ours = result["a"][metric]
-        assert (ours.mean, ours.sequences) == pytest.approx((expected[metric].mean, expected[metric].standard_error))
+        estimates = result["a"][metric]
+        assert (estimates.mean, estimates.sequences) == pytest.approx(
+            (expected[metric].mean, expected[metric].standard_error)
+        )
     khat = result.rows["a"].bounds["k-hat"]
     assert khat.mean() == pytest.approx(expected["k-hat"].mean)
     assert result.rows["a"].unreliable == (khat > 0.7).mean()
 
 
-def test_the_particle_bound_is_that_of_the_filter_and_models_without_one_say_why():
-    """Below the evidence on average, the same as without the others, and nothing else depends on it."""
+def test_the_fivo_bound_is_the_filters_and_unsupported_models_get_a_note():
+    """It is at most the evidence on average, and computing it changes no other bound."""
     models = {
         "filters": build(MEAN_FIELD, fitted=False),
         "backward": build((DKF[0], "q(z_t | z_{>t}, x_{1:T})")),
@@ -89,8 +90,8 @@ def test_the_particle_bound_is_that_of_the_filter_and_models_without_one_say_why
     }
     x = draws(models["filters"], 60)
     result, without = run(models, x, filter_particles=16), run(models, x)
-    own, evidence = result.rows["filters"].bounds["FIVO bound"][0], Oracle(models["filters"], T).evidence(x)
-    above = own - evidence.detach().numpy()
+    bounds, evidence = result.rows["filters"].bounds["FIVO bound"][0], Oracle(models["filters"], T).evidence(x)
+    above = bounds - evidence.detach().numpy()
     assert -2 < above.mean() < 4 * above.std() / math.sqrt(60)
     none = result.rows["nothing latent"].bounds
     np.testing.assert_allclose(none["FIVO bound"], none["IWAE bound"])
@@ -105,7 +106,7 @@ def test_the_particle_bound_is_that_of_the_filter_and_models_without_one_say_why
 
 
 def record(values, clips=None, frames=None):
-    """A comparison of importance-weighted bounds (S, N) by name, in nats a sequence."""
+    """Return a comparison of IWAE bounds (S, N) by model name, in nats per sequence."""
     count = next(iter(values.values())).shape[1]
     clips = range(count) if clips is None else clips
     rows = {}
@@ -118,7 +119,7 @@ def record(values, clips=None, frames=None):
     return Comparison(rows=rows, keys=keys, frames=frames, data={}, protocol={}, emission="mean", **counts)
 
 
-def test_errors_over_sequences_are_clustered_by_clip_and_weigh_frames():
+def test_errors_over_sequences_are_clustered_by_clip_and_weighted_by_frames():
     clips, frames = ["a", "a", "b", "c", "c", "c"], [3, 5, 4, 2, 2, 6]
     first, second = (np.random.default_rng(seed).normal(size=(1, 6)) for seed in (0, 1))
     result = record({"a": first, "b": second}, clips, frames)
@@ -130,7 +131,7 @@ def test_errors_over_sequences_are_clustered_by_clip_and_weigh_frames():
         assert estimate.sequences == pytest.approx(math.sqrt(3 / 2 * sum(s**2 for s in clip_sums)) / total)
 
 
-def test_errors_over_seeds_are_those_of_their_means_and_the_total_has_two_way_random_effects():
+def test_errors_over_seeds_and_in_total_match_two_way_random_effects():
     random = np.random.default_rng(0)
     first, second = random.normal(size=(3, 8)), random.normal(size=(4, 8))
     of_both = [np.std(v.mean(1), ddof=1) / math.sqrt(len(v)) for v in (first, second)]
@@ -149,7 +150,7 @@ def test_errors_over_seeds_are_those_of_their_means_and_the_total_has_two_way_ra
 
 
 def distribution(model):
-    """Gain, covariance of q(latents | x), and covariance of x, of a linear-Gaussian model."""
+    """Return the gain and covariance of q(latents | x), and the covariance of x, of a linear-Gaussian model."""
     oracle = Oracle(model, T)
     gain, _, root = (part[0] for part in oracle._guide())
     covariance = torch.linalg.inv(oracle._joint()[1])[len(gain) :, len(gain) :]
@@ -159,20 +160,20 @@ def distribution(model):
 def test_information_is_the_mutual_information_of_a_linear_guide():
     model, n = build(MEAN_FIELD, scale=0.8), 600
     gain, noise, covariance = distribution(model)
-    told = (gain @ covariance * gain).sum(1) / noise.diagonal()  # signal to noise of each scalar latent
-    found = run({"a": model}, draws(model, n), particles=1, contrasts=n).rows["a"].information["z"][0]
-    exact = 0.5 * torch.log1p(told)
+    signal_to_noise = (gain @ covariance * gain).sum(1) / noise.diagonal()  # of each scalar latent
+    information = run({"a": model}, draws(model, n), particles=1, contrasts=n).rows["a"].information["z"][0]
+    exact = 0.5 * torch.log1p(signal_to_noise)
     # The log-ratio of two jointly normal numbers of correlation r has variance r^2 (1 - r^2 = exp(-2 information)).
     error = torch.sqrt((1 - torch.exp(-2 * exact)) / n)
-    assert found.shape == exact.shape
+    assert information.shape == exact.shape
     assert (exact > 0.1).all()
-    assert (np.abs(found - exact.numpy()) < 4 * error.numpy()).all()
+    assert (np.abs(information - exact.numpy()) < 4 * error.numpy()).all()
 
 
 # -------------------------------------------------------------------------------------------------------------- data
 
 
-def test_ragged_sequences_are_weighed_by_their_frames():
+def test_ragged_sequences_are_weighted_by_their_frames():
     pair = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"
     model = DynamicalVAE(*pair, {"w": 2, "z": 2, "x": 3}, dvae.networks.Recurrent(4)).double()
     lengths = torch.tensor([7, 2, 4, 7, 1, 3])
@@ -203,7 +204,7 @@ def test_a_bound_that_is_not_finite_names_model_and_sequence():
 # ----------------------------------------------------------------------------------------------------------- records
 
 
-def test_a_comparison_comes_back_from_json_with_all_that_it_says(fitted, tmp_path):
+def test_a_comparison_is_read_back_from_json_unchanged(fitted, tmp_path):
     models, x = fitted
     windows = ArrayWindows(x, 3, clips=["a"] * 12 + ["b"] * 12)
     result = run(models, windows, samples=2, particles=4, configs={"dkf": {"latent": 1}})
@@ -220,9 +221,9 @@ def test_a_comparison_comes_back_from_json_with_all_that_it_says(fitted, tmp_pat
     assert again.rows["dkf"].equations["generative"] == models["dkf"][0].generative.text
     assert summary["models"]["dkf"]["khat_above_0.7"] is None  # four particles have no tail
     for damage in (
-        lambda own: own["keys"].pop(),
-        lambda own: own["rows"]["dkf"]["bounds"]["ELBO"].__setitem__(0, 1),
-        lambda own: own["rows"]["dkf"]["bounds"].pop("k-hat"),
+        lambda attributes: attributes["keys"].pop(),
+        lambda attributes: attributes["rows"]["dkf"]["bounds"]["ELBO"].__setitem__(0, 1),
+        lambda attributes: attributes["rows"]["dkf"]["bounds"].pop("k-hat"),
     ):
         document = json.loads(result.to_json())
         damage(document["attributes"])
@@ -230,18 +231,18 @@ def test_a_comparison_comes_back_from_json_with_all_that_it_says(fitted, tmp_pat
             Comparison.from_json(json.dumps(document))
 
 
-def test_joined_rows_are_those_of_one_comparison(fitted):
+def test_joined_comparisons_equal_one_comparison(fitted):
     models, x = fitted
     dkf, other = (run({name: model}, x) for name, model in models.items())
     assert Comparison.from_json(dkf.to_json()).join(other).to_json() == run(models, x).to_json()
-    for told, data, options in (("seed", x, {"seed": 1}), ("data", x + 1, {}), ("contrasts", x, {"contrasts": 8})):
-        with pytest.raises(ValueError, match=f"differ in {told}"):
+    for option, data, options in (("seed", x, {"seed": 1}), ("data", x + 1, {}), ("contrasts", x, {"contrasts": 8})):
+        with pytest.raises(ValueError, match=f"differ in {option}"):
             dkf.join(run({"b": models["dkf"]}, data, **options))
     with pytest.raises(ValueError, match="comparisons have"):
         dkf.join(dkf)
 
 
-# Of so few draws as 100 the diagnosis warns without cause; see `Comparison.to_arviz`.
+# With only 100 draws the diagnostic warns without cause; `Comparison.to_arviz` explains why.
 @pytest.mark.filterwarnings("ignore:Estimated shape parameter of Pareto:UserWarning")
 @pytest.mark.filterwarnings("ignore:The inplace keyword in DataFrame.sort_values:DeprecationWarning")  # arviz_stats 0.8
 def test_arviz_reads_the_comparison(fitted):
@@ -257,7 +258,7 @@ def test_arviz_reads_the_comparison(fitted):
         loo = arviz_stats.loo(tree, pointwise=True)
         assert loo.n_data_points == 24
         bound = result[name]["IWAE bound"].mean * result.frames.sum()
-        # p is Monte Carlo error alone; of an exact guide it is 0, which leaves the rounding of sums of estimates
+        # p is Monte Carlo error only; it is 0 for an exact guide, up to rounding
         rounding = 24 * 100 * np.finfo(float).eps * abs(bound)
         assert loo.elpd == pytest.approx(bound, abs=3 * loo.p + rounding)
         assert loo.p < 0.5
@@ -288,14 +289,14 @@ def runs(tmp_path_factory):
 CHEAP = ["--particles", "25", "--contrasts", "4"]
 
 
-def test_runs_that_differ_in_the_seed_only_are_seeds_of_one_row(runs, capsys, tmp_path):
+def test_runs_that_differ_only_in_the_seed_share_a_row(runs, capsys, tmp_path):
     paths = [str(runs / name) for name in ("a0", "b", "a1", "c")]
     out, figure = tmp_path / "comparison.json", tmp_path / "comparison.png"
     arguments = [*paths, *CHEAP, "--samples", "2", "--out", str(out), "--figure", str(figure)]
     assert main(["compare", *arguments]) == 0
-    printed = capsys.readouterr().out
+    output = capsys.readouterr().out
     for part in ("vae (latent 2)", "vae (latent 3)", "dkf", "K = 25", "free-running", "ADE"):
-        assert part in printed
+        assert part in output
     result = Comparison.load(out)
     seeds = {name: row.seeds for name, row in result.rows.items()}
     assert seeds == {"vae (latent 2)": 2, "vae (latent 3)": 1, "dkf": 1}
@@ -312,15 +313,15 @@ def test_a_failed_run_is_refused(runs, capsys, tmp_path, command):
     shutil.copytree(runs / "a1", path)
     state = json.loads((path / "state.json").read_text())
     (path / "state.json").write_text(json.dumps({**state, "status": "failed", "step": 0}))
-    asked = [command, str(path), "--out", str(out)]
-    assert main(asked) == 1
+    arguments = [command, str(path), "--out", str(out)]
+    assert main(arguments) == 1
     error = capsys.readouterr().err.replace("\n", " ")
     if command != "compare":
         assert f"{path} has not ended (failed at step 0 of 4); its weights are the initial ones" in error
     assert f"at a lower learning rate with: dvae resume {path} --learning-rate 0.0001" in error
     assert not out.exists()
     if command == "forecast":
-        assert main([*asked, "--failed", "--samples", "1"]) == 0
+        assert main([*arguments, "--failed", "--samples", "1"]) == 0
         assert "note: " in capsys.readouterr().err
         assert np.load(out)["emission"] == "drawn"
         with pytest.warns(UserWarning, match="failed at step 0 of 4"):
@@ -335,13 +336,13 @@ def test_runs_of_other_windows_are_not_compared(runs, capsys, tmp_path):
     assert "other test windows" in " ".join(capsys.readouterr().err.split())
 
 
-def test_many_models_are_compared_by_the_metric_and_its_direction():
+def test_the_best_of_many_models_depends_on_the_direction_of_the_metric():
     random = np.random.default_rng(0)
     values = {name: mean + 0.1 * random.standard_normal((3, 12)) for name, mean in (("a", 0.0), ("b", 1.0), ("c", 5.0))}
-    found = record(values)
-    assert found.confidence_set().members == ["c"]  # of bounds the higher is better
-    assert found.pairs().differences["a", "c"] == found.difference("a", "c")
-    assert all(p < 0.01 for p in found.pairs().p_values.values())
-    assert found.required("b", "a").achieved > 0.9
+    result = record(values)
+    assert result.confidence_set().members == ["c"]  # of bounds the higher is better
+    assert result.pairs().differences["a", "c"] == result.difference("a", "c")
+    assert all(p < 0.01 for p in result.pairs().p_values.values())
+    assert result.required("b", "a").achieved > 0.9
     with pytest.raises(KeyError, match="no score 'ADE'"):
-        found.confidence_set("ADE")
+        result.confidence_set("ADE")

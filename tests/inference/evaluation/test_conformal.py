@@ -1,4 +1,4 @@
-"""Coverage of prediction bands for dependent windows and few clips; TARP; calibration at each horizon."""
+"""Conformal prediction bands with dependent windows and few clips, TARP, and calibration by horizon."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ def draw(*shape, seed=0):
 
 
 def rate(hits):
-    """Mean and four standard errors."""
+    """Return the mean and four standard errors."""
     return hits.mean(), 4 * hits.std() / math.sqrt(len(hits))
 
 
@@ -28,14 +28,14 @@ def rate(hits):
 
 
 @pytest.mark.parametrize(("clips", "level"), [(9, 0.9), (19, 0.9), (7, 0.5)])
-def test_of_clips_of_one_window_the_quantile_is_that_of_split_conformal(clips, level):
+def test_with_one_window_per_clip_the_quantile_is_split_conformal(clips, level):
     values = draw(clips, 3, 2).abs()
     place = math.ceil(round((clips + 1) * level, 9))
-    found = quantile(values, torch.arange(clips), level)
-    torch.testing.assert_close(found, values.sort(0).values[place - 1])
+    factor = quantile(values, torch.arange(clips), level)
+    torch.testing.assert_close(factor, values.sort(0).values[place - 1])
 
 
-def test_of_too_few_clips_no_quantile_is_finite():
+def test_with_too_few_clips_the_quantile_is_infinite():
     assert quantile(draw(8, 1), torch.arange(8), 0.9).isinf().all()
     gaps = draw(9, 2).abs()
     gaps[0, 1] = torch.nan
@@ -43,17 +43,17 @@ def test_of_too_few_clips_no_quantile_is_finite():
 
 
 @pytest.mark.parametrize("most", [1, 6])
-def test_a_window_of_a_new_clip_is_held_with_the_level(most):
-    """4000 sets of clips of 1 to `most` windows, which share a scale and grow with their number."""
+def test_windows_of_new_clips_are_covered_at_the_level(most):
+    """Simulate 4000 sets of clips with 1 to `most` windows, whose scale grows with their number."""
     random, clips, level = np.random.default_rng(0), 12, 0.8
     sizes = random.integers(1, most + 1, (4000, clips + 1))
     scale = random.gamma(2.0, size=sizes.shape) * sizes
     values = scale[..., None] * np.abs(random.standard_normal((*sizes.shape, most)))
-    known = np.arange(most) < sizes[..., None]
-    kept = np.where(known, values, np.nan)[:, :clips].reshape(4000, -1).T
-    factor = quantile(torch.from_numpy(kept), torch.arange(clips).repeat_interleave(most), level).numpy()
-    held = values[:, -1, 0] <= factor  # windows of a clip are alike
-    mean, error = rate(held)
+    mask = np.arange(most) < sizes[..., None]
+    scores = np.where(mask, values, np.nan)[:, :clips].reshape(4000, -1).T
+    factor = quantile(torch.from_numpy(scores), torch.arange(clips).repeat_interleave(most), level).numpy()
+    covered = values[:, -1, 0] <= factor  # windows of a clip are alike
+    mean, error = rate(covered)
     assert level - error <= mean
     if most == 1:
         exact = math.ceil(round((clips + 1) * level, 9)) / (clips + 1)
@@ -66,7 +66,7 @@ def test_a_window_of_a_new_clip_is_held_with_the_level(most):
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A model whose forecasts are exact, and windows that it drew, for calibration and new ones, with gaps to come."""
+    """Return a model with exact forecasts, and windows with missing values that it drew: for calibration, and new."""
     model = dvae.linear_gaussian_surrogate(
         "p(z_t) p(x_t | x_{t-1}, z_t)", "q(z_t | x_t)", {"z": 1, "x": 2}, 6, scale=0.9
     )
@@ -80,7 +80,7 @@ def fitted():
 
 
 class Narrow(torch.nn.Module):
-    """Half as wide as another model, about its mean, from a frame on."""
+    """A model whose forecasts are half as wide about the mean, from a frame on."""
 
     likelihood = False
 
@@ -95,23 +95,23 @@ class Narrow(torch.nn.Module):
         return {"x": torch.cat([x[:, :, : self.start], narrow[:, :, self.start :]], 2)}
 
 
-def test_bands_hold_what_exact_forecasts_say_and_narrow_ones_do_not(fitted):
-    model, kept, new = fitted
+def test_bands_of_exact_forecasts_have_their_coverage_and_narrow_ones_less(fitted):
+    model, calibration, new = fitted
     for each, right in ((model, True), (Narrow(model), False)):
-        bands = conformal_bands(each, kept, samples=30, progress=False)
-        judged = bands.coverage(each, new, progress=False)["model"]
+        bands = conformal_bands(each, calibration, samples=30, progress=False)
+        coverage = bands.coverage(each, new, progress=False)["model"]
         for region in ("number", "frame", "future"):
-            held, said = (judged[f"{how} 90 %, {region}"] for how in ("held", "said"))
-            # the calibration has as many clips as those that are judged, and as large an error
-            assert abs(held.mean - 0.9) < 4 * math.sqrt(2) * held.standard_error, region
-            assert (abs(said.mean - 0.9) < 5 * said.standard_error) == right, region
-        widths = [judged[f"width held 90 %, {region}"].mean for region in ("number", "frame", "future")]
+            held_share, expected_share = (coverage[f"{word} 90 %, {region}"] for word in ("held", "said"))
+            # calibration and evaluation have equally many clips, and so equally large errors
+            assert abs(held_share.mean - 0.9) < 4 * math.sqrt(2) * held_share.standard_error, region
+            assert (abs(expected_share.mean - 0.9) < 5 * expected_share.standard_error) == right, region
+        widths = [coverage[f"width held 90 %, {region}"].mean for region in ("number", "frame", "future")]
         assert widths == sorted(widths)
 
 
-def test_bands_are_kept_and_put_around_forecasts(fitted, tmp_path):
-    model, kept, new = fitted
-    bands = conformal_bands(model, kept, 0.8, samples=20, progress=False)
+def test_stored_bands_are_put_around_forecasts(fitted, tmp_path):
+    model, calibration, new = fitted
+    bands = conformal_bands(model, calibration, 0.8, samples=20, progress=False)
     bands.save(tmp_path / "coverage.json")
     again = PredictionBands.load(tmp_path / "coverage.json")
     assert again.to_json() == bands.to_json()
@@ -137,30 +137,30 @@ def test_bands_are_kept_and_put_around_forecasts(fitted, tmp_path):
 # ----------------------------------------------------------------------------------------------------------------- TARP
 
 
-def test_the_share_in_balls_is_that_of_the_definition():
+def test_tarp_shares_equal_the_definition():
     samples, truth, point = draw(6, 9, 3, 2), draw(6, 3, 2, seed=1), draw(6, 3, 2, seed=2)
     truth[2, 0, 1], truth[3] = torch.nan, torch.nan
-    found = tarp_histogram(samples, truth, point, 10)
-    assert found[3].isnan().all()
+    histogram = tarp_histogram(samples, truth, point, 10)
+    assert histogram[3].isnan().all()
     for n in (0, 1, 2, 4, 5):
-        known = ~truth[n].isnan()
-        away = [float((each[known] - point[n][known]).norm()) for each in (*samples[n], truth[n])]
-        rank = sum(each < away[-1] for each in away[:-1])
-        assert found[n].argmax() == rank
-        assert found[n, rank] == pytest.approx(1)
+        observed = ~truth[n].isnan()
+        distances = [float((each[observed] - point[n][observed]).norm()) for each in (*samples[n], truth[n])]
+        rank = sum(each < distances[-1] for each in distances[:-1])
+        assert histogram[n].argmax() == rank
+        assert histogram[n, rank] == pytest.approx(1)
     one, line, far = samples[..., :1, :1], truth[..., :1, :1], torch.full((6, 1, 1), -99.0).double()
     torch.testing.assert_close(tarp_histogram(one, line, far), pit_histogram(one, line), equal_nan=True)
 
 
 def leaves(result, name, histogram):
-    """Whether a curve leaves its band of 99.9 %."""
+    """Return whether a curve leaves its 99.9 % band."""
     _, departs, low, high = result.departure(name, histogram, 1e-3)
     return bool(((departs < low) | (departs > high)).any())
 
 
-def test_evaluations_tell_narrow_forecasts_from_exact_ones(fitted):
-    model, kept, _ = fitted
-    models, windows = {"exact": model, "narrow": Narrow(model)}, replace(kept, mask=None)
+def test_narrow_forecasts_leave_the_bands_and_exact_ones_do_not(fitted):
+    model, calibration, _ = fitted
+    models, windows = {"exact": model, "narrow": Narrow(model)}, replace(calibration, mask=None)
     result = evaluate(models, windows, scores=lambda windows: [tarp(windows)], references=False, progress=False)
     assert [leaves(result, name, "TARP") for name in models] == [False, True]
     assert dvae.Evaluation.from_json(result.to_json()).to_json() == result.to_json()
@@ -171,20 +171,20 @@ def test_evaluations_tell_narrow_forecasts_from_exact_ones(fitted):
 # -------------------------------------------------------------------------------------------------------------- horizon
 
 
-def test_calibration_over_the_horizon_is_of_every_frame_and_drawn(fitted):
-    """Forecasts whose first half is exact and whose last frame is not: only there it shows."""
-    model, kept, _ = fitted
-    windows = replace(kept, mask=None)
+def test_calibration_is_computed_and_drawn_for_every_frame_of_the_horizon(fitted):
+    """The first half of each forecast is exact and the last frame is not."""
+    model, calibration, _ = fitted
+    windows = replace(calibration, mask=None)
 
     result = evaluate({"late": Narrow(model, 3)}, windows, scores=over_horizon, references=False, progress=False)
     row = result["late"]
     assert {*row} >= {measure.name for measure in calibrated(windows) if not measure.bins}
-    left = []
+    outside = []
     for frame in (1, 2, 3, 4):
         covered = row[f"coverage 90 %, frame {frame}"]
         assert (abs(covered.mean - 0.9) < 4 * covered.standard_error) == (frame < 4)
-        left.append(leaves(result, "late", f"PIT, frame {frame}"))
-    assert left == [False, False, False, True]
+        outside.append(leaves(result, "late", f"PIT, frame {frame}"))
+    assert outside == [False, False, False, True]
     figure = result.plot_horizon()
     assert [axes.get_title() for axes in figure.axes][:4] == ["frame 1", "frame 2", "frame 3", "frame 4"]
     with pytest.raises(ValueError, match="frames must be between 1 and 4"):

@@ -1,4 +1,4 @@
-"""Evaluation: all rows on the same windows, honest standard errors, records that say what was measured."""
+"""Evaluation: all rows on the same windows, correct standard errors, complete records."""
 
 import json
 import math
@@ -43,7 +43,7 @@ def model():
 
 
 class Forecaster(nn.Module):
-    """A model that forecasts what it is told, and has no uncertainty to speak of."""
+    """A model that forecasts by a function and has no uncertainty."""
 
     likelihood = True
     generative = SimpleNamespace(text="p(x_t)")
@@ -63,7 +63,7 @@ def run(model, windows, **options):
 
 
 def free_running(forecaster, windows, **options):
-    """Scores of a forecaster that has no bound."""
+    """Return the scores of a forecaster without a bound."""
 
     def no_bound(self, model, batch):
         return SimpleNamespace(per_frame=torch.zeros(len(batch["x"])), kl={}, frames=FRAMES)
@@ -94,7 +94,7 @@ def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_frame(model):
     assert not {"KL z", "ELBO"} & result["last value"].keys()
 
 
-def test_evaluation_leaves_mode_and_random_state_alone(model):
+def test_evaluation_changes_neither_mode_nor_random_state(model):
     model.train()
     state = torch.get_rng_state()
     run(model, array_windows())
@@ -102,17 +102,17 @@ def test_evaluation_leaves_mode_and_random_state_alone(model):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_a_perfect_forecast_has_no_error_and_a_lone_window_keeps_its_own_truth():
+def test_a_perfect_forecast_has_error_zero_also_for_multimodal_truth():
     windows = array_windows()
     truth = iter(windows.all()["x"][:, OBSERVED:].split(5))
     perfect = Forecaster(lambda x, horizon, samples: next(truth).expand(samples, -1, -1, -1))
-    alone = partial(motion.displacements, threshold=1e-9)
-    scores = free_running(perfect, windows, batch_size=5, scores=alone)
+    displacements = partial(motion.displacements, threshold=1e-9)
+    scores = free_running(perfect, windows, batch_size=5, scores=displacements)
     for name in ("ADE", "FDE", "MMADE", "MMFDE", "ADEm", "MMFDEm", "energy score", "variogram score", "APD"):
         assert scores[name].mean == pytest.approx(0, abs=1e-6), name
 
 
-def test_multimodal_errors_average_over_every_window_in_the_same_pose():
+def test_multimodal_errors_average_over_all_windows_with_the_same_pose():
     x = draw(6, FRAMES, SIZE)
     x[:3, OBSERVED - 1] = x[0, OBSERVED - 1]
     windows = ArrayWindows(x, OBSERVED)
@@ -127,22 +127,22 @@ def test_multimodal_errors_average_over_every_window_in_the_same_pose():
 
 
 def in_poses(poses, **options):
-    """Windows of two frames whose last observed poses these are."""
+    """Return windows of two frames with these last observed poses."""
     return ArrayWindows(torch.stack([poses, poses], 1), 1, **options)
 
 
-def test_like_windows_are_strictly_below_the_threshold_and_include_the_window_itself():
+def test_similar_windows_lie_strictly_below_the_threshold_and_include_the_window():
     windows = in_poses(torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [9.0, 9.0]]))
-    assert [found.tolist() for found in multimodal_truths(windows)] == [[0, 2], [1, 2], [0, 1, 2], [3]]
-    assert [found.tolist() for found in multimodal_truths(windows, itself=False)] == [[2], [2], [0, 1], []]
-    assert [found.tolist() for found in multimodal_truths(windows, 0.6)] == [[0, 1, 2], [0, 1, 2], [0, 1, 2], [3]]
+    assert [truths.tolist() for truths in multimodal_truths(windows)] == [[0, 2], [1, 2], [0, 1, 2], [3]]
+    assert [truths.tolist() for truths in multimodal_truths(windows, itself=False)] == [[2], [2], [0, 1], []]
+    assert [truths.tolist() for truths in multimodal_truths(windows, 0.6)] == [[0, 1, 2], [0, 1, 2], [0, 1, 2], [3]]
 
 
 # Standard errors
 
 
 def evaluation(values, clips):
-    """Zero velocity on windows whose final error is `values`, of the given clips."""
+    """Evaluate zero velocity on windows whose final errors are `values`, of the given clips."""
     x = torch.zeros(len(values), 2, 1, dtype=torch.float64)
     x[:, 1, 0] = torch.as_tensor(values)
     return run({}, ArrayWindows(x, 1, clips=clips))
@@ -155,7 +155,7 @@ def test_independent_windows_have_the_standard_error_of_a_mean():
     assert score.standard_error == pytest.approx((values.std() / math.sqrt(30)).item())
 
 
-def test_copies_of_windows_in_a_clip_add_no_certainty():
+def test_copies_of_windows_in_a_clip_change_no_standard_error():
     values = draw(10).abs()
     once = evaluation(values, [str(i) for i in range(10)])["last value"]["FDE"]
     thrice = evaluation(values.repeat(3), [str(i) for i in range(10)] * 3)["last value"]["FDE"]
@@ -177,7 +177,7 @@ def test_differences_are_paired(model):
 # Records
 
 
-def test_the_record_says_what_was_measured_and_comes_back_from_json(model, tmp_path):
+def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
     windows = array_windows()
     result = run({"dkf": model}, windows, configs={"dkf": {"width": 8}}, bound_particles=3, seed=5)
     result.save(tmp_path / "evaluation.json")
@@ -187,9 +187,9 @@ def test_the_record_says_what_was_measured_and_comes_back_from_json(model, tmp_p
     assert again.to_json() == result.to_json()
     assert (again.samples, again.seed, again.bound_particles) == (5, 5, 3)
     assert again.protocol == {"observed": OBSERVED}
-    alone = sum(len(found) == 1 for found in multimodal_truths(windows))
-    assert again.basis == {"multimodal": {"threshold": 0.5, "itself": True, "alone": alone}}
-    assert f"{alone} of 12 have no other" in str(result)
+    single_truths = sum(len(truths) == 1 for truths in multimodal_truths(windows))
+    assert again.basis == {"multimodal": {"threshold": 0.5, "itself": True, "alone": single_truths}}
+    assert f"{single_truths} of 12 have no other" in str(result)
     assert again.rows["dkf"].config == {"width": 8}
     assert again.rows["dkf"].equations["generative"] == model.generative.text
     assert (again.metrics["ELBO"].program, again.metrics["ELBO"].unit) == ("teacher-forced", "nats/frame")
@@ -238,13 +238,13 @@ def nan_at_the_second_window(x, horizon, samples):
     return forecast
 
 
-def test_forecasts_that_are_not_finite_are_an_error_naming_method_and_window():
+def test_a_nonfinite_forecast_is_an_error_with_method_and_window():
     windows = array_windows(clips=[f"clip_{i}" for i in range(12)])
     with pytest.raises(FloatingPointError, match="forecast"):
         run({"wild": Forecaster(nan_at_the_second_window)}, windows)
 
 
-def test_ragged_windows_are_refused():
+def test_ragged_windows_are_an_error():
     windows = array_windows()
     ragged = Mock(windows, all=lambda: {**windows.all(), "lengths": torch.ones(12)})
     with pytest.raises(ValueError, match="windows"):
@@ -259,46 +259,46 @@ def still(windows, *measures, **options):
     return result, result["last value"]
 
 
-def test_a_score_is_a_function_of_forecasts_truth_past_and_places():
+def test_a_score_gets_forecasts_truth_past_and_indices():
     x = draw(9, 6, 2)
     windows = ArrayWindows(x, 4, clips=list("aaabbbccc"))
-    seen = []
+    calls = []
 
     def function(forecasts, truth, past, index):
-        seen.append(index)
+        calls.append(index)
         assert torch.equal(truth, x[index, 4:])
         assert torch.equal(past["x"], x[index, :4])
         assert torch.equal(forecasts[:, 0], last_value(past["x"], 2)[0])
         return index.double()
 
     result, scores = still(windows, Measure("place", function, "windows", ""), batch_size=4)
-    assert torch.equal(torch.cat(seen), torch.arange(9))
+    assert torch.equal(torch.cat(calls), torch.arange(9))
     assert scores["place"].mean == pytest.approx(4)
     assert result.rows["last value"].clip_means["place"].tolist() == [1, 4, 7]
     assert result.metrics["place"].unit == "windows"
     assert "place (windows)" in str(result)
 
 
-def test_a_score_may_be_of_the_whole_set_and_say_nothing_of_some_clips():
+def test_a_score_of_the_whole_set_may_skip_clips():
     windows = ArrayWindows(draw(6, 3, 1), 2, clips=list("aabbcc"))
 
     def most(values, clips):
         assert values.shape == (6, 2)
         return [float(values.max())] * (int(clips.max()) + 1)
 
-    whole = Measure("most", lambda f, *_: torch.stack([f[:, 0, 0, 0], f[:, 0, 0, 0]], 1), pool=most)
+    whole_set = Measure("most", lambda f, *_: torch.stack([f[:, 0, 0, 0], f[:, 0, 0, 0]], 1), pool=most)
     some = Measure("some", lambda f, t, p, index: torch.where(index < 2, torch.nan, 1.0 * index), partial=True)
-    _, scores = still(windows, whole, some)
+    _, scores = still(windows, whole_set, some)
     assert scores["most"].mean == pytest.approx(windows.x[:, 1].max().item())
     assert scores["some"].mean == pytest.approx((2 + 3 + 4 + 5) / 4)
     assert scores["some"].freedom == 1
 
 
-def test_windows_that_do_not_count_leave_the_mean_and_not_their_clip():
+def test_windows_with_nan_scores_leave_the_mean_but_not_their_clip():
     values = torch.tensor([1.0, torch.nan, 3.0, torch.nan, torch.nan, 8.0])
     clips = torch.tensor([0, 0, 1, 2, 2, 3])
     of_clips = torch.tensor(means_of_those_that_count(values, clips))
     assert float(of_clips @ (clips.bincount() / 6.0)) == pytest.approx(4.0)  # (1 + 3 + 8) / 3
-    assert of_clips[2] == pytest.approx(4.0)  # says nothing, moves nothing
-    whole = torch.arange(6.0)
-    assert means_of_those_that_count(whole, clips) == pytest.approx(list(clip_means(whole, clips)))
+    assert of_clips[2] == pytest.approx(4.0)  # NaN values change nothing
+    score_values = torch.arange(6.0)
+    assert means_of_those_that_count(score_values, clips) == pytest.approx(list(clip_means(score_values, clips)))

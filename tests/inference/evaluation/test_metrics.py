@@ -49,11 +49,11 @@ def draw(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def by_the_letter(samples, truths):
-    """Every score of samples (K, T, D) by definition; the true future is the first of truths (M, T, D)."""
+def by_definition(samples, truths):
+    """Return every score of samples (K, T, D) by its definition; the true future is the first of truths (M, T, D)."""
     count, frames, size = samples.shape
     norm = np.linalg.norm
-    apart = [norm(samples[j] - samples[k]) for j in range(count) for k in range(j)]
+    pair_distances = [norm(samples[j] - samples[k]) for j in range(count) for k in range(j)]
     ade = [[np.mean([norm(s[t] - y[t]) for t in range(frames)]) for s in samples] for y in truths]
     fde = [[norm(s[-1] - y[-1]) for s in samples] for y in truths]
     pairs = [(t, i, j) for t in range(frames) for i in range(size) for j in range(i)]
@@ -65,7 +65,7 @@ def by_the_letter(samples, truths):
         error = np.var(values, ddof=1) / count if count > 1 else 0.0
         variogram.append((abs(truth[t, i] - truth[t, j]) ** 0.5 - values.mean()) ** 2 - error)
     return {
-        average_pairwise_distance: np.mean(apart) if apart else 0.0,
+        average_pairwise_distance: np.mean(pair_distances) if pair_distances else 0.0,
         average_displacement_error: min(ade[0]),
         final_displacement_error: min(fde[0]),
         median_average_displacement_error: np.median(ade[0]),
@@ -75,26 +75,27 @@ def by_the_letter(samples, truths):
         median_multimodal_average_displacement_error: np.mean([np.median(errors) for errors in ade]),
         median_multimodal_final_displacement_error: np.mean([np.median(errors) for errors in fde]),
         continuous_ranked_probability_score: abs(samples - truth).mean() - (np.mean(numbers) if numbers else 0.0) / 2,
-        energy_score: np.mean([norm(s - truth) for s in samples]) - (np.mean(apart) if apart else 0.0) / 2,
+        energy_score: np.mean([norm(s - truth) for s in samples])
+        - (np.mean(pair_distances) if pair_distances else 0.0) / 2,
         variogram_score: np.mean(variogram) if variogram else 0.0,
     }
 
 
 @settings(max_examples=30, deadline=None)
 @given(SIZES)
-def test_every_score_is_its_definition_at_every_size(sizes):
+def test_every_score_equals_its_definition_at_every_size(sizes):
     count, modes, frames, size, seed = sizes
     samples, truths = draw(count, frames, size, seed=seed), draw(modes, frames, size, seed=seed + 1)
-    for score, expected in by_the_letter(samples.numpy(), truths.numpy()).items():
+    for score, expected in by_definition(samples.numpy(), truths.numpy()).items():
         if score is average_pairwise_distance:
-            found = score(samples)
+            values = score(samples)
         else:
-            found = score(samples, truths if score in MULTIMODAL else truths[0])
-        assert found.item() == pytest.approx(expected, abs=1e-7), score.__name__
+            values = score(samples, truths if score in MULTIMODAL else truths[0])
+        assert values.item() == pytest.approx(expected, abs=1e-7), score.__name__
 
 
 @pytest.mark.parametrize("score", [average_pairwise_distance, *PAIRED, *MULTIMODAL])
-def test_leading_dimensions_are_windows_scored_alone_whatever_the_order_of_samples(score):
+def test_windows_are_scored_independently_and_the_order_of_samples_is_irrelevant(score):
     samples, truths = draw(2, 3, 5, 4, 6), draw(2, 3, 2, 4, 6, seed=1)
     rest = () if score is average_pairwise_distance else (truths if score in MULTIMODAL else truths[:, :, 0],)
     together = score(samples, *rest)
@@ -117,7 +118,7 @@ def test_frechet_distance_of_a_set_from_itself_is_exactly_zero_in_any_order(rows
 
 
 @given(st.integers(2, 40), st.integers(2, 40), st.integers(1, 6), st.integers(0, 999))
-def test_frechet_distance_is_that_of_normal_fits_by_another_formula(first, second, size, seed):
+def test_frechet_distance_equals_that_of_fitted_normals_by_another_formula(first, second, size, seed):
     a, b = draw(first, size, seed=seed), draw(second, size, seed=seed + 1) @ draw(size, size, seed=seed + 2) + 1
     if min(first, second) <= size:  # sqrtm wants full rank
         a, b = torch.cat([a, draw(size + 1, size, seed=seed + 3)]), torch.cat([b, draw(size + 1, size, seed=seed + 4)])
@@ -129,26 +130,28 @@ def test_frechet_distance_is_that_of_normal_fits_by_another_formula(first, secon
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_apde_is_how_far_two_diversities_are_apart(count):
+def test_apde_is_the_difference_of_two_diversities(count):
     samples, truths = draw(2, count, 4, 3), draw(2, 5, 4, 3, seed=1)
-    found = average_pairwise_distance_error(samples, truths)
+    error = average_pairwise_distance_error(samples, truths)
     for n in range(2):
-        ours, theirs = (
+        sample_diversity, truth_diversity = (
             [float((x[i] - x[j]).square().sum().sqrt()) for i in range(len(x)) for j in range(i)]
             for x in (samples[n], truths[n])
         )
-        assert found[n] == pytest.approx(abs((np.mean(ours) if ours else 0.0) - np.mean(theirs)))
+        assert error[n] == pytest.approx(
+            abs((np.mean(sample_diversity) if sample_diversity else 0.0) - np.mean(truth_diversity))
+        )
     assert (average_pairwise_distance_error(truths.flip(1) + 2.0, truths) < 1e-12).all()
     assert average_pairwise_distance_error(samples, truths[:, :1]).isnan().all()
 
 
-def test_cmd_is_the_area_between_cumulative_motions():
-    """sum_{i<T} sum_{t<=i} |M_t - M|; 0 at the pace of real motion, and the earlier a deviation the more it counts."""
+def test_cmd_is_the_area_between_cumulative_motion_curves():
+    """sum_{i<T} sum_{t<=i} |M_t - M|: 0 at the pace of real motion, and larger for earlier deviations."""
     motion, real = draw(2, 6).abs(), draw(2, seed=1).abs()
-    found = cumulative_motion_distance(motion, real)
+    distance = cumulative_motion_distance(motion, real)
     for n in range(2):
         area = sum(abs(motion[n, t] - real[n]) for i in range(6) for t in range(i + 1))
-        assert found[n] == pytest.approx(float(area))
+        assert distance[n] == pytest.approx(float(area))
     steady = real[:, None].expand(-1, 6)
     assert cumulative_motion_distance(steady, real).tolist() == [0, 0]
     early, late = (cumulative_motion_distance(steady + torch.eye(6)[t], real) for t in (0, 5))

@@ -1,4 +1,4 @@
-"""The shared loop: what it minimises, that it resumes bit for bit, where it stops, that files stay whole."""
+"""The training loop: its objective, bit-for-bit resuming, stopping, and intact files."""
 
 import contextlib
 import io
@@ -75,7 +75,7 @@ def test_free_bits_stop_the_gradient_and_a_negative_kl_estimate_stays_unbiased()
 
 
 @pytest.mark.parametrize("option", ["kl_weight", "free_bits", "energy_weights"])
-def test_a_weight_for_an_unknown_term_is_refused(option):
+def test_a_weight_for_an_unknown_term_is_an_error(option):
     with pytest.raises(ValueError, match=f"{option} names 'y', but the terms are"):
         Evidence(**{option: {"y": 1.0}})(terms(), 0)
 
@@ -102,20 +102,20 @@ def test_a_fit_raises_the_bound_and_reports_terms_that_add_up():
     for row in result.history:
         prefix = "validation/" if "validation/bound" in row else ""
         assert row[f"{prefix}bound"] == pytest.approx(row[f"{prefix}log_likelihood/x"] - row[f"{prefix}kl/z"])
-        if not prefix:  # the weight is that of the global step before the update, the recorded bound has none
+        if not prefix:  # the weight belongs to the global step before the update; the recorded bound is unweighted
             weight = min(0.2 + 0.8 * (row["step"] - 1) / 40, 1.0)
             assert row["loss"] == pytest.approx(weight * row["kl/z"] - row["log_likelihood/x"])
 
 
-def test_validation_scores_held_out_data_in_frames_and_without_weights():
+def test_validation_scores_are_unweighted_bounds_per_frame_of_held_out_data():
     model = build()
     lengths = torch.tensor([4, 1, 2, 3, 4, 4, 1])
     held_out = {"x": HELD_OUT, "lengths": lengths}
     result = run(model, validation=held_out, objective=Evidence(kl_weight=0.0), steps=20, batch_size=24, seed=3)
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(3)
-        scored = SequenceELBO().terms(model, held_out)
-    assert result.best_bound == pytest.approx(scored.bound.sum().item() / lengths.sum().item(), abs=1e-12)
+        terms_of_all = SequenceELBO().terms(model, held_out)
+    assert result.best_bound == pytest.approx(terms_of_all.bound.sum().item() / lengths.sum().item(), abs=1e-12)
 
 
 def test_validating_changes_neither_training_nor_the_callers_random_state(tmp_path):
@@ -128,7 +128,7 @@ def test_validating_changes_neither_training_nor_the_callers_random_state(tmp_pa
     assert same(*(load_file(tmp_path / name / "last.safetensors") for name in ("with", "without")))
 
 
-def test_the_seed_decides_everything():
+def test_runs_with_the_same_seed_are_equal():
     first, second, third = build(), build(), build()
     for model, seed in ((first, 1), (second, 1), (third, 2)):
         run(model, seed=seed, steps=10)
@@ -137,33 +137,33 @@ def test_the_seed_decides_everything():
 
 
 def test_the_model_ends_in_evaluation_mode_with_the_best_weights_and_best_is_a_copy(tmp_path):
-    model, kept = build(), {}
-    callbacks = [At(20, lambda state: kept.update(weights(state.model))), At(21, ruin)]
+    model, best = build(), {}
+    callbacks = [At(20, lambda state: best.update(weights(state.model))), At(21, ruin)]
     result = run(model, validation=HELD_OUT, out=tmp_path, callbacks=callbacks, learning_rate=1e-3)
     assert result.best_step == 20
     assert not model.training
-    assert same(weights(model), kept)
-    assert same(load_file(tmp_path / "best.safetensors"), kept)
-    assert not same(load_file(tmp_path / "last.safetensors"), kept)
+    assert same(weights(model), best)
+    assert same(load_file(tmp_path / "best.safetensors"), best)
+    assert not same(load_file(tmp_path / "last.safetensors"), best)
     restored = build(seed=5)
     load_weights(restored, tmp_path)
-    assert same(weights(restored), kept)
+    assert same(weights(restored), best)
 
 
-def test_early_stopping_counts_validations_without_a_better_bound():
+def test_early_stopping_counts_validations_without_improvement():
     result = run(validation=HELD_OUT, learning_rate=0.0, validate_every=5, patience=3)
     assert (result.status, result.best_step, result.step) == ("stopped early", 5, 20)
 
 
 def test_stages_follow_one_another_on_one_global_step():
-    seen = []
+    calls = []
 
     def spying(name):
-        return lambda terms, step: (seen.append((name, step)), Evidence()(terms, step))[1]
+        return lambda terms, step: (calls.append((name, step)), Evidence()(terms, step))[1]
 
     stages = [Stage(3, spying("a")), Stage(2, spying("b"), learning_rate=Ramp(0.0, 1.0, 5))]
     result = run(stages=stages, log_every=1)
-    assert seen == [("a", 0), ("a", 1), ("a", 2), ("b", 3), ("b", 4)]
+    assert calls == [("a", 0), ("a", 1), ("a", 2), ("b", 3), ("b", 4)]
     assert result.series("learning_rate")[1] == pytest.approx([0.02, 0.02, 0.02, 0.6, 0.8])
     with pytest.raises(ValueError, match="stages take"):
         run(stages=stages, steps=9)
@@ -171,7 +171,7 @@ def test_stages_follow_one_another_on_one_global_step():
         run(stages=stages, objective=Evidence())
 
 
-def test_a_stage_keeps_what_it_freezes_also_across_a_resume(tmp_path):
+def test_a_stage_keeps_frozen_parameters_also_after_resuming(tmp_path):
     stages = [Stage(30, frozen=("generator.z.", "generator.x.head")), Stage(30)]
     start = build().state_dict()
 
@@ -179,11 +179,11 @@ def test_a_stage_keeps_what_it_freezes_also_across_a_resume(tmp_path):
         now = state.model.state_dict()
         return {name for name in now if not torch.equal(now[name], start[name])}
 
-    seen = {}
-    watch = [At(step, lambda state, step=step: seen.update({step: moved(state)})) for step in (30, 31)]
+    moved_parts = {}
+    watch = [At(step, lambda state, step=step: moved_parts.update({step: moved(state)})) for step in (30, 31)]
     run(out=tmp_path / "whole", stages=stages, callbacks=watch)
-    assert seen[30] == {name for name in start if not name.startswith(stages[0].frozen)}
-    assert seen[31] == set(start)
+    assert moved_parts[30] == {name for name in start if not name.startswith(stages[0].frozen)}
+    assert moved_parts[31] == set(start)
     with pytest.raises(Interrupted):
         run(out=tmp_path / "parts", stages=stages, callbacks=[At(20, interrupt)])
     run(build(seed=9), out=tmp_path / "parts", stages=stages, resume=True)
@@ -194,25 +194,25 @@ def test_a_stage_keeps_what_it_freezes_also_across_a_resume(tmp_path):
         run(stages=[Stage(2, frozen=("generator", "encoder"))])
 
 
-def test_the_program_receives_the_scheduled_probability_of_self_feeding():
-    seen = []
+def test_the_program_receives_the_scheduled_sampling_probability():
+    probabilities = []
 
     class Spy(DynamicalVAE):
         def model(self, batch=None, **options):
-            seen.append(options.get("scheduled_sampling", 0.0))
+            probabilities.append(options.get("scheduled_sampling", 0.0))
             return super().model(batch, **options)
 
     run(build(kind=Spy), validation=HELD_OUT, steps=4, validate_every=4, scheduled_sampling=Ramp(0.0, 0.4, 4))
-    assert seen == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.0, 0.3])  # validated without, then as it ends
+    assert probabilities == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.0, 0.3])  # validated at 0, then at the final value
 
 
 def test_the_gradient_is_clipped_in_norm():
     model = build()
     before = torch.nn.utils.parameters_to_vector(model.parameters()).clone()
     result = run(model, steps=1, log_every=1, optimizer="sgd", learning_rate=1.0, gradient_clip=0.01)
-    moved = torch.nn.utils.parameters_to_vector(model.parameters()) - before
+    step = torch.nn.utils.parameters_to_vector(model.parameters()) - before
     assert result.history[0]["gradient_norm"] > 0.01
-    assert moved.norm().item() == pytest.approx(0.01)
+    assert step.norm().item() == pytest.approx(0.01)
 
 
 def test_ragged_and_masked_data_train():
@@ -224,7 +224,7 @@ def test_ragged_and_masked_data_train():
     assert math.isfinite(result.history[-1]["bound"])
 
 
-def test_a_batch_holds_different_sequences_and_all_of_them_if_there_are_few():
+def test_a_batch_has_distinct_sequences_and_all_of_a_small_dataset():
     data = Sequences({"x": torch.arange(6.0)[:, None, None], "lengths": torch.arange(6)})
     for size in (1, 4, 6, 9):
         batch = data.sample(size, torch.Generator().manual_seed(0))
@@ -236,16 +236,16 @@ def test_a_batch_holds_different_sequences_and_all_of_them_if_there_are_few():
 # Resuming --------------------
 
 
-@pytest.mark.parametrize("how", ["callback", "ctrl-c", "terminate"])
-def test_an_interrupted_run_resumes_bit_for_bit(tmp_path, how):
-    number = signal.SIGTERM if how == "terminate" else signal.SIGINT
-    action = interrupt if how == "callback" else lambda state: signal.raise_signal(number)
+@pytest.mark.parametrize("kind", ["callback", "ctrl-c", "terminate"])
+def test_an_interrupted_run_resumes_bit_for_bit(tmp_path, kind):
+    number = signal.SIGTERM if kind == "terminate" else signal.SIGINT
+    action = interrupt if kind == "callback" else lambda state: signal.raise_signal(number)
     options = {
         "validation": HELD_OUT,
         "objective": Evidence(kl_weight=Ramp(0.0, 1.0, 50)),
         "scheduled_sampling": Ramp(0.0, 0.5, 60),
     }
-    whole = run(out=tmp_path / "whole", **options)
+    uninterrupted = run(out=tmp_path / "whole", **options)
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with pytest.raises(Interrupted, match="resume with") as stopped:
         run(out=tmp_path / "parts", callbacks=[At(33, action)], **options)
@@ -254,13 +254,13 @@ def test_an_interrupted_run_resumes_bit_for_bit(tmp_path, how):
     assert Run(tmp_path / "parts").state["status"] == "interrupted"
 
     resumed = run(build(seed=9), out=tmp_path / "parts", resume=True, **options)
-    assert resumed.history == whole.history
-    assert (resumed.best_step, resumed.best_bound) == (whole.best_step, whole.best_bound)
+    assert resumed.history == uninterrupted.history
+    assert (resumed.best_step, resumed.best_bound) == (uninterrupted.best_step, uninterrupted.best_bound)
     for name in ("last.safetensors", "best.safetensors"):
         assert same(load_file(tmp_path / "whole" / name), load_file(tmp_path / "parts" / name))
 
 
-def test_other_training_data_are_not_resumed_on(tmp_path):
+def test_resuming_on_other_training_data_is_an_error(tmp_path):
     class Windows(Sequences):
         @property
         def fingerprint(self):
@@ -288,10 +288,10 @@ def test_rows_after_the_checkpoint_are_dropped_on_resume(tmp_path):
     assert JSONLines(tmp_path / "log.jsonl").read() == result.history
 
 
-# Stopping at what is not finite --------------------
+# Nonfinite values --------------------
 
 
-def test_a_term_that_is_not_finite_stops_the_run_and_leaves_the_last_checkpoint(tmp_path, monkeypatch):
+def test_a_nonfinite_term_stops_the_run_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
     honest, calls = SequenceELBO.terms, []
 
     def broken(self, model, batch, **options):
@@ -303,17 +303,17 @@ def test_a_term_that_is_not_finite_stops_the_run_and_leaves_the_last_checkpoint(
         return result
 
     monkeypatch.setattr(SequenceELBO, "terms", broken)
-    model, kept = build(), {}
+    model, checkpoint = build(), {}
     with pytest.raises(NonFiniteError, match="sequences"):
-        run(model, out=tmp_path, callbacks=[At(20, lambda state: kept.update(weights(state.model)))])
+        run(model, out=tmp_path, callbacks=[At(20, lambda state: checkpoint.update(weights(state.model)))])
     assert Run(tmp_path).state["status"] == "failed"
-    assert same(load_file(tmp_path / "last.safetensors"), kept)
+    assert same(load_file(tmp_path / "last.safetensors"), checkpoint)
     assert all(torch.isfinite(value).all() for value in weights(model).values())
     monkeypatch.setattr(SequenceELBO, "terms", honest)
     assert run(build(seed=9), out=tmp_path, resume=True).step == 60
 
 
-def test_a_gradient_or_weight_that_is_not_finite_is_named():
+def test_a_nonfinite_gradient_or_weight_is_named():
     def steep(terms, step):
         return Evidence()(terms, step) + (terms.kl["z"].sum() * 0).sqrt()
 
@@ -326,10 +326,10 @@ def test_a_gradient_or_weight_that_is_not_finite_is_named():
         run(objective=lambda terms, step: Evidence()(terms, step) * math.nan)
 
 
-# What is refused --------------------
+# Errors --------------------
 
 
-def test_options_that_do_not_exist_or_make_sense_are_refused():
+def test_unknown_or_invalid_options_are_errors():
     with pytest.raises(TypeError, match="option"):
         run(step=5)
     with pytest.raises(TypeError, match="options"):
@@ -349,7 +349,7 @@ def finished(tmp_path):
     return tmp_path
 
 
-def test_a_run_is_neither_overwritten_nor_resumed_by_accident(finished):
+def test_an_existing_run_is_never_overwritten_or_resumed_implicitly(finished):
     with pytest.raises(CheckpointError, match="continue"):
         run(out=finished)
     state = json.loads((finished / "state.json").read_text())
@@ -367,7 +367,7 @@ def test_a_run_is_neither_overwritten_nor_resumed_by_accident(finished):
     ("name", "damage"),
     [("best.safetensors", "flipped"), ("last.safetensors", "truncated"), ("last.state.safetensors", "missing")],
 )
-def test_damaged_files_are_refused_by_name(finished, name, damage):
+def test_a_damaged_file_is_an_error_with_its_name(finished, name, damage):
     path = finished / name
     content = bytearray(path.read_bytes())
     content[-5] ^= 1
@@ -387,7 +387,7 @@ def test_damaged_files_are_refused_by_name(finished, name, damage):
         ({"fingerprints": {"last.safetensors": None}}, "fingerprints"),
     ],
 )
-def test_a_state_that_verifies_nothing_is_refused(finished, state, message):
+def test_a_state_without_fingerprints_is_an_error(finished, state, message):
     (finished / "state.json").write_text(json.dumps(state))
     for path in (finished, finished / "best.safetensors"):
         with pytest.raises(CheckpointError, match=message):
@@ -396,7 +396,7 @@ def test_a_state_that_verifies_nothing_is_refused(finished, state, message):
         run(out=finished, steps=10, resume=True)
 
 
-def test_the_weights_of_another_model_are_refused(finished, tmp_path):
+def test_weights_of_another_model_are_an_error(finished, tmp_path):
     with pytest.raises(CheckpointError, match="weights"):
         load_weights(build(latent=3), finished)
     with pytest.raises(CheckpointError, match="another model"):
@@ -431,19 +431,19 @@ STATE |= {"last_value": None, "processor_seconds": 0.0}
 
 
 @given(st.integers(0, 8))
-def test_a_process_killed_at_any_moment_leaves_a_whole_checkpoint(tmp_path_factory, moment):
+def test_a_process_killed_at_any_moment_leaves_an_intact_checkpoint(tmp_path_factory, moment):
     path = tmp_path_factory.mktemp("run")
     files = {name: name.encode() * 3 for name in ("last.safetensors", "last.state.safetensors")}
     Run(path).commit(STATE | {"step": 1}, {name: b"1" + content for name, content in files.items()})
-    left = [moment]
+    remaining = [moment]
 
     class Killed(BaseException):
         pass
 
     def mortal(function):
         def call(*arguments):
-            left[0] -= 1
-            if left[0] < 0:
+            remaining[0] -= 1
+            if remaining[0] < 0:
                 raise Killed
             function(*arguments)
 
@@ -472,7 +472,7 @@ def test_every_tracker_receives_every_row(tmp_path):
     assert list((tmp_path / "board").glob("events.*"))
 
 
-def test_json_lines_survive_a_line_that_was_cut_off(tmp_path):
+def test_json_lines_ignore_a_truncated_last_line(tmp_path):
     path = tmp_path / "log.jsonl"
     path.write_text('{"step": 1, "loss": 2.0}\n{"step": 2, "loss": 1.0}\n{"step": 3, "lo')
     log = JSONLines(path)

@@ -1,4 +1,4 @@
-"""Weights that adapt: they balance what the paper says, belong to one run, and are as they were when it goes on."""
+"""GradNorm: weights balance gradients as in the paper, belong to one run, and are restored on resuming."""
 
 import math
 
@@ -20,19 +20,19 @@ from dvae.inference.training.schedules import Ramp
 from dvae.program.model import DynamicalVAE
 
 
-def alone(value):
-    """The mean over one process."""
+def single_process_mean(value):
+    """Return the mean over one process."""
     return value
 
 
 def energies(**values):
-    """Terms of two frames, each energy as given."""
+    """Return terms of two frames with the given energies."""
     tables = {name: value.reshape(1) for name, value in values.items()}
     return dvae.Terms({}, {}, tables, torch.full((1,), 2.0).double())
 
 
 class Linear(torch.nn.Module):
-    """Three tasks on one matrix, each a squared error: L_i = scale_i |W x - y_i|^2 / 2 by two frames."""
+    """Three tasks on one matrix, with losses L_i = scale_i |W x - y_i|^2 / 2 over two frames."""
 
     def __init__(self, scales=(1.0, 30.0, 0.2)):
         super().__init__()
@@ -47,20 +47,20 @@ class Linear(torch.nn.Module):
         return tuple(f"task{i}" for i in range(len(self.scales)))
 
     def terms(self):
-        found = [s * ((self.shared @ self.x - y) ** 2).sum() for s, y in zip(self.scales, self.y)]
-        return energies(**dict(zip(self.names, found)))
+        losses = [s * ((self.shared @ self.x - y) ** 2).sum() for s, y in zip(self.scales, self.y)]
+        return energies(**dict(zip(self.names, losses)))
 
     def losses(self):
         return torch.stack(list(self.terms().energies.values())).flatten().detach() / 2
 
     def norms(self):
-        """Of the gradient of s |W x - y|^2 / 2, which is s (W x - y) x^T."""
+        """Return the norms of the gradients of s |W x - y|^2 / 2, which are s (W x - y) x^T."""
         miss = self.shared.detach() @ self.x - self.y
         return torch.tensor(self.scales).double() * miss.norm(dim=1) * self.x.norm()
 
 
 def run(model=None, **options):
-    """A short quiet run of a model with two energies."""
+    """Run a short, quiet fit of a model with two energies."""
     defaults = {"batch_size": 8, "log_every": 1, "validate_every": 20, "progress": False, "learning_rate": 0.02}
     if "stages" not in options:
         defaults |= {"steps": 30, "objective": BALANCED}
@@ -68,7 +68,7 @@ def run(model=None, **options):
 
 
 class Scaled(DynamicalVAE):
-    """Energies of one gradient, and one that is another."""
+    """Energies of three tasks; two of them have the same gradient."""
 
     def penalties(self, rollout, batch, draws):
         means = rollout.parameters("x", rollout.values["x"])[0]
@@ -88,8 +88,8 @@ def weighing(result, name):
 
 
 @pytest.mark.parametrize("asymmetry", [0.0, 1.5])
-def test_a_step_is_down_the_slope_of_the_papers_loss(asymmetry):
-    """By central differences in log w of sum_i |w_i |grad L_i| - target_i| / Gbar, with gradients written by hand."""
+def test_a_step_descends_the_loss_of_the_paper(asymmetry):
+    """Compare with central differences in log w of sum_i |w_i |grad L_i| - target_i| / Gbar."""
     model = Linear(scales=(1.0, 2.0, 0.5))
     balance = GradNorm(model.names, "shared", asymmetry=asymmetry, learning_rate=0.05).begin(model)
     first, expected, h = model.losses(), torch.ones(3).double(), 1e-6
@@ -101,14 +101,14 @@ def test_a_step_is_down_the_slope_of_the_papers_loss(asymmetry):
         def imbalance(logarithms, norms=norms, target=target, mean=mean):
             return (logarithms.exp() * norms - target).abs().sum() / mean
 
-        moved = [
+        updated = [
             (imbalance(expected.log() + h * axis) - imbalance(expected.log() - h * axis)) / (2 * h)
             for axis in torch.eye(3).double()
         ]
-        expected = (expected.log() - 0.05 * torch.stack(moved)).exp()
+        expected = (expected.log() - 0.05 * torch.stack(updated)).exp()
         expected = expected * 3 / expected.sum()
         balance.measure(model.terms())
-        balance.adapt(alone)
+        balance.adapt(single_process_mean)
         torch.testing.assert_close(balance.weights, expected, rtol=1e-7, atol=0)
         with torch.no_grad():  # tasks train at different rates
             model.shared += 0.05 * torch.outer(model.y[0] - model.shared @ model.x, model.x)
@@ -116,7 +116,7 @@ def test_a_step_is_down_the_slope_of_the_papers_loss(asymmetry):
 
 @given(st.data())
 def test_weights_are_positive_and_add_up_to_the_number_of_tasks(data):
-    """Whatever losses and gradients are, those of 0 among them."""
+    """Test all losses and gradients, also 0."""
     tasks = data.draw(st.integers(2, 5))
     size = st.lists(st.sampled_from([0.0, 1e-30, 1e-3, 1.0, 7.0, 1e4, 1e30]), min_size=tasks, max_size=tasks)
     names = tuple(map(str, range(tasks)))
@@ -128,12 +128,12 @@ def test_weights_are_positive_and_add_up_to_the_number_of_tasks(data):
         slopes, losses = data.draw(size), data.draw(size) if step else [1.0] * tasks
         values = [slope * (weight - weight.detach()) + loss for slope, loss in zip(slopes, losses, strict=True)]
         balance.measure(energies(**dict(zip(names, values, strict=True))))
-        balance.adapt(alone)
+        balance.adapt(single_process_mean)
         assert (balance.weights > 0).all()
         assert balance.weights.sum().item() == pytest.approx(tasks)
 
 
-def test_the_loss_is_the_weighted_tasks_and_the_other_terms_as_evidence_has_them():
+def test_the_loss_is_the_weighted_tasks_plus_the_evidence_terms():
     result = run(objective=MIXED, steps=25)
     for row in result.history:
         kl = min(0.1 * (row["step"] - 1) / 4, 0.1) * row["kl/z"]
@@ -144,7 +144,7 @@ def test_the_loss_is_the_weighted_tasks_and_the_other_terms_as_evidence_has_them
     assert weighing(result, "x")[-1] != 1.0
 
 
-def test_validation_losses_have_weights_of_1_and_can_be_compared():
+def test_validation_losses_have_weights_of_1():
     objective = GradNorm(("small", "large"), "generator.x.", Evidence(select="loss"), learning_rate=0.1)
     result = run(objective=objective, validation=TRAIN, steps=40)
     for row in result.history:
@@ -161,20 +161,20 @@ STAGED = [Stage(9, BALANCED), Stage(8, MIXED, learning_rate=0.01), Stage(4), Sta
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The history and the last weights of a run that is not interrupted."""
+def uninterrupted(tmp_path_factory):
+    """Return the history and last weights of an uninterrupted run."""
     place = tmp_path_factory.mktemp("whole")
     return run(stages=STAGED, out=place).history, load_file(place / "last.safetensors")
 
 
 @pytest.mark.parametrize("stop", [9, 13])
-def test_an_interrupted_run_has_its_weights_back_bit_for_bit(tmp_path, whole, stop):
+def test_an_interrupted_run_restores_its_weights_bit_for_bit(tmp_path, uninterrupted, stop):
     with pytest.raises(Interrupted):
         run(stages=STAGED, out=tmp_path, callbacks=[At(stop, interrupt)])
     resumed = run(build(9, kind=Scaled), stages=STAGED, out=tmp_path, resume=True)
     last = load_file(tmp_path / "last.safetensors")
-    assert resumed.history == whole[0]
-    assert all(torch.equal(value, last[name]) for name, value in whole[1].items())
+    assert resumed.history == uninterrupted[0]
+    assert all(torch.equal(value, last[name]) for name, value in uninterrupted[1].items())
 
 
 def test_every_stage_begins_with_weights_of_1():
@@ -187,16 +187,16 @@ def test_every_stage_begins_with_weights_of_1():
     assert not [name for name in rows[18] if name.startswith("weight/")]
 
 
-# What is refused --------------------
+# Errors --------------------
 
 
-def test_a_model_without_the_shared_layer_is_refused_before_its_stage_comes():
-    lost = GradNorm(("small", "large"), "decoder.last")
+def test_a_model_without_the_shared_layer_is_an_error_before_training():
+    objective = GradNorm(("small", "large"), "decoder.last")
     with pytest.raises(ValueError, match="starts with"):
-        dvae.SVI(build(kind=Scaled), stages=[Stage(5), Stage(5, lost)])
+        dvae.SVI(build(kind=Scaled), stages=[Stage(5), Stage(5, objective)])
 
 
-def test_a_task_that_does_not_go_through_the_shared_parameters_is_refused():
+def test_a_task_without_shared_parameters_is_an_error():
     model = Linear(scales=(1.0,))
     balance = GradNorm(("task0", "own"), "shared", asymmetry=0.0).begin(model)
     terms = energies(task0=model.terms().energies["task0"], own=model.own.sum())
@@ -212,10 +212,10 @@ def test_a_task_that_does_not_go_through_the_shared_parameters_is_refused():
         ({"weight/small": 3.0}, "positive numbers"),
     ],
 )
-def test_a_state_that_no_run_writes_is_refused_in_a_sentence(tmp_path, change, message):
-    """Signed as its author would."""
+def test_an_impossible_state_is_an_error(tmp_path, change, message):
+    """The file has a valid fingerprint."""
     run(steps=5, objective=BALANCED, out=tmp_path)
-    changed = {f"objective/{name}": torch.tensor(value, dtype=torch.float64) for name, value in change.items()}
-    Run(tmp_path).commit(Run(tmp_path).state, {OPTIMISER: save(Run(tmp_path).optimiser_state() | changed)})
+    altered = {f"objective/{name}": torch.tensor(value, dtype=torch.float64) for name, value in change.items()}
+    Run(tmp_path).commit(Run(tmp_path).state, {OPTIMISER: save(Run(tmp_path).optimiser_state() | altered)})
     with pytest.raises(CheckpointError, match=message):
         run(build(9, kind=Scaled), steps=10, objective=BALANCED, out=tmp_path, resume=True)

@@ -1,4 +1,4 @@
-"""Several processes: together they are one that has all their batches, and what one that is lost takes with it."""
+"""Several processes: together they equal one process with all batches, and they stop together."""
 
 import os
 import signal
@@ -38,20 +38,20 @@ def walks(n):
 
 
 def stepped(batches):
-    """Weights after a step on each batch, and the terms of all of them, by a model that draws nothing."""
+    """Take a step on each batch with a model that draws nothing; return weights and terms."""
     svi = SVI(model("p(x_t | x_{t-1})", None), **OPTIONS, weight_decay=0.1)
     svi.init()
     for batch in batches:
         svi.step(batch)
-    scores = [svi.evaluate(Sequences(walks(n))) for n in (9, 1)]  # of one sequence one of two processes has none
+    scores = [svi.evaluate(Sequences(walks(n))) for n in (9, 1)]  # with one sequence, one of the two processes has none
     return svi.model.state_dict(), scores
 
 
 def fitted(out, **options):
-    """What is left of a run in several processes: its weights, or how it failed."""
+    """Return the weights of a run in several processes, or its error."""
     try:
-        found = fit(model(*EQUATIONS), walks(12), walks(6), out=out, **OPTIONS | options)
-        return {"how": (found.status, found.step), "weights": found.model.state_dict()}
+        fit_result = fit(model(*EQUATIONS), walks(12), walks(6), out=out, **OPTIONS | options)
+        return {"how": (fit_result.status, fit_result.step), "weights": fit_result.model.state_dict()}
     except LostProcess as error:
         return {"how": str(error)}
 
@@ -65,7 +65,7 @@ def joint(rank, out):
 
 
 def some_gradients(rank, out):
-    """Of three parameters the second has a gradient in one process, the third in none."""
+    """One process has a gradient for the second of three parameters, none has one for the third."""
     parameters = [torch.nn.Parameter(torch.ones(2)) for _ in range(3)]
     parameters[0].grad = torch.full((2,), 1.0 + rank)
     parameters[1].grad = torch.ones(2) if rank else None
@@ -92,17 +92,23 @@ def stopped(rank, out):
 
 
 def play(out, *names):
-    """Each of these functions in two processes, forked from one that has imported all, as if torchrun had."""
+    """Call each of these functions in two forked processes with the environment of torchrun."""
     launch(Training())  # which imports fabric
     for name in names:
-        with socket.socket() as found:
-            found.bind(("127.0.0.1", 0))
-            port = found.getsockname()[1]
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
         started = []
         for rank in range(2):
             if not (child := os.fork()):
-                told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "MASTER_PORT": port}
-                os.environ |= {key: str(value) for key, value in told.items()}
+                environment = {
+                    "RANK": rank,
+                    "LOCAL_RANK": rank,
+                    "WORLD_SIZE": 2,
+                    "LOCAL_WORLD_SIZE": 2,
+                    "MASTER_PORT": port,
+                }
+                os.environ |= {key: str(value) for key, value in environment.items()}
                 os.environ |= {"MASTER_ADDR": "127.0.0.1", "TORCHELASTIC_RUN_ID": "none"}
                 torch.save(globals()[name](rank, Path(out)), f"{out}/{name}-{rank}.pt")
                 os._exit(0)
@@ -115,7 +121,7 @@ def play(out, *names):
 
 @pytest.fixture(scope="module")
 def of_two(tmp_path_factory):
-    """What each function has left in both processes."""
+    """Return the results of each function in both processes."""
     if not torch.distributed.is_available():
         pytest.skip("this torch is built without torch.distributed")
     out = tmp_path_factory.mktemp("processes")
@@ -123,19 +129,19 @@ def of_two(tmp_path_factory):
     here = Path(__file__).parent
     paths = os.pathsep.join(map(str, (here.parents[2], here.parents[1], here)))
     script = "import sys, test_processes; test_processes.play(*sys.argv[1:])"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", script, str(out), *names],
         env=os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         timeout=120,
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
 
-    def read(name):
+    def results(name):
         return [torch.load(file) for rank in (0, 1) if (file := out / f"{name}-{rank}.pt").exists()]
 
-    return read, out
+    return results, out
 
 
 pytestmark = pytest.mark.slow
@@ -144,15 +150,15 @@ pytestmark = pytest.mark.slow
 # ------------------------------------------------------------------------------------------------ distributions
 
 
-def test_they_are_one_process_with_the_batches_of_all(of_two):
-    """Also where their batches have different numbers of frames; and of what is validated each scores a share."""
+def test_processes_equal_one_process_with_all_batches(of_two):
+    """Test also batches with different numbers of frames, and validation split among processes."""
     expected = stepped([walks(9)] * 3)
     first, second = of_two[0]("joint")
     torch.testing.assert_close(first, second, rtol=0, atol=0)
     torch.testing.assert_close(first, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_a_parameter_has_no_gradient_where_it_has_none_in_any_process(of_two):
+def test_a_parameter_without_a_gradient_in_every_process_has_none(of_two):
     for rank, ((both, one, none), loss, share) in enumerate(of_two[0]("some_gradients")):
         assert none is None
         torch.testing.assert_close(both, torch.full((2,), (1 + 3 * 2) / 4))
@@ -160,32 +166,32 @@ def test_a_parameter_has_no_gradient_where_it_has_none_in_any_process(of_two):
         assert (float(loss), float(share)) == ((2 + 3 * 1) / 4, (1 + 2 * rank) / 4)
 
 
-def test_they_draw_differently_and_have_the_same_weights(of_two):
-    first, second = (found["weights"] for found in of_two[0]("whole"))
+def test_processes_draw_differently_and_keep_equal_weights(of_two):
+    first, second = (result["weights"] for result in of_two[0]("whole"))
     assert all(torch.equal(first[name], second[name]) for name in first)
     state = Run(of_two[1] / "whole").optimiser_state()
     for name in ("random/generator", "random/torch"):
         assert not torch.equal(*state[name])
 
 
-def test_a_process_that_is_killed_stops_the_others_and_costs_no_more_than_the_steps_since_the_checkpoint(of_two):
-    read, out = of_two
-    (said,) = [found["how"] for found in read("killed")]
-    assert "another process of this run has ended" in said
+def test_a_killed_process_stops_the_others_and_loses_only_steps_since_the_checkpoint(of_two):
+    results, out = of_two
+    (reason,) = [result["how"] for result in results("killed")]
+    assert "another process of this run has ended" in reason
     for name in ("log.jsonl", "best.safetensors", "last.safetensors"):
         assert (out / "run" / name).read_bytes() == (out / "whole" / name).read_bytes()
 
 
-def test_what_asks_one_of_them_to_stop_stops_all(of_two):
-    assert [found["how"] for found in of_two[0]("stopped")] == [("stopped early", 6)] * 2
+def test_a_stop_request_to_one_process_stops_all(of_two):
+    assert [result["how"] for result in of_two[0]("stopped")] == [("stopped early", 6)] * 2
 
 
-def test_streams_are_of_one_process_of_one_seed():
+def test_random_streams_differ_by_process_and_seed():
     assert [seed_of(seed, 0) for seed in (-1, 0, 7)] == [-1, 0, 7]
     assert len({seed_of(seed, rank) for seed, rank in product(range(-20, 20), range(20))}) == 800
 
 
-def test_what_cannot_be_started_is_told(monkeypatch):
+def test_an_impossible_launch_is_an_error(monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(ValueError, match="accelerator"):
         processes.launch(Training(accelerator="mps"))
@@ -194,8 +200,8 @@ def test_what_cannot_be_started_is_told(monkeypatch):
         processes.launch(Training(accelerator="cpu", devices=2))
 
 
-def test_torchrun_says_how_many_processes_there_are(monkeypatch):
-    assert processes._count_processes(2) == (2, 1)
+def test_torchrun_sets_the_number_of_processes(monkeypatch):
+    assert processes._places(2) == (2, 1)
     for name, value in {"TORCHELASTIC_RUN_ID": "none", "LOCAL_WORLD_SIZE": "2", "WORLD_SIZE": "6"}.items():
         monkeypatch.setenv(name, value)
     assert processes._count_processes(1) == processes._count_processes(2) == (2, 3)

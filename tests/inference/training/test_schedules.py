@@ -1,4 +1,4 @@
-"""Schedules: their ends, their shape, their JSON form, and what happens to one that outlasts the run."""
+"""Schedules: ends, shape, JSON form, and clamping to the length of a run."""
 
 import json
 import math
@@ -52,14 +52,14 @@ def test_a_ramp_is_half_way_in_the_middle(kind):
     assert kind(0.0, 2.0, steps=100, delay=10)(60) == pytest.approx(1.0)
 
 
-def test_a_saturating_rise_is_a_weight_that_nears_its_end_by_a_share_a_step():
+def test_a_saturating_rise_approaches_its_end_by_a_fixed_share_per_step():
     steps, rate = 200, 0.99
     rise = Saturating(0.0, 5 * (1 - rate**steps), steps, steepness=-steps * math.log(rate))
     assert [rise(step) for step in (1, 50, 200)] == pytest.approx([5 * (1 - rate**step) for step in (1, 50, 200)])
     assert Saturating(0.0, 1.0, 100, steepness=1e-9)(25) == pytest.approx(0.25)
 
 
-def test_piecewise_goes_through_its_points_in_lines_and_jumps_to_the_later_of_two():
+def test_piecewise_interpolates_its_points_and_jumps_where_two_coincide():
     cycle = Piecewise(((10, 0.0), (20, 1.0), (20, 0.0), (30, 1.0)))
     assert [cycle(step) for step in (0, 10, 15, 19, 20, 25, 30, 99)] == pytest.approx([0, 0, 0.5, 0.9, 0, 0.5, 1, 1])
 
@@ -69,7 +69,7 @@ def test_json_round_trip(value):
     assert from_config(json.loads(json.dumps(to_config(value)))) == value
 
 
-def test_numbers_are_constant_schedules_and_other_things_are_refused():
+def test_numbers_are_constant_schedules_and_other_types_are_errors():
     assert schedule(0.5)(10**9) == 0.5
     assert schedule(Ramp(0.0, 1.0, 5)) == Ramp(0.0, 1.0, 5)
     for wrong in ("0.1", True, None, lambda step: 0.1):
@@ -86,7 +86,7 @@ def test_a_clamped_schedule_reaches_its_end_value_within_the_run(value, steps):
     assert clamped(0) == pytest.approx(value(0), abs=1e-9) or isinstance(value, Piecewise)
 
 
-def test_clamping_says_what_it_changed_and_leaves_the_rest_alone():
+def test_clamping_warns_of_what_it_changes_and_changes_nothing_else():
     objective = Evidence(kl_weight={"w": 0.5, "z": Ramp(0.0, 1.0, steps=800, delay=200)})
     with pytest.warns(UserWarning, match="shortened"):
         clamped = clamp(objective, 100)

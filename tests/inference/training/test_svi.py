@@ -1,4 +1,4 @@
-"""The loop by hand: steps of one's own are those of `fit`, bit for bit, and leave the caller's random state alone."""
+"""`dvae.SVI`: steps by hand repeat `fit` bit for bit and keep the caller's random state."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ RUNS = {
 
 
 def by_hand(loop, until=STEPS):
-    """Steps up to one, with validations; the rows of the log. What else the caller does changes nothing."""
+    """Take steps up to `until`, with validations, while the caller draws random numbers; return the rows of the log."""
     source, rows = Sequences({"x": TRAIN}), []
     while loop.state.step < until:
         loop.step(source.sample(8, loop.generator))
@@ -45,23 +45,23 @@ def by_hand(loop, until=STEPS):
 
 
 @pytest.mark.parametrize("options", RUNS.values(), ids=RUNS)
-def test_steps_by_hand_repeat_a_fit_and_go_on_from_a_checkpoint_bit_for_bit(tmp_path, options):
-    fitted = build()
-    result = dvae.fit(fitted, TRAIN, HELD_OUT, **SHARED, **options)
-    whole, resumed = (dvae.SVI(build(seed), **SHARED, **options) for seed in (0, 9))
-    for loop in (whole, resumed):
+def test_steps_by_hand_repeat_a_fit_and_resume_bit_for_bit(tmp_path, options):
+    fit_model = build()
+    result = dvae.fit(fit_model, TRAIN, HELD_OUT, **SHARED, **options)
+    uninterrupted, resumed = (dvae.SVI(build(seed), **SHARED, **options) for seed in (0, 9))
+    for loop in (uninterrupted, resumed):
         loop.init()
-    before = by_hand(whole, until=15)
-    store(whole, Run(tmp_path))
+    before = by_hand(uninterrupted, until=15)
+    store(uninterrupted, Run(tmp_path))
     restore(resumed, Run(tmp_path))
-    for loop in (whole, resumed):
+    for loop in (uninterrupted, resumed):
         assert before + by_hand(loop) == result.history
         assert (loop.state.best_step, loop.state.best_bound) == (result.best_step, result.best_bound)
-        assert same(loop.state.best, weights(fitted))
-    assert same(weights(resumed.model), weights(whole.model))
+        assert same(loop.state.best, weights(fit_model))
+    assert same(weights(resumed.model), weights(uninterrupted.model))
 
 
-def test_the_callers_random_state_is_left_alone():
+def test_the_random_state_of_the_caller_is_unchanged():
     loop, before = dvae.SVI(build(), steps=STEPS), torch.get_rng_state()
     loop.init()
     loop.step(TRAIN)
@@ -69,7 +69,7 @@ def test_the_callers_random_state_is_left_alone():
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_what_comes_too_early_is_refused_in_a_sentence():
+def test_steps_before_initialization_are_errors():
     loop = dvae.SVI(build())
     for early in (lambda: loop.step(TRAIN), lambda: loop.evaluate(HELD_OUT), lambda: loop.state):
         with pytest.raises(RuntimeError, match="begun"):

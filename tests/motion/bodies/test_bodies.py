@@ -1,4 +1,4 @@
-"""Bodies with a surface: skinning follows joints, the person is a person, files of others are read or refused."""
+"""Bodies with a surface: skinning follows joints, the default person is plausible, invalid body files are errors."""
 
 from collections import Counter
 
@@ -14,19 +14,19 @@ PERSON = human().double()
 
 
 def poses(body=PERSON, spread=0.7):
-    """Shapes (B, S), rotations (B, T, J, 3, 3) and translations (B, T, 3) of anybody."""
+    """Draw shapes (B, S), rotations (B, T, J, 3, 3) and translations (B, T, 3)."""
     vectors = spread * torch.randn(B, T, body.joints, 3, dtype=torch.float64)
     shape = torch.randn(B, body.parameters_of_shape, dtype=torch.float64)
     return shape, rotations.to_matrix(vectors, "vector"), torch.randn(B, T, 3, dtype=torch.float64)
 
 
 def edges(faces):
-    """Of triangles, each from one corner to the next one."""
+    """Return the directed edges of triangles."""
     return Counter(map(tuple, torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()))
 
 
 def parts(body):
-    """The faces of each part: those that hang together."""
+    """Return the faces of each connected part."""
     part = torch.arange(len(body.template))
     while True:
         least = part[body.faces].amin(1)
@@ -39,13 +39,13 @@ def parts(body):
 # ------------------------------------------------------------------------------------------------------- the person
 
 
-def test_every_part_of_the_person_is_closed_whoever_it_is():
-    """Each edge lies between two triangles that go along it in opposite directions, and something is inside."""
+def test_every_part_of_the_person_is_a_closed_surface_for_all_shapes():
+    """Each edge belongs to two triangles with opposite directions, and each part has a positive volume."""
     assert len(parts(PERSON)) == 11  # trunk, head, nose; legs, feet, arms and thumbs
     for faces in parts(PERSON):
-        found = edges(faces)
-        assert set(found.values()) == {1}
-        assert {(end, start) for start, end in found} == set(found)
+        directed_edges = edges(faces)
+        assert set(directed_edges.values()) == {1}
+        assert {(end, start) for start, end in directed_edges} == set(directed_edges)
         corners = torch.cartesian_prod(*[torch.tensor([-3.0, 3.0], dtype=torch.float64)] * len(SHAPE))
         assert (enclosed_volume(PERSON.at_rest(corners)[0], faces) > 0).all()
 
@@ -60,30 +60,32 @@ def test_every_part_of_the_person_is_closed_whoever_it_is():
         ("hips", ("L_Hip", "R_Hip")),
     ],
 )
-def test_a_length_is_changed_by_its_parameter_and_by_size_alone(name, ends):
+def test_only_its_parameter_and_size_change_a_length(name, ends):
     start, end = (PERSON.names.index(joint) for joint in ends)
     joints = PERSON.at_rest(torch.eye(len(SHAPE)).double())[1] - PERSON.at_rest(torch.zeros(8).double())[1]
-    moved = (joints[:, end] - joints[:, start]).norm(dim=-1) > 1e-6
-    assert {SHAPE[k] for k in moved.nonzero()} == {"size", name}
+    changed_lengths = (joints[:, end] - joints[:, start]).norm(dim=-1) > 1e-6
+    assert {SHAPE[k] for k in changed_lengths.nonzero()} == {"size", name}
 
 
 # --------------------------------------------------------------------------------------------------------- skinning
 
 
 def test_joints_are_those_of_forward_kinematics():
-    shape, turns, translation = poses()
+    shape, joint_rotations, translation = poses()
     pivots = PERSON.at_rest(shape)[1]
     offsets = pivots - pivots[:, [max(parent, 0) for parent in PERSON.parents]]
-    expected, _ = kinematics.forward(PERSON.parents, turns, offsets[:, None], pivots[:, None, 0] + translation)
-    torch.testing.assert_close(PERSON(shape, turns, translation)[1], expected)
+    expected, _ = kinematics.forward(
+        PERSON.parents, joint_rotations, offsets[:, None], pivots[:, None, 0] + translation
+    )
+    torch.testing.assert_close(PERSON(shape, joint_rotations, translation)[1], expected)
 
 
 def test_a_surface_is_the_weighted_sum_of_rigid_ones():
-    """The product of matrices against the formula, vertex by vertex and joint by joint."""
-    shape, turns, translation = poses()
+    """Compare the matrix product with the formula for each vertex and joint."""
+    shape, joint_rotations, translation = poses()
     resting, pivots = PERSON.at_rest(shape)
-    vertices, joints = PERSON(shape, turns, translation)
-    world = kinematics.forward(PERSON.parents, turns, torch.zeros(22, 3).double(), translation)[1]
+    vertices, joints = PERSON(shape, joint_rotations, translation)
+    world = kinematics.forward(PERSON.parents, joint_rotations, torch.zeros(22, 3).double(), translation)[1]
     expected = torch.zeros_like(vertices)
     for joint in range(PERSON.joints):
         rigid = (resting - pivots[:, joint, None])[:, None] @ world[:, :, joint].mT + joints[:, :, joint, None]
@@ -91,48 +93,48 @@ def test_a_surface_is_the_weighted_sum_of_rigid_ones():
     torch.testing.assert_close(vertices, expected)
 
 
-def test_whoever_walks_far_keeps_the_same_surface():
-    """But for rounding places so far away, 2^-24 of them each time; weights that add up to 1 - 1e-7 stretch nobody."""
-    body, (shape, turns, translation) = human(), (tensor.float() for tensor in poses())
-    near, far = (body(shape, turns, translation + move)[0] for move in (0, 1024))
+def test_a_distant_translation_keeps_the_surface():
+    """The error is the rounding of large coordinates, 2^-24 of them; a sum of weights of 1 - 1e-7 stretches nothing."""
+    body, (shape, joint_rotations, translation) = human(), (tensor.float() for tensor in poses())
+    near, far = (body(shape, joint_rotations, translation + move)[0] for move in (0, 1024))
     torch.testing.assert_close(far - 1024, near, atol=3 * 1024 / 2**24, rtol=0)
 
 
 def test_gradients_are_right():
-    shape, turns, translation = poses()
-    given = (shape[:2], rotations.from_matrix(turns[:2, :2], "6d"), translation[:2, :2])
+    shape, joint_rotations, translation = poses()
+    arguments = (shape[:2], rotations.from_matrix(joint_rotations[:2, :2], "6d"), translation[:2, :2])
 
     def surface(shape, numbers, translation):
         return PERSON(shape, rotations.to_matrix(numbers, "6d"), translation)
 
-    assert torch.autograd.gradcheck(surface, [tensor.requires_grad_() for tensor in given], fast_mode=True)
+    assert torch.autograd.gradcheck(surface, [tensor.requires_grad_() for tensor in arguments], fast_mode=True)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_are_finite_where_nothing_is_turned_and_nothing_is_wrong(dtype):
+def test_gradients_are_finite_at_the_rest_pose_with_zero_error(dtype):
     body = human().to(dtype)
-    given = [torch.zeros(2, 8), torch.eye(3).repeat(2, T, 22, 1, 1), torch.zeros(2, T, 3)]
-    given = [tensor.to(dtype).requires_grad_() for tensor in given]
-    vertices, _ = body(*given)
+    arguments = [torch.zeros(2, 8), torch.eye(3).repeat(2, T, 22, 1, 1), torch.zeros(2, T, 3)]
+    arguments = [tensor.to(dtype).requires_grad_() for tensor in arguments]
+    vertices, _ = body(*arguments)
     assert vertices.dtype == dtype
     vertex_error(vertices, vertices.detach()).sum().backward(retain_graph=True)
-    assert all(tensor.grad.isfinite().all() for tensor in given)
+    assert all(tensor.grad.isfinite().all() for tensor in arguments)
     (enclosed_volume(vertices, body.faces) + vertices.square().mean((-2, -1))).sum().backward()
-    assert all(tensor.grad.isfinite().all() and tensor.grad.any() for tensor in given)
+    assert all(tensor.grad.isfinite().all() and tensor.grad.any() for tensor in arguments)
 
 
-def test_a_body_is_no_part_of_what_a_model_saves():
+def test_a_model_does_not_save_its_body():
     assert not torch.nn.Sequential(human()).state_dict()
 
 
-def test_sizes_that_do_not_fit_are_refused():
-    shape, turns, translation = poses()
+def test_mismatched_sizes_are_errors():
+    shape, joint_rotations, translation = poses()
     with pytest.raises(ValueError, match=r"rotations \(..., T, 22, 3, 3\)"):
-        PERSON(shape, turns[:, :, :20], translation)
+        PERSON(shape, joint_rotations[:, :, :20], translation)
     with pytest.raises(ValueError, match=r"translation"):
-        PERSON(shape[:2], turns, translation)
+        PERSON(shape[:2], joint_rotations, translation)
     with pytest.raises(ValueError, match=r"expected \(..., 8\)"):
-        PERSON(shape[:, :7], turns, translation)
+        PERSON(shape[:, :7], joint_rotations, translation)
     with pytest.raises(ValueError, match="regressor has shape"):
         Body(PERSON.names, PERSON.parents, PERSON.template, PERSON.shapes, PERSON.weights, PERSON.weights, PERSON.faces)
 
@@ -140,25 +142,25 @@ def test_sizes_that_do_not_fit_are_refused():
 # --------------------------------------------------------------------------------------------------------- measures
 
 
-def test_the_volume_of_a_cube_and_how_far_it_is_moved():
+def test_the_volume_and_vertex_error_of_a_moved_cube():
     corners = torch.cartesian_prod(*[torch.tensor([0.0, 2.0])] * 3)
     squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = torch.tensor([[a, *rest] for a, b, c, d in squares for rest in ((b, c), (c, d))])
     assert enclosed_volume(corners, faces) == 8
     torch.testing.assert_close(enclosed_volume(corners + torch.tensor([5.0, -7.0, 3.0]), faces), torch.tensor(8.0))
     frames = corners.repeat(2, 3, 1, 1)  # two sequences of three frames
-    moved = frames.clone()
-    moved[0, 0] += torch.tensor([0.3, 0.4, 0.0])
-    torch.testing.assert_close(vertex_error(moved, frames), torch.tensor([0.5 / 3, 0.0]))
+    translated = frames.clone()
+    translated[0, 0] += torch.tensor([0.3, 0.4, 0.0])
+    torch.testing.assert_close(vertex_error(translated, frames), torch.tensor([0.5 / 3, 0.0]))
     with pytest.raises(ValueError, match="of one shape"):
-        vertex_error(moved, frames[:1])
+        vertex_error(translated, frames[:1])
 
 
 # ------------------------------------------------------------------------------------------------------------ files
 
 
 def arrays(body):
-    """The members of a file of a body, as `smplx` names them."""
+    """Return the members of a body file as `smplx` names them."""
     tree = np.array([body.parents, range(body.joints)]).astype(np.uint32)  # the root's parent is 2**32 - 1
     members = {"v_template": body.template, "shapedirs": body.shapes, "J_regressor": body.regressor}
     return {name: tensor.numpy() for name, tensor in {**members, "weights": body.weights, "f": body.faces}.items()} | {
@@ -170,18 +172,18 @@ def write_body(path, body):
     np.savez(path, **arrays(body))
 
 
-def test_a_body_in_the_layout_of_smplx_is_read_as_it_was(tmp_path):
-    written = human()
-    write_body(tmp_path / "body.npz", written)
+def test_a_body_in_the_layout_of_smplx_is_read_unchanged(tmp_path):
+    person = human()
+    write_body(tmp_path / "body.npz", person)
     body = read_body(tmp_path / "body.npz")
-    assert (body.names, body.parents) == (written.names, written.parents)
-    for name, tensor in written.named_buffers():
+    assert (body.names, body.parents) == (person.names, person.parents)
+    for name, tensor in person.named_buffers():
         torch.testing.assert_close(getattr(body, name), tensor, atol=0, rtol=0)
-    assert read_body(tmp_path / "body.npz", shapes=3).shapes.equal(written.shapes[..., :3])
+    assert read_body(tmp_path / "body.npz", shapes=3).shapes.equal(person.shapes[..., :3])
 
 
-def test_hands_that_are_not_turned_move_with_the_wrist(tmp_path):
-    """As SMPL-H has it: more joints, of which nothing is turned; numbers are float64, and other members pickled."""
+def test_hands_without_rotations_move_with_the_wrist(tmp_path):
+    """As in SMPL-H: more joints without rotations, numbers in float64, other members pickled."""
     members = arrays(human())
     wrist, vertices = human().names.index("L_Wrist"), len(members["v_template"])
     finger = np.flatnonzero(members["weights"][:, wrist] > 0.9)
@@ -219,7 +221,7 @@ def changed(name, change):
         (changed("kintree_table", lambda a: a[:, :5]), "expected whole numbers"),
     ],
 )
-def test_files_that_are_no_body_are_refused_in_a_sentence(tmp_path, change, message):
+def test_files_that_are_no_body_are_errors(tmp_path, change, message):
     members = arrays(human())
     change(members)
     np.savez(tmp_path / "wrong.npz", **members)
@@ -232,16 +234,16 @@ def test_files_that_are_no_body_are_refused_in_a_sentence(tmp_path, change, mess
     ("limit", "most", "message"),
     [("LARGEST", 100, "a body has at most 100"), ("MOST_VERTICES", 1000, "1,486 vertices; a body has at most 1,000")],
 )
-def test_a_file_larger_than_any_body_is_refused(tmp_path, monkeypatch, limit, most, message):
+def test_a_file_larger_than_any_body_is_an_error(tmp_path, monkeypatch, limit, most, message):
     write_body(tmp_path / "body.npz", human())
     monkeypatch.setattr(f"dvae.motion.bodies.smplx.{limit}", most)
     with pytest.raises(ValueError, match=message):
         read_body(tmp_path / "body.npz")
 
 
-def test_the_squared_error_is_that_of_vertices_though_none_is_made():
+def test_the_squared_error_equals_that_of_vertices_without_computing_them():
     shape, *first = poses()
     _, *second = poses()
-    away = PERSON(shape, *first)[0] - PERSON(shape, *second)[0]
-    torch.testing.assert_close(PERSON.squared_error(shape, first, second), away.square().sum(-1).mean(-1))
+    difference = PERSON(shape, *first)[0] - PERSON(shape, *second)[0]
+    torch.testing.assert_close(PERSON.squared_error(shape, first, second), difference.square().sum(-1).mean(-1))
     assert (PERSON.squared_error(shape, first, first) == 0).all()

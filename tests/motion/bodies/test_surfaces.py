@@ -1,4 +1,4 @@
-"""Pictures of bodies: they are the bodies themselves, side by side, upright and towards the viewer."""
+"""Pictures of bodies: side by side, upright and facing the viewer."""
 
 import io
 
@@ -14,8 +14,8 @@ PERSON = human()
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_bodies_stand_apart_upright_and_face_the_viewer(up):
-    """Of a symmetric body what is drawn is as high as it, and of its triangles those that face the viewer are drawn."""
+def test_bodies_are_drawn_side_by_side_upright_and_facing_the_viewer(up):
+    """A drawn symmetric body has the body's height, and only triangles that face the viewer are drawn."""
     people = PERSON.at_rest(torch.eye(8)[:5])[0]
     heights = (people[..., 1].amax(1) - people[..., 1].amin(1)).numpy()
     if up == "z":
@@ -35,13 +35,13 @@ def test_bodies_stand_apart_upright_and_face_the_viewer(up):
         surfaces(PERSON.faces, people[:, :9])
 
 
-def test_what_faces_the_viewer_is_drawn_the_nearest_in_front():
-    square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])  # faces +z, where the viewer is
+def test_visible_triangles_are_drawn_from_back_to_front():
+    square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])  # faces +z, towards the viewer
     roof = [[-0.5, 0.5, 1], [0.5, 0.5, 1], [0.5, 1, 0.2], [-0.5, 1, 0.2]]  # in front, turned to the light
     faces = np.array([[0, 1, 2], [0, 2, 3]])
 
     def middle(faces, vertices):
-        """The colour a little below the middle."""
+        """Return the colour slightly below the middle."""
         file = io.BytesIO()
         surfaces(faces, vertices).savefig(file, format="png")
         with Image.open(file) as image:

@@ -1,4 +1,4 @@
-"""Motion that lacks joints: read, cut, turned, fitted by every method, forecast, scored and filled in."""
+"""Motion with missing joints: reading, windows, representations, fitting, forecasts, scores and imputation."""
 
 import base64
 import json
@@ -51,20 +51,20 @@ SMALL = {
 
 
 def without(clips, **joints):
-    """Clips whose joints are NaN in some frames."""
-    found = []
+    """Return clips whose joints are NaN in some frames."""
+    clips_with_gaps = []
     for clip in clips:
         positions = clip.positions.copy()
         for name, frames in joints.items():
             positions[frames, WALKER.names.index(name)] = np.nan
-        found.append(Clip(clip.split, clip.name, positions, clip.labels))
-    return MotionSet(found, WALKER, "some", missing=True)
+        clips_with_gaps.append(Clip(clip.split, clip.name, positions, clip.labels))
+    return MotionSet(clips_with_gaps, WALKER, "some", missing=True)
 
 
 # ------------------------------------------------------------------------------------------------------ sets and files
 
 
-def test_missing_joints_are_refused_unless_they_are_allowed():
+def test_missing_joints_are_errors_unless_allowed():
     clips = list(GAPS)
     with pytest.raises(ValueError, match=r"has NaN or infinite positions.*missing=True \(--missing\) keeps the clip"):
         MotionSet(clips, WALKER)
@@ -75,7 +75,7 @@ def test_missing_joints_are_refused_unless_they_are_allowed():
     ("value", "message"),
     [(np.inf, "has infinite positions"), (np.nan, "has no joint that is observed in any of its 90 frames")],
 )
-def test_what_is_no_gap_is_refused(value, message):
+def test_other_invalid_positions_are_errors(value, message):
     clip = Clip("a", "b", np.full_like(PEOPLE.clips[0].positions, value))
     with pytest.raises(ValueError, match=message):
         MotionSet([clip], WALKER, missing=True)
@@ -88,38 +88,38 @@ def test_gaps_are_read_from_a_folder_and_an_archive(tmp_path, format):
     with pytest.raises(ValueError, match=r"NaN.*missing=True"):
         motion.read_motion(path, skeleton=WALKER)
     for onto in (None, WALKER):
-        found = motion.read_motion(path, skeleton=WALKER, missing=True, onto=onto)
-        assert found.missing
+        loaded = motion.read_motion(path, skeleton=WALKER, missing=True, onto=onto)
+        assert loaded.missing
         for clip in GAPS:
-            there = next(other for other in found if other.key == clip.key).positions
-            assert np.array_equal(np.isnan(there), np.isnan(clip.positions))
-            np.testing.assert_allclose(there, clip.positions, atol=1e-5)
+            loaded_positions = next(other for other in loaded if other.key == clip.key).positions
+            assert np.array_equal(np.isnan(loaded_positions), np.isnan(clip.positions))
+            np.testing.assert_allclose(loaded_positions, clip.positions, atol=1e-5)
 
 
-def test_gaps_stay_where_motion_is_resampled_or_divided():
-    whole, half = GAPS.divided(0.3), GAPS.resampled(WALKER.fps / 2)
-    assert whole.missing
+def test_resampling_and_dividing_keep_missing_values():
+    parts, half = GAPS.divided(0.3), GAPS.resampled(WALKER.fps / 2)
+    assert parts.missing
     assert half.missing
-    assert sum(np.isnan(clip.positions).sum() for clip in whole) == sum(np.isnan(clip.positions).sum() for clip in GAPS)
-    doubled = GAPS.resampled(2 * WALKER.fps)  # its even frames are those that were there
+    assert sum(np.isnan(clip.positions).sum() for clip in parts) == sum(np.isnan(clip.positions).sum() for clip in GAPS)
+    doubled = GAPS.resampled(2 * WALKER.fps)  # its even frames are the original ones
     for clip, slow, fast in zip(GAPS, half, doubled, strict=True):
         np.testing.assert_array_equal(slow.positions, clip.positions[::2])
         np.testing.assert_array_equal(fast.positions[::2], clip.positions)
 
 
-def test_turns_of_joints_need_whole_bodies(tmp_path):
+def test_rotations_require_complete_bodies(tmp_path):
     needs = "has missing joints, so its rotations are not known"
-    turned = replace(motion.PROTOCOLS["simulated"], representation="6d")
-    for call in (GAPS.with_rotations, lambda: motion.windows(GAPS, turned, "train")):
+    protocol = replace(motion.PROTOCOLS["simulated"], representation="6d")
+    for call in (GAPS.with_rotations, lambda: motion.windows(GAPS, protocol, "train")):
         with pytest.raises(ValueError, match=needs):
             call()
-    quaternions = motion.MotionData("simulated", GAPS, replace(turned, representation="quaternion"))
+    quaternions = motion.MotionData("simulated", GAPS, replace(protocol, representation="quaternion"))
     with pytest.raises(ValueError, match=f"{needs}; .* fill its gaps first"):
         dvae.method("mix-and-match").build(quaternions.windows("train"))
-    found = replace(PEOPLE.with_rotations(), missing=True)
-    batch = motion.windows(found, turned, "test").all()
+    people = replace(PEOPLE.with_rotations(), missing=True)
+    batch = motion.windows(people, protocol, "test").all()
     with pytest.raises(ValueError, match="leaves the rotations of others undetermined"):
-        motion.windows(found, turned, "test").schema.view(batch | {"mask": {"x": batch["mask"]}})
+        motion.windows(people, protocol, "test").schema.view(batch | {"mask": {"x": batch["mask"]}})
     for format in ("bvh", "amass"):
         with pytest.raises(
             ValueError, match=f"has missing joints, but {format} has no gaps; fill them first.*or write npz"
@@ -128,14 +128,14 @@ def test_turns_of_joints_need_whole_bodies(tmp_path):
 
 
 def _future_with_gaps():
-    """Forecasts, what was observed of them, and the truth."""
+    """Return forecasts, the observed past, and the truth."""
     clip, gaps = PEOPLE.clips[0].positions, without(PEOPLE, LElbow=slice(3, 30), RKnee=slice(25, 40)).clips[0].positions
     return clip[None, None, 10:40], gaps[None, :10], gaps[None, 10:40]
 
 
 @pytest.mark.parametrize(("share", "length"), [(0.2, 15.0), (0.5, 4.0)])
 def test_bursts_have_their_share_and_length(share, length):
-    """Of F independent chains, within five standard errors: a burst has a variance of length (length - 1)."""
+    """Test F independent chains within five standard errors; the variance of a burst is length (length - 1)."""
     still = np.broadcast_to(PEOPLE.clips[0].positions[:1], (20_000, WALKER.joints, 3))
     (clip,) = motion.occlude(MotionSet([Clip("a", "b", still)], WALKER), share, length, seed=3)
     hidden = np.isnan(clip.positions).any(2)
@@ -152,38 +152,38 @@ def test_bursts_have_their_share_and_length(share, length):
 
 
 @pytest.mark.parametrize("name", ["simulated", "simulated-trajectories", "turned"])
-def test_windows_say_what_was_observed_and_hide_the_rest(name):
-    """Where it was, they are the windows of the whole motion; of each joint all three coordinates or none."""
+def test_windows_have_masks_and_zeros_at_missing_values(name):
+    """Observed values equal the values of complete motion; a joint has all three coordinates or none."""
     protocol = motion.PROTOCOLS[name.replace("turned", "simulated")]
     protocol = motion.Protocol(**{**vars(protocol), "heading": name == "turned", "rotate": False})
-    whole, some = (motion.windows(each, protocol, "train").all() for each in (PEOPLE, GAPS))
-    mask = some["mask"]
+    complete, incomplete = (motion.windows(each, protocol, "train").all() for each in (PEOPLE, GAPS))
+    mask = incomplete["mask"]
     assert 0.7 < mask.float().mean() < 0.95
     assert torch.equal(mask.unflatten(-1, (-1, 3)).any(-1), mask.unflatten(-1, (-1, 3)).all(-1))
-    assert (some["x"][~mask] == 0).all()
+    assert (incomplete["x"][~mask] == 0).all()
     if name != "turned":
-        assert torch.equal(some["x"][mask], whole["x"][mask])
-    drawn = motion.windows(GAPS, protocol, "train").sample(5, torch.Generator().manual_seed(0))
-    assert drawn["x"].isfinite().all()
-    assert drawn["mask"].shape == drawn["x"].shape
+        assert torch.equal(incomplete["x"][mask], complete["x"][mask])
+    sampled = motion.windows(GAPS, protocol, "train").sample(5, torch.Generator().manual_seed(0))
+    assert sampled["x"].isfinite().all()
+    assert sampled["mask"].shape == sampled["x"].shape
 
 
-@pytest.mark.parametrize("unseen", [15, 10])  # frames of each clip in which no left side is, all of the past or not
-def test_the_future_does_not_turn_the_past(unseen):
-    lacking = without(PEOPLE, LHip=slice(unseen), LShoulder=slice(unseen))
-    turned = [np.concatenate([c.positions[:15], c.positions[15:] * [-1, 1, -1]]) for c in lacking]
-    other = [replace(clip, positions=positions) for clip, positions in zip(lacking, turned, strict=True)]
+@pytest.mark.parametrize("unseen", [15, 10])  # frames without a left side: the whole past, or part of it
+def test_the_heading_of_the_past_ignores_the_future(unseen):
+    incomplete = without(PEOPLE, LHip=slice(unseen), LShoulder=slice(unseen))
+    positions_by_clip = [np.concatenate([c.positions[:15], c.positions[15:] * [-1, 1, -1]]) for c in incomplete]
+    other = [replace(clip, positions=positions) for clip, positions in zip(incomplete, positions_by_clip, strict=True)]
     protocol = replace(motion.PROTOCOLS["simulated"], heading=True, train_stride=90)  # windows at the first frames
     pasts = [
         motion.windows(MotionSet(clips, WALKER, missing=True), protocol, "train").all()["x"][:, :15]
-        for clips in (lacking.clips, other)
+        for clips in (incomplete.clips, other)
     ]
     torch.testing.assert_close(*pasts)
-    plain = motion.windows(lacking, replace(protocol, heading=False), "train").all()["x"][:, :15]
+    plain = motion.windows(incomplete, replace(protocol, heading=False), "train").all()["x"][:, :15]
     assert torch.equal(pasts[0], plain) == (unseen == 15)
 
 
-def test_listed_windows_have_something_before_and_after_the_present():
+def test_listed_windows_have_observations_in_past_and_future():
     some = without(PEOPLE, Pelvis=slice(0, 18))
     windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
     assert {start for _, _, start in windows.keys} == {5, 10, 15}  # 15 frames from 5 on end at 19
@@ -195,27 +195,27 @@ def test_listed_windows_have_something_before_and_after_the_present():
 # ----------------------------------------------------------------------------------------- references, scores, energies
 
 
-def test_zero_velocity_stays_where_joints_were_last():
+def test_zero_velocity_repeats_the_last_observed_positions():
     x, mask = torch.randn(2, 5, 3), torch.ones(2, 5, 3, dtype=torch.bool)
     mask[0, 3:, 1] = mask[1, :, 2] = False
-    found = last_value(torch.where(mask, x, torch.nan), 4, mask)
-    assert torch.equal(found[0, :, 0], found[0, :, 3])
-    assert torch.equal(found[0, 0, 0], torch.stack([x[0, 4, 0], x[0, 2, 1], x[0, 4, 2]]))
-    assert found[0, 1, 0, 2] == 0
+    forecast = last_value(torch.where(mask, x, torch.nan), 4, mask)
+    assert torch.equal(forecast[0, :, 0], forecast[0, :, 3])
+    assert torch.equal(forecast[0, 0, 0], torch.stack([x[0, 4, 0], x[0, 2, 1], x[0, 4, 2]]))
+    assert forecast[0, 1, 0, 2] == 0
 
 
-def test_distances_are_over_what_both_have():
+def test_distances_use_entries_observed_in_both():
     first, second = torch.randn(5, 6) + 100, torch.randn(4, 6) + 100
-    seen, also = torch.rand(5, 6) < 0.6, torch.rand(4, 6) < 0.6
-    seen[0], also[0] = torch.tensor([1, 1, 1, 0, 0, 0]), torch.tensor([0, 0, 0, 1, 1, 1])
-    found = distances(torch.where(seen, first, torch.nan), second, seen.bool(), also.bool())
-    assert found[0, 0] == torch.inf
+    first_mask, second_mask = torch.rand(5, 6) < 0.6, torch.rand(4, 6) < 0.6
+    first_mask[0], second_mask[0] = torch.tensor([1, 1, 1, 0, 0, 0]), torch.tensor([0, 0, 0, 1, 1, 1])
+    result = distances(torch.where(first_mask, first, torch.nan), second, first_mask.bool(), second_mask.bool())
+    assert result[0, 0] == torch.inf
     for n in range(5):
         for m in range(4):
-            both = seen[n].bool() & also[m].bool()
+            both = first_mask[n].bool() & second_mask[m].bool()
             if both.any():
                 expected = ((first[n] - second[m])[both].square().mean() * 6).sqrt()
-                torch.testing.assert_close(found[n, m], expected, atol=1e-4, rtol=1e-4)
+                torch.testing.assert_close(result[n, m], expected, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(distances(first, second, torch.ones(5, 6).bool()), torch.cdist(first, second))
 
 
@@ -237,81 +237,81 @@ SEVERAL = [
 
 
 @pytest.mark.parametrize("score", [*SCORES, *SEVERAL])
-def test_scores_are_of_what_was_observed(score):
-    """A coordinate that was never observed, or a frame of which nothing was, might as well not be there."""
+def test_scores_use_observed_values_only(score):
+    """Removing coordinates or frames without observations changes no score."""
     several = (3,) if score in SEVERAL else ()
     samples, truth = torch.randn(2, 4, 6, 5).double(), torch.randn(2, *several, 6, 5).double()
     gaps = truth.clone()
     gaps[..., 2, :], gaps[..., 3] = torch.nan, torch.nan
-    kept, coordinates = [0, 1, 3, 4, 5], [0, 1, 2, 4]
+    rows, coordinates = [0, 1, 3, 4, 5], [0, 1, 2, 4]
     torch.testing.assert_close(
-        score(samples, gaps), score(samples[..., kept, :][..., coordinates], truth[..., kept, :][..., coordinates])
+        score(samples, gaps), score(samples[..., rows, :][..., coordinates], truth[..., rows, :][..., coordinates])
     )
 
 
-def test_a_diversity_with_gaps_is_that_of_what_pairs_share():
-    """Futures that lie equally far apart in all numbers have the same diversity, whatever is missing."""
+def test_diversity_uses_numbers_observed_in_both_futures():
+    """Futures with the same distance in each number have the same diversity for all missing values."""
     samples, truths = torch.randn(4, 6, 5).double(), torch.arange(3.0).double()[:, None, None].expand(3, 6, 5)
     gaps = torch.where(torch.rand(3, 6, 5) < 0.7, truths, torch.nan)
-    found = errors.average_pairwise_distance_error(samples, gaps)
-    torch.testing.assert_close(found, errors.average_pairwise_distance_error(samples, truths))
+    diversity = errors.average_pairwise_distance_error(samples, gaps)
+    torch.testing.assert_close(diversity, errors.average_pairwise_distance_error(samples, truths))
     gaps[0], gaps[1:, 0] = torch.nan, truths[1:, 0]
     gaps[1, 1:], gaps[2] = torch.nan, torch.nan
-    assert errors.average_pairwise_distance_error(samples, gaps).isnan()  # no two share anything
+    assert errors.average_pairwise_distance_error(samples, gaps).isnan()  # no two futures have a common observed number
 
 
-def test_what_is_forecast_in_gaps_changes_no_score_and_the_truth_errs_in_nothing():
-    whole, windows = (motion.windows(each, motion.PROTOCOLS["simulated"], "test") for each in (PEOPLE, GAPS))
+def test_forecasts_at_missing_values_change_no_score_and_the_truth_has_error_zero():
+    complete, windows = (motion.windows(each, motion.PROTOCOLS["simulated"], "test") for each in (PEOPLE, GAPS))
     observed, x, index = windows.protocol.observed, windows.all().mask_to_nan(), torch.arange(len(windows))
     past, truth, clips = windows.all().past(observed), x[:, observed:], clip_index(windows.keys)
-    forecasts, real = torch.randn(len(x), 3, *truth.shape[1:]), whole.all()["x"][:, None, observed:]
+    forecasts, real = torch.randn(len(x), 3, *truth.shape[1:]), complete.all()["x"][:, None, observed:]
     anywhere = torch.where(truth[:, None].isnan(), 9.0, forecasts)
     measures = {measure.name: measure for measure in motion.scores(windows)}
-    assert measures.keys() == {measure.name for measure in motion.scores(whole)}
+    assert measures.keys() == {measure.name for measure in motion.scores(complete)}
     for name in ("ADE", "FDE", "jerk", "CMD"):
-        found, other = (measures[name].function(each, truth, past, index) for each in (forecasts, anywhere))
+        score, other = (measures[name].function(each, truth, past, index) for each in (forecasts, anywhere))
         if name == "CMD":
-            found, other = (torch.as_tensor(measures[name].pool(each, clips)) for each in (found, other))
-        assert torch.equal(other, found), name
+            score, other = (torch.as_tensor(measures[name].pool(each, clips)) for each in (score, other))
+        assert torch.equal(other, score), name
     for name in ("ADE", "FDE", "bone-length error", *(name for name in measures if name.startswith("limb"))):
         within = 0.1 if "angle" in name else 1e-4
         assert measures[name].function(real, truth, past, index).abs().max() < within, name
 
 
-def test_statistics_are_of_what_was_observed():
-    """A coordinate that was never observed might as well not be there; of bodies, a bone or the last frames."""
+def test_statistics_use_observed_values_only():
+    """Removing coordinates without observations changes no statistic; bodies lose a bone or the last frames."""
     x = torch.randn(3, 20, 4).cumsum(1).double()
     gaps = x.clone()
     gaps[..., 2] = torch.nan
     for statistic in STATISTICS.values():
         torch.testing.assert_close(statistic.function(gaps), statistic.function(x[..., [0, 1, 3]]))
     windows = motion.windows(PEOPLE, motion.PROTOCOLS["simulated"], "test")
-    x, head = windows.all()["x"], WALKER.find("Head")  # an end, so that one bone goes with it
+    x, head = windows.all()["x"], WALKER.find("Head")  # an end joint, which has one bone
     gaps = x.clone()
     gaps[:, 60:], gaps[..., 3 * head - 3 : 3 * head] = torch.nan, torch.nan
-    found = {name: statistic.function(gaps) for name, statistic in motion.statistics(windows).items()}
-    kept = [n for n, (_, child) in enumerate(WALKER.edges) if child != head]
-    lengths = WALKER.bone_lengths(windows.positions(x[:, :60]))[..., kept]
-    torch.testing.assert_close(found["bone length"], lengths.mean((1, 2)))
-    assert all(value.isfinite().all() for value in found.values())
+    values = {name: statistic.function(gaps) for name, statistic in motion.statistics(windows).items()}
+    bones = [n for n, (_, child) in enumerate(WALKER.edges) if child != head]
+    lengths = WALKER.bone_lengths(windows.positions(x[:, :60]))[..., bones]
+    torch.testing.assert_close(values["bone length"], lengths.mean((1, 2)))
+    assert all(value.isfinite().all() for value in values.values())
 
 
-def test_what_needs_whole_bodies_says_what_to_do():
+def test_operations_on_complete_bodies_raise_errors_with_advice():
     windows = motion.windows(GAPS, motion.PROTOCOLS["simulated"], "test")
     with pytest.raises(
         ValueError, match=r"features of whole futures, but these windows have missing joints.*dvae impute"
     ):
         motion.scores(windows, classifiers={"content": None})
-    told = motion.windows(GAPS, motion.PROTOCOLS["simulated-trajectories"], "test").given(["LWrist"])
+    with_paths = motion.windows(GAPS, motion.PROTOCOLS["simulated-trajectories"], "test").given(["LWrist"])
     with pytest.raises(
         ValueError, match=r"only whole poses can be exchanged, but these windows may have missing joints.*dvae impute"
     ):
-        motion.ExchangedWindows(told)
+        motion.ExchangedWindows(with_paths)
     data, method = small("trajevae")
     pose = GAPS.clips[0].positions[np.isnan(GAPS.clips[0].positions).any((1, 2))][0]
-    with pytest.raises(ValueError, match=r"the initial pose has no positions of .*fill the gaps first") as refused:
+    with pytest.raises(ValueError, match=r"the initial pose has no positions of .*fill the gaps first") as error:
         method.build(data.schema).complete(pose, frames=5)
-    assert "--missing" not in str(refused.value)
+    assert "--missing" not in str(error.value)
     flow = dvae.method("moglow", width=4, flow_steps=1)
     data = motion.MotionData("simulated", GAPS, motion.PROTOCOLS["simulated"])
     with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide them together"):
@@ -320,46 +320,46 @@ def test_what_needs_whole_bodies_says_what_to_do():
 
 @pytest.mark.parametrize("heading", [True, False])
 @pytest.mark.parametrize("root", ["drop", "relative"])
-def test_windows_are_put_back_where_they_were(root, heading):
-    """Whole poses, turned and moved as windows are, fill the clips; but for the root's own gap, where poses lack it."""
+def test_filled_windows_return_to_their_positions_in_clips(root, heading):
+    """Complete poses in window coordinates fill the clips, except where the root is missing and poses drop it."""
     gaps = without(GAPS, Pelvis=slice(30, 36))
     protocol = replace(motion.PROTOCOLS["simulated"], root=root, heading=heading, test_stride=20)
     windows = motion.windows(gaps, protocol, "test")
-    read, true = (
+    observed, true = (
         torch.stack([torch.from_numpy(clips[key[:2]].positions[key[2] :][: windows.length]) for key in windows.keys])
         for clips in (gaps, PEOPLE)
     )
-    made = true - (true[:, :, [WALKER.root]] if root == "drop" else true[:, :1, [WALKER.root]])
+    poses = true - (true[:, :, [WALKER.root]] if root == "drop" else true[:, :1, [WALKER.root]])
     if heading:
-        angle = WALKER.heading_near(read, protocol.observed - 1)[:, None, None]
-        made = motion.rotate_about_up(made, -angle, WALKER.up)
-    found = windows.fill_missing(made)
-    assert found.missing == any(np.isnan(clip.positions).any() for clip in found)
+        angle = WALKER.heading_near(observed, protocol.observed - 1)[:, None, None]
+        poses = motion.rotate_about_up(poses, -angle, WALKER.up)
+    filled = windows.fill_missing(poses)
+    assert filled.missing == any(np.isnan(clip.positions).any() for clip in filled)
     covered = max(key[2] for key in windows.keys) + windows.length
-    for clip in found:
-        true, read = PEOPLE[clip.key].positions, gaps[clip.key].positions
-        assert np.array_equal(clip.positions[~np.isnan(read)], read[~np.isnan(read)])
-        assert np.array_equal(np.isnan(clip.positions[covered:]), np.isnan(read[covered:]))
+    for clip in filled:
+        true, observed = PEOPLE[clip.key].positions, gaps[clip.key].positions
+        assert np.array_equal(clip.positions[~np.isnan(observed)], observed[~np.isnan(observed)])
+        assert np.array_equal(np.isnan(clip.positions[covered:]), np.isnan(observed[covered:]))
         bridge = np.linspace(true[29, WALKER.root], true[36, WALKER.root], 8)[1:-1]
-        moved = (bridge - true[30:36, WALKER.root])[:, None] if root == "drop" else 0.0
-        expected = np.where(np.isnan(read), true, read)[:covered]
-        expected[30:36] += np.where(np.isnan(read[30:36]), moved, 0.0)
+        root_error = (bridge - true[30:36, WALKER.root])[:, None] if root == "drop" else 0.0
+        expected = np.where(np.isnan(observed), true, observed)[:covered]
+        expected[30:36] += np.where(np.isnan(observed[30:36]), root_error, 0.0)
         np.testing.assert_allclose(clip.positions[:covered], expected, atol=1e-5)
 
 
-def test_energies_are_of_what_was_observed():
+def test_energies_use_observed_values_only():
     samples, truth = torch.randn(3, 2, 6, 48).double(), torch.randn(2, 6, 48).double()
-    seen = torch.rand(2, 6, 48) < 0.8
-    gaps = torch.where(seen, truth, torch.nan)
-    errors = torch.where(seen, samples - truth, 0.0).square()
+    mask = torch.rand(2, 6, 48) < 0.8
+    gaps = torch.where(mask, truth, torch.nan)
+    errors = torch.where(mask, samples - truth, 0.0).square()
     torch.testing.assert_close(energies.best_of_many(samples, gaps), errors.sum((2, 3)).amin(0))
     torch.testing.assert_close(energies.history_error(samples, gaps), errors.sum(3).mean((0, 2)))
     joint = 3 * (WALKER.names.index("LElbow") - 1)
     pose = truth[:, 0].clone()
     pose[:, joint : joint + 3] = torch.nan
-    kept = [n for n, edge in enumerate(WALKER.edges) if WALKER.names.index("LElbow") not in edge]
-    lengths, own = (WALKER.limbs(each).norm(dim=-1) for each in (samples, truth[:, 0]))
-    expected = (lengths - own[:, None]).square()[..., kept].sum(3).mean((0, 2))
+    bones = [n for n, edge in enumerate(WALKER.edges) if WALKER.names.index("LElbow") not in edge]
+    lengths, true_lengths = (WALKER.limbs(each).norm(dim=-1) for each in (samples, truth[:, 0]))
+    expected = (lengths - true_lengths[:, None]).square()[..., bones].sum(3).mean((0, 2))
     torch.testing.assert_close(energies.limb_length(samples, pose, WALKER), expected)
 
 
@@ -371,14 +371,14 @@ def small(name):
     protocol = motion.PROTOCOLS["simulated-trajectories" if issubclass(kind, TrajectoryMethod) else "simulated"]
     protocol = replace(protocol, predicted=12, observed=min(protocol.observed, 6), train_stride=15)
     data = motion.MotionData("simulated", GAPS, protocol)
-    own = {"latent": 4, "warm_up": 1} | ({"width": 8} if name == "equations" else {})
-    options = SMALL.get(name, {"width": 4} if name == "autoregressive" else own)
+    sizes = {"latent": 4, "warm_up": 1} | ({"width": 8} if name == "equations" else {})
+    options = SMALL.get(name, {"width": 4} if name == "autoregressive" else sizes)
     return data, dvae.method(name, **options).resolve_defaults(data.windows("train"))
 
 
 @pytest.mark.parametrize("name", [name for name in METHODS if name not in ("mix-and-match", "motion-latent", "moglow")])
-def test_every_method_goes_the_whole_way_with_gaps(name):
-    """Fitted, validated, scored; and whatever stands where nothing was observed changes nothing."""
+def test_every_method_supports_missing_values(name):
+    """Fit, validate and score; the values at missing entries change nothing."""
     data, method = small(name)
     train, validation, test = map(data.windows, ("train", "validation", "test"))
     torch.manual_seed(0)
@@ -389,11 +389,11 @@ def test_every_method_goes_the_whole_way_with_gaps(name):
     assert all(np.isfinite(score.mean) for score in scores["model"].values())
     assert scores.data["seen"]["future"] == test.all()["mask"][:, data.protocol.observed :].double().mean()
 
-    drawn, objective = recipe.batches.sample(3, torch.Generator().manual_seed(1)), recipe.objective
+    sampled, objective = recipe.batches.sample(3, torch.Generator().manual_seed(1)), recipe.objective
     present, drawing = data.protocol.observed, {"draws": objective.draws} if objective.draws else {}
     results = []
     for hidden in (0.0, 7.0, torch.nan):
-        batch = {**drawn, "x": torch.where(drawn["mask"], drawn["x"], hidden)}
+        batch = {**sampled, "x": torch.where(sampled["mask"], sampled["x"], hidden)}
         past = {"x": batch["x"][:, :present], "mask": batch["mask"][:, :present]}
         model.zero_grad()
         torch.manual_seed(2)
@@ -401,32 +401,34 @@ def test_every_method_goes_the_whole_way_with_gaps(name):
         loss.backward()
         slopes = [p.grad.clone() for p in model.parameters() if p.grad is not None]
         results.append([loss.detach(), *slopes, model.forecast(past, 5, 2)["x"]])
-        whole = {n: value for n, value in batch.items() if n not in ("pseudo", "valid")}
-        results[-1].append(filled := model.impute(whole, 2)["x"])
-        assert torch.equal(filled[:, drawn["mask"]], batch["x"][drawn["mask"]].expand(2, -1))
+        to_fill = {n: value for n, value in batch.items() if n not in ("pseudo", "valid")}
+        results[-1].append(filled := model.impute(to_fill, 2)["x"])
+        assert torch.equal(filled[:, sampled["mask"]], batch["x"][sampled["mask"]].expand(2, -1))
     assert all(value.isfinite().all() for value in results[0])
     assert any(slope.any() for slope in results[0][1:-2])
     for other in results[1:]:
-        assert all(torch.equal(here, there) for here, there in zip(results[0], other, strict=True))
+        assert all(
+            torch.equal(first_value, other_value) for first_value, other_value in zip(results[0], other, strict=True)
+        )
 
 
 def still_gsps():
-    """A model of GSPS, and windows in which all joints rest."""
+    """Return a GSPS model, and windows without motion."""
     data, method = small("gsps")
     torch.manual_seed(0)
     model, x = method.build(data.schema).eval(), data.windows("test").all()["x"][:4]
     return model, x[:, :1].expand_as(x).clone()
 
 
-def test_gsps_fills_gaps_by_what_comes_near_to_all_that_was_seen():
-    """Of many motions of the model, that of which all but some frames of a joint was seen, if for a drift in time."""
+def test_gsps_fills_gaps_with_the_motion_nearest_to_all_observations():
+    """A motion of the model is recovered from all but some frames of one joint, despite a drift in time."""
     model, x = still_gsps()
     batch, gap = {"x": x, "mask": torch.ones_like(x).bool()}, slice(model.frames + 2, model.frames + 9)
     torch.manual_seed(2)
-    made = model.reconstruct(batch, 4)["x"]
+    futures = model.reconstruct(batch, 4)["x"]
     batch["mask"][:, gap, 9:12] = False
     drift = 1e-4 * torch.arange(model.length - model.frames)[:, None]
-    for future in made[:, :, model.frames :] + drift:
+    for future in futures[:, :, model.frames :] + drift:
         true = torch.cat([x[:, : model.frames], future], 1)
         torch.manual_seed(2)
         filled = model.impute({**batch, "x": torch.where(batch["mask"], true, torch.nan)}, 1)["x"][0]
@@ -435,11 +437,11 @@ def test_gsps_fills_gaps_by_what_comes_near_to_all_that_was_seen():
         model.impute({name: value[:, :12] for name, value in batch.items()})
 
 
-# ------------------------------------------------------------------------------------------------------- what is shown
+# ------------------------------------------------------------------------------------------------------------- players
 
 
-def test_players_have_gaps():
-    """A joint that is missing is nowhere; all others are where they are in whole motion."""
+def test_players_omit_missing_joints():
+    """A missing joint has no position; the others have the positions of complete motion."""
     samples, observed, truth = (each[:, 0] if each.ndim == 5 else each[0] for each in _future_with_gaps())
     stage = make_scene(WALKER, observed, samples, truth, every=1)
     gaps = np.isnan(np.concatenate([observed, truth])).any(-1)
@@ -461,7 +463,7 @@ def test_players_have_gaps():
 QUICK = ["--steps", "1", "--batch-size", "2", "--warm-up", "1"]
 
 
-def test_every_command_that_reads_motion_takes_gaps_the_same_way():
+def test_all_commands_on_motion_have_the_same_option_for_missing_values():
     for name in COMMANDS:
         hints = get_type_hints(command(name.split()), include_extras=True)
         if "source" in hints and is_dataclass(hints["source"]):
@@ -479,49 +481,49 @@ def gaps(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(gaps, tmp_path_factory):
-    """A run on motion with gaps."""
+    """Return a run on motion with missing joints."""
     run = str(tmp_path_factory.mktemp("runs") / "run")
     assert main(["fit", "vae", "--data", gaps, "--missing", "--out", run, "--protocol", "simulated", *QUICK]) == 0
     return run
 
 
-def test_commands_forecast_show_and_fill_motion_with_gaps(fitted, tmp_path):
+def test_commands_forecast_report_and_impute_motion_with_gaps(fitted, tmp_path):
     assert json.loads(Path(fitted, "config.json").read_text())["data"]["missing"] is True
-    futures, page, filled = (str(tmp_path / name) for name in ("f.npz", "r.html", "i.npz"))
+    futures, page, imputed = (str(tmp_path / name) for name in ("f.npz", "r.html", "i.npz"))
     assert main(["forecast", fitted, "--out", futures, "--samples", "2"]) == 0
-    found = motion.Forecasts.load(futures)
-    assert np.isnan(found.truth).any()
-    assert np.isfinite(found.forecasts).all()
+    forecasts = motion.Forecasts.load(futures)
+    assert np.isnan(forecasts.truth).any()
+    assert np.isfinite(forecasts.forecasts).all()
     assert main(["animate", futures, "--out", str(tmp_path / "f.html")]) == 0
     few = ["--windows", "1", "--samples", "2", "--bound-windows", "2", "--particles", "2"]
     assert main(["report", fitted, "--out", page, *few]) == 0
     assert "cannot be shown" not in Path(page).read_text()
 
     clip = GAPS.clips[-1]
-    assert main(["impute", fitted, "--out", filled, "--clip", clip.name, "--samples", "3"]) == 0
-    with np.load(filled) as file:
-        found = dict(file)
-    there = ~np.isnan(clip.positions).any(-1)
-    assert np.array_equal(found["observed"][0], there)
+    assert main(["impute", fitted, "--out", imputed, "--clip", clip.name, "--samples", "3"]) == 0
+    with np.load(imputed) as file:
+        forecasts = dict(file)
+    observed = ~np.isnan(clip.positions).any(-1)
+    assert np.array_equal(forecasts["observed"][0], observed)
     relative = clip.positions - clip.positions[:, [WALKER.root]]
-    np.testing.assert_array_equal(found["filled"][1, 0][there], relative[there])
-    assert (found["spread"][0][there] == 0).all()
-    spread = found["filled"].var(0).sum(-1) ** 0.5
-    np.testing.assert_allclose(found["spread"][~found["observed"]], spread[~found["observed"]], rtol=1e-5)
+    np.testing.assert_array_equal(forecasts["filled"][1, 0][observed], relative[observed])
+    assert (forecasts["spread"][0][observed] == 0).all()
+    spread = forecasts["filled"].var(0).sum(-1) ** 0.5
+    np.testing.assert_allclose(forecasts["spread"][~forecasts["observed"]], spread[~forecasts["observed"]], rtol=1e-5)
 
 
-def test_gaps_are_filled_in_the_motion_itself(fitted, tmp_path, capsys):
+def test_impute_writes_filled_motion_files(fitted, tmp_path, capsys):
     impute = ["impute", fitted, "--samples", "1"]
     assert main([*impute, "--filled", str(tmp_path / "all.npz")]) == 0
-    whole = motion.read_motion(tmp_path / "all.npz", missing=True)
-    assert {each.key for each in whole} == {each.key for each in GAPS if each.split == "test"}
-    for each in whole:
-        read = GAPS[each.key].positions
-        assert np.array_equal(each.positions[~np.isnan(read)], read[~np.isnan(read)])
+    filled = motion.read_motion(tmp_path / "all.npz", missing=True)
+    assert {each.key for each in filled} == {each.key for each in GAPS if each.split == "test"}
+    for each in filled:
+        observed = GAPS[each.key].positions
+        assert np.array_equal(each.positions[~np.isnan(observed)], observed[~np.isnan(observed)])
         assert np.isfinite(each.positions[:75]).all()
     clip, one = GAPS.clips[-1], tmp_path / "one.bvh"
     assert main([*impute, "--clip", clip.name, "--filled", str(one)]) == 0
-    bvh = motion.read_motion(one, metres=0.01)  # bones are as long as a model of one step has them
+    bvh = motion.read_motion(one, metres=0.01)  # a model of one step has implausible bone lengths
     assert (bvh.clips[0].frames, bvh.skeleton.fps) == (clip.frames, WALKER.fps)
     capsys.readouterr()
     for arguments, message in (
@@ -533,7 +535,7 @@ def test_gaps_are_filled_in_the_motion_itself(fitted, tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_a_run_is_scored_and_shown_on_other_motion_with_gaps(gaps, tmp_path, capsys):
+def test_a_run_is_scored_and_reported_on_other_motion_with_gaps(gaps, tmp_path, capsys):
     run, other, few = str(tmp_path / "run"), ["--data", gaps, "--missing"], ["--samples", "2"]
     assert main(["fit", "vae", "--data", "simulated", *QUICK, "--out", run]) == 0
     forecast = ["forecast", run, "--out", str(tmp_path / "f.npz"), *few]

@@ -32,7 +32,7 @@ TINY = Protocol("tiny", observed=3, predicted=4, fps=30, train_stride=2, test_st
 
 
 def people(frames=(20, 12, 30, 9, 25, 7, 6), split="train", seed=0):
-    """Clips of the given lengths whose positions tell (clip, frame, joint, axis) apart."""
+    """Return clips of the given lengths whose positions encode (clip, frame, joint, axis)."""
     random = np.random.default_rng(seed)
     shapes = [(F, WALKER.joints, 3) for F in frames]
     return [Clip(split, f"clip_{i}", random.uniform(-0.8, 0.8, s)) for i, s in enumerate(shapes)]
@@ -43,7 +43,7 @@ def motion(**kwargs):
 
 
 def archive(path, content, name="positions_3d"):
-    """An npz whose member is a pickle, written by hand as numpy writes it (protocol 3)."""
+    """Write an npz whose member is a pickle, by hand in numpy's format (protocol 3)."""
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": "|O", "fortran_order": False, "shape": ()})
     stream.write(content)
@@ -61,7 +61,7 @@ class TestSkeleton:
             assert skeleton.names[left][1:] == skeleton.names[right][1:]
         assert [skeleton.order.index(p) < skeleton.order.index(c) for p, c in skeleton.edges].count(False) == 0
 
-    def test_human36m_is_the_tree_of_the_papers(self):
+    def test_human36m_has_the_skeleton_of_the_papers(self):
         assert (HUMAN36M.joints, HUMANEVA.joints, len(HUMAN36M_KEPT)) == (17, 15, 17)
         dropped = {4, 5, 9, 10, 11, 16, 20, 21, 22, 23, 24, 28, 29, 30, 31}
         assert set(HUMAN36M_KEPT) == set(range(32)) - dropped
@@ -79,11 +79,11 @@ class TestSkeleton:
             ({"names": ("a",), "parents": (-1,), "fps": 0}, "0 frames per second"),
         ],
     )
-    def test_what_is_no_skeleton_is_refused(self, fields, message):
+    def test_an_invalid_skeleton_is_an_error(self, fields, message):
         with pytest.raises(ValueError, match=message):
             Skeleton(**fields)
 
-    def test_a_file_that_is_no_skeleton_is_an_error(self, tmp_path):
+    def test_an_invalid_skeleton_file_is_an_error(self, tmp_path):
         (tmp_path / "s.json").write_text('{"joints": 3}')
         with pytest.raises(ValueError, match="expected JSON with joint_names and parents"):
             Skeleton.from_json(tmp_path / "s.json")
@@ -112,16 +112,16 @@ BAD = [
 
 class TestMotionSet:
     @pytest.mark.parametrize(("change", "message"), BAD)
-    def test_bad_clips_are_refused_by_name_and_number(self, change, message):
+    def test_an_invalid_clip_is_an_error_with_its_name(self, change, message):
         with pytest.raises(ValueError, match=message):
             MotionSet([damaged(change)], WALKER)
 
-    def test_bad_clips_can_be_dropped_and_are_counted(self):
+    def test_invalid_clips_can_be_skipped_and_are_counted(self):
         clips = [*people(), *(replace(damaged(c), name=f"bad_{i}") for i, (c, _) in enumerate(BAD))]
-        kept = MotionSet(clips, WALKER, skip_bad=True)
-        assert len(kept) == len(people())
-        assert [name for _, name, _ in kept.skipped] == [f"bad_{i}" for i in range(len(BAD))]
-        assert kept.summary()[0]["skipped"] == len(BAD)
+        valid = MotionSet(clips, WALKER, skip_bad=True)
+        assert len(valid) == len(people())
+        assert [name for _, name, _ in valid.skipped] == [f"bad_{i}" for i in range(len(BAD))]
+        assert valid.summary()[0]["skipped"] == len(BAD)
         with pytest.raises(ValueError, match="no clips; 1 were skipped, the first: clip train/walk has NaN"):
             MotionSet([damaged(with_nan)], WALKER, skip_bad=True)
 
@@ -136,18 +136,18 @@ class TestMotionSet:
 
     def test_a_set_does_not_share_memory_with_its_source(self):
         clips = people()
-        made = MotionSet(clips, WALKER)
-        before = made.fingerprint()
+        motion_set = MotionSet(clips, WALKER)
+        before = motion_set.fingerprint()
         clips[0].positions[:] = 0
-        assert made.fingerprint() == before
+        assert motion_set.fingerprint() == before
 
-    def test_fingerprint_sees_every_part_of_the_content(self):
+    def test_every_part_of_the_content_changes_the_fingerprint(self):
         original = motion()
         first, *rest = original.clips
-        changed = first.positions.copy()
-        changed[3, 4, 1] += 1e-5
+        positions = first.positions.copy()
+        positions[3, 4, 1] += 1e-5
         others = [
-            MotionSet([replace(first, positions=changed), *rest], WALKER),
+            MotionSet([replace(first, positions=positions), *rest], WALKER),
             MotionSet([replace(first, name="other"), *rest], WALKER),
             MotionSet([replace(first, split="test2"), *rest], WALKER),
             MotionSet(rest, WALKER),
@@ -169,7 +169,7 @@ class TestArchive:
         return {s: {c.name: c.positions for c in clips if c.split == s} for s in clips.splits}
 
     @pytest.mark.parametrize(
-        ("hostile", "named"),
+        ("hostile", "function"),
         [
             (Evil(), r"refused (posix|nt)\.system"),
             (np.array(["2020"], dtype="datetime64[D]"), r"refused an array of datetime64"),
@@ -177,10 +177,10 @@ class TestArchive:
         ],
         ids=["system", "dtype", "list"],
     )
-    def test_hostile_pickles_are_refused_by_name_and_not_run(self, tmp_path, monkeypatch, hostile, named):
+    def test_hostile_pickles_are_errors_and_never_run(self, tmp_path, monkeypatch, hostile, function):
         monkeypatch.chdir(tmp_path)
         path = archive(tmp_path / "a.npz", pickle.dumps({**self.nested(), "test": {"walk": hostile}}, 2))
-        with pytest.raises(ValueError, match=rf"a\.npz: (positions_3d: )?{named}"):
+        with pytest.raises(ValueError, match=rf"a\.npz: (positions_3d: )?{function}"):
             read_motion(path, skeleton=WALKER)
         assert not (tmp_path / "pwned").exists()
 
@@ -193,24 +193,24 @@ class TestArchive:
             (b"\x80\x04\x8e" + (2**60).to_bytes(8, "little"), "damaged pickle"),
         ],
     )
-    def test_other_contents_are_explained(self, tmp_path, content, message):
+    def test_other_contents_are_errors(self, tmp_path, content, message):
         with pytest.raises(ValueError, match=message):
             read_motion(archive(tmp_path / "a.npz", content), skeleton=WALKER)
 
-    def test_a_pickle_outside_positions_3d_is_refused_unread(self, tmp_path):
+    def test_a_pickle_outside_positions_3d_is_an_error_before_reading(self, tmp_path):
         path = archive(tmp_path / "a.npz", pickle.dumps(Evil()), name="train/walk")
         with pytest.raises(ValueError, match="train/walk: holds pickled objects"):
             read_motion(path, skeleton=WALKER)
 
 
 class TestPlain:
-    @pytest.mark.parametrize("made", [lambda: simulate(5, 20), motion], ids=["labelled", "bare"])
-    def test_save_and_load_round_trip(self, tmp_path, made):
-        save(tmp_path / "new" / "set.npz", made())
-        read = read_motion(tmp_path / "new" / "set.npz")
-        assert read.fingerprint() == made().fingerprint()
-        assert read.skeleton == made().skeleton
-        for old, new in zip(made(), read, strict=True):
+    @pytest.mark.parametrize("original", [lambda: simulate(5, 20), motion], ids=["labelled", "bare"])
+    def test_save_and_load_round_trip(self, tmp_path, original):
+        save(tmp_path / "new" / "set.npz", original())
+        loaded = read_motion(tmp_path / "new" / "set.npz")
+        assert loaded.fingerprint() == original().fingerprint()
+        assert loaded.skeleton == original().skeleton
+        for old, new in zip(original(), loaded, strict=True):
             assert {**new.labels, **old.labels} == new.labels
 
     def test_links_are_replaced_and_not_followed(self, tmp_path):
@@ -225,7 +225,7 @@ class TestPlain:
         assert read_motion(links[0]).fingerprint() == simulate(5, 20).fingerprint()
 
     @pytest.mark.parametrize("name", ["a.npz", "a.npz.labels.csv"])
-    def test_a_full_disk_leaves_the_older_file_and_is_named(self, name, tmp_path, monkeypatch):
+    def test_a_full_disk_keeps_the_old_file_and_is_an_error_with_its_name(self, name, tmp_path, monkeypatch):
         save(tmp_path / "a.npz", simulate(5, 20))
         old = (tmp_path / name).read_bytes()
         replace_file = os.replace
@@ -241,7 +241,7 @@ class TestPlain:
         assert (tmp_path / name).read_bytes() == old
         assert len(list(tmp_path.iterdir())) == 3
 
-    def test_a_body_at_rest_is_read_again(self, tmp_path):
+    def test_a_highly_compressible_file_is_read(self, tmp_path):
         frames = 80 * 10**6 // (WALKER.joints * 3 * 4)  # packs to less than a hundredth
         rest = np.repeat(people()[0].positions[:1].astype(np.float32), frames, 0)
         save(tmp_path / "a.npz", MotionSet([Clip("train", "rest", rest)], WALKER))
@@ -268,10 +268,10 @@ class TestPlain:
         with (tmp_path / "mine.csv").open("w", newline="") as file:
             rows = [("clip", "split", "mood"), ("clip_0", "test", "glad"), ("clip_0", "train", "sad")]
             csv.writer(file).writerows(rows)
-        read = read_motion(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
-        assert read["train", "clip_0"].labels["mood"] == "sad"
-        assert read["test", "clip_0"].labels["mood"] == "glad"
-        assert read["test", "clip_1"].labels == {}
+        loaded = read_motion(tmp_path / "a.npz", labels=tmp_path / "mine.csv")
+        assert loaded["train", "clip_0"].labels["mood"] == "sad"
+        assert loaded["test", "clip_0"].labels["mood"] == "glad"
+        assert loaded["test", "clip_1"].labels == {}
         for text, message in (
             ("clip,split\nother,train\n", r"no row names a clip of .*a.npz"),
             ("name\n", "named clip"),
@@ -283,7 +283,7 @@ class TestPlain:
 
 class TestWindows:
     def expected(self, protocol, key, length=None):
-        """One window, straight from the definition."""
+        """Return one window by the definition."""
         split, name, start = key
         window = motion()[split, name].positions[start : start + (length or protocol.length)]
         if protocol.root == "drop":
@@ -291,7 +291,7 @@ class TestWindows:
         return (window - window[:1, :1]).reshape(len(window), -1)
 
     @pytest.mark.parametrize(("root", "length"), [("drop", None), ("relative", 5), ("drop", 12)])
-    def test_listed_windows_are_the_definition(self, root, length):
+    def test_listed_windows_equal_the_definition(self, root, length):
         protocol = replace(TINY, root=root)
         listed = windows(motion(), protocol, "train+validation", length)
         T = length or 7
@@ -304,14 +304,14 @@ class TestWindows:
         for window, key in zip(x, keys, strict=True):
             np.testing.assert_array_equal(window.numpy(), self.expected(protocol, key, length))
 
-    def test_positions_put_the_root_back(self):
+    def test_positions_restore_the_root(self):
         for root in ("drop", "relative"):
             cut = windows(motion(), replace(TINY, root=root), "test")
-            placed = cut.positions(cut.all()["x"])
-            assert placed.shape == (len(cut), 7, 17, 3)
-            assert (placed[:, 0, 0] == 0).all()
+            positions = cut.positions(cut.all()["x"])
+            assert positions.shape == (len(cut), 7, 17, 3)
+            assert (positions[:, 0, 0] == 0).all()
             truth = np.stack([WALKER.bone_lengths(motion()[s, n].positions[t : t + 7]) for s, n, t in cut.keys])
-            np.testing.assert_allclose(WALKER.bone_lengths(placed).numpy(), truth, atol=1e-6)
+            np.testing.assert_allclose(WALKER.bone_lengths(positions).numpy(), truth, atol=1e-6)
         with pytest.raises(ValueError, match="frames have 50 numbers, expected 51"):
             cut.positions(torch.zeros(3, 50))
 
@@ -319,10 +319,10 @@ class TestWindows:
         skeleton = Skeleton(("a", "root", "b"), (1, -1, 1), (0,), (2,))
         positions = np.random.default_rng(0).uniform(-0.8, 0.8, (9, 3, 3)).astype(np.float32)
         cut = windows(MotionSet([Clip("test", "c", positions)], skeleton), TINY, "test")
-        placed = cut.positions(cut.all()["x"])[0].numpy()
-        np.testing.assert_array_equal(placed, positions[:7] - positions[:7, 1:2])
+        restored = cut.positions(cut.all()["x"])[0].numpy()
+        np.testing.assert_array_equal(restored, positions[:7] - positions[:7, 1:2])
 
-    def test_drawn_windows_are_windows_and_only_the_generator_decides(self):
+    def test_sampled_windows_are_windows_and_depend_on_the_generator_only(self):
         cut = windows(motion(), TINY, "train")
         every = {w.numpy().tobytes() for w in cut.all(stride=1)["x"]}
         torch.manual_seed(0)
@@ -341,33 +341,33 @@ class TestWindows:
         protocol = replace(TINY, train=("S1", "S2"), sampling=sampling, validation=0.0)
         cut = windows(MotionSet(clips, WALKER), protocol, "train")
         index = {w.numpy().tobytes(): key[:2] for w, key in zip(cut.all(1)["x"], cut.index(1), strict=True)}
-        drawn = [index[w.numpy().tobytes()] for w in cut.sample(8000, torch.Generator().manual_seed(0))["x"]]
-        counts = np.array([drawn.count(clip.key) for clip in clips])
+        indices = [index[w.numpy().tobytes()] for w in cut.sample(8000, torch.Generator().manual_seed(0))["x"]]
+        counts = np.array([indices.count(clip.key) for clip in clips])
         error = np.sqrt(np.array(share) * (1 - np.array(share)) / 8000)
         assert (np.abs(counts / 8000 - share) < 4 * error).all()
 
     @pytest.mark.parametrize(("up", "root"), [("y", "drop"), ("z", "relative")])
-    def test_heading_turns_windows_as_a_whole(self, up, root):
-        turned = MotionSet(motion().clips, replace(WALKER, up=up))
-        plain, faced = (windows(turned, replace(TINY, root=root, heading=h), "test") for h in (False, True))
+    def test_heading_rotates_whole_windows(self, up, root):
+        rotated_up = MotionSet(motion().clips, replace(WALKER, up=up))
+        plain, faced = (windows(rotated_up, replace(TINY, root=root, heading=h), "test") for h in (False, True))
         before, after = (cut.positions(cut.all()["x"].double()) for cut in (plain, faced))
-        heading = turned.skeleton.heading
+        heading = rotated_up.skeleton.heading
         torch.testing.assert_close(heading(after[:, 2]).abs(), torch.zeros(len(after)).double(), atol=1e-5, rtol=0)
         angle = -heading(before[:, 2])[:, None, None]
         torch.testing.assert_close(rotate_about_up(before, angle, up), after, atol=1e-6, rtol=0)
 
-    def test_random_rotation_turns_drawn_windows_and_not_listed_ones(self):
+    def test_random_rotation_applies_to_sampled_windows_only(self):
         plain = windows(motion(), TINY, "train")
         turning = windows(motion(), replace(TINY, rotate=True), "train")
         assert torch.equal(plain.all()["x"], turning.all()["x"])
-        straight, turned = (cut.sample(200, torch.Generator().manual_seed(2))["x"] for cut in (plain, turning))
-        lengths = [WALKER.bone_lengths(plain.positions(x)) for x in (straight, turned)]
+        straight, rotated = (cut.sample(200, torch.Generator().manual_seed(2))["x"] for cut in (plain, turning))
+        lengths = [WALKER.bone_lengths(plain.positions(x)) for x in (straight, rotated)]
         torch.testing.assert_close(*lengths, atol=1e-5, rtol=1e-5)
-        headings = [WALKER.heading(plain.positions(x)[:, 0].double()) for x in (straight, turned)]
+        headings = [WALKER.heading(plain.positions(x)[:, 0].double()) for x in (straight, rotated)]
         angles = headings[1] - headings[0]
         assert torch.hypot(torch.cos(angles).mean(), torch.sin(angles).mean()) < 4 / 200**0.5
 
-    def test_validation_clips_are_training_clips_and_nothing_is_lost_or_shared(self):
+    def test_validation_and_training_partition_the_training_clips(self):
         parts = {s: windows(motion(), TINY, s) for s in ("train", "validation", "test", "train+validation")}
         names = {s: {(*c.key,) for c in w.clips} | {k[:2] for k in w.skipped} for s, w in parts.items()}
         assert not names["train"] & names["validation"]
@@ -377,7 +377,7 @@ class TestWindows:
         longer = windows(motion(), TINY, "validation", 10)
         assert {c.key for c in longer.clips} | {k[:2] for k in longer.skipped} == names["validation"]
 
-    def test_splitting_by_a_label_takes_clips_of_every_split(self):
+    def test_splitting_by_a_label_uses_clips_of_every_split(self):
         clips = [replace(c, labels={"style": "AB"[i % 2]}) for i, c in enumerate(motion().clips)]
         protocol = replace(TINY, split_by="style", train=("A",), test=("B",))
         labelled = MotionSet(clips, WALKER)
@@ -390,7 +390,7 @@ class TestWindows:
         with pytest.raises(KeyError, match="no label 'mood'; there are style"):
             test.labels("mood")
 
-    def test_what_cannot_be_cut_is_explained(self):
+    def test_windows_that_cannot_be_cut_are_errors(self):
         others = replace(TINY, train=("S1",), test=("S2",))
         for protocol, split, length, message in (
             (TINY, "train", 99, r"no window of 99 frames: \d clips, the longest of 30 frames"),
@@ -411,9 +411,9 @@ class TestWindows:
         with pytest.raises(ValueError, match="stride is -1"):
             windows(motion(), TINY, "test").all(-1)
 
-    def test_presets_are_those_of_the_papers(self):
-        found = {name: (p.observed, p.predicted, p.fps) for name, p in PROTOCOLS.items()}
-        assert found["h36m"] == (25, 100, 50)
-        assert found["humaneva"] == (15, 60, 60)
-        assert found["trajevae"] == (1, 100, 50)
-        assert found["bandai2-by-style"] == found["cmu8"] == found["simulated"] == (15, 60, 30)
+    def test_preset_protocols_match_the_papers(self):
+        values = {name: (p.observed, p.predicted, p.fps) for name, p in PROTOCOLS.items()}
+        assert values["h36m"] == (25, 100, 50)
+        assert values["humaneva"] == (15, 60, 60)
+        assert values["trajevae"] == (1, 100, 50)
+        assert values["bandai2-by-style"] == values["cmu8"] == values["simulated"] == (15, 60, 30)

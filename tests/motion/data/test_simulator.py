@@ -23,8 +23,8 @@ def test_bones_are_rigid_within_a_clip_and_differ_between_people(people, positio
     lengths = WALKER.bone_lengths(positions)
     assert np.ptp(lengths, axis=1).max() < 1e-5
     assert lengths.mean(1).std(0).min() > 0.005
-    known = np.stack([clip.truth["bone_lengths"] for clip in people])
-    np.testing.assert_allclose(lengths, np.repeat(known[:, None], 150, axis=1), atol=1e-5)
+    true_lengths = np.stack([clip.truth["bone_lengths"] for clip in people])
+    np.testing.assert_allclose(lengths, np.repeat(true_lengths[:, None], 150, axis=1), atol=1e-5)
 
 
 def test_feet_stay_on_the_floor_and_do_not_slide(positions):
@@ -37,7 +37,7 @@ def test_feet_stay_on_the_floor_and_do_not_slide(positions):
     assert np.median(np.take_along_axis(speed, standing, axis=2)) < 0.1
 
 
-def test_wavers_raise_the_hand_that_the_truth_names(people, positions):
+def test_wavers_raise_the_hand_given_in_the_truth(people, positions):
     above = positions[:, :, [WALKER.names.index(j) for j in ("LWrist", "RWrist")], 1]
     above = above - positions[:, :, [WALKER.names.index("Neck")], 1]
     weights = np.stack([clip.truth["weights"] for clip in people])
@@ -57,18 +57,18 @@ class TestFigures:
         past, future = positions[:K, :past_frames], positions[:K, past_frames : past_frames + H]
         ax = futures(WALKER, past[0], torch.from_numpy(future), future[0], frames=4)
         ax.figure.canvas.draw()
-        shown = min(2, past_frames) + 2 * min(4, H)
-        assert len(ax.collections) == shown
+        frames = min(2, past_frames) + 2 * min(4, H)
+        assert len(ax.collections) == frames
         key = [text.get_text() for text in ax.get_legend().get_texts()]
         assert key == ["observed", "what happened", f"{K} sample{'s' * (K > 1)}"]
         assert ax.get_xticklabels()[-1].get_text() == f"+{H / 30:.1f} s"
 
-    def test_given_paths_are_crosses_where_the_joints_should_be(self, positions):
+    def test_given_paths_are_drawn_as_crosses(self, positions):
         samples, wrist = positions[:1, 5:65], WALKER.find("LWrist")
         path = samples[0, :, wrist].copy()
         ax = futures(WALKER, positions[1, :5], samples, frames=3, paths={"left_wrist": path})
         bone = next(b for b, (_, child) in enumerate(WALKER.edges) if child == wrist)
-        for drawn, line in zip(ax.collections[2:4], ax.lines[:2], strict=True):
-            np.testing.assert_allclose(line.get_xydata()[0], drawn.get_segments()[bone][1])
+        for crosses, line in zip(ax.collections[2:4], ax.lines[:2], strict=True):
+            np.testing.assert_allclose(line.get_xydata()[0], crosses.get_segments()[bone][1])
         with pytest.raises(ValueError, match=r"expected a path \(60, 3\) of LWrist"):
             futures(WALKER, positions[1, :5], samples, paths={"LWrist": path[:9]})

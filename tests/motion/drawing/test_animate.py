@@ -1,4 +1,4 @@
-"""Moving skeletons: the page shows the motion itself, bone by bone; forecasts in files; the command that plays both."""
+"""Animated skeletons: the page plays the motion, forecast files are read back, the command plays both."""
 
 import base64
 import html
@@ -28,44 +28,44 @@ def clips():
 
 @pytest.fixture(scope="module")
 def bodies(clips):
-    """(observed, samples, truth) of walking people."""
+    """Return (observed, samples, truth) of walking people."""
     positions = np.stack([clip.positions for clip in clips])
     return positions[0, :NOW], positions[1:, NOW:], positions[0, NOW:]
 
 
 def unpacked(scene):
-    """Positions (people, frames, joints, 3) as the script of the page reads them; NaN after the end of a person."""
+    """Return positions (people, frames, joints, 3) as the script of the page reads them; NaN after a person's end."""
     planes = np.frombuffer(zlib.decompress(base64.b64decode(scene["packed"])), np.uint8).reshape(2, -1).astype(np.int32)
     steps = (planes[0] | planes[1] << 8).reshape(-1, scene["joints"], 3)
     past, *aheads = np.split(steps, np.cumsum([scene["observed"], *(each["frames"] for each in scene["people"])])[:-1])
-    found = np.full((len(aheads), scene["frames"], scene["joints"], 3), np.nan)
+    people = np.full((len(aheads), scene["frames"], scene["joints"], 3), np.nan)
     for place, ahead in enumerate(aheads):
-        whole = np.cumsum(np.concatenate([past, ahead]), 0).astype(np.int16)
-        found[place, : len(whole)] = scene["unit"] * whole
-    return found
+        values = np.cumsum(np.concatenate([past, ahead]), 0).astype(np.int16)
+        people[place, : len(values)] = scene["unit"] * values
+    return people
 
 
 def scene_of(*arguments, **options):
-    """The scene of a page, as its script reads it."""
+    """Return the scene of a page as its script reads it."""
     page = animate(*arguments, **options).to_html()
     return json.loads(html.unescape(re.search('data-motion="([^"]*)"', page)[1]))[0]
 
 
-def seen(skeleton, positions, last, view):
-    """Positions as the viewer of the page has them: x to the right, z up."""
+def project(skeleton, positions, last, view):
+    """Return positions as the viewer of the page has them: x to the right, z up."""
     turn = torch.tensor(view - float(skeleton.heading(torch.tensor(last))))
-    turned = rotate_about_up(torch.tensor(positions), turn, skeleton.up).numpy()
-    return turned if skeleton.up == "z" else np.stack([turned[..., 0], -turned[..., 2], turned[..., 1]], -1)
+    rotated = rotate_about_up(torch.tensor(positions), turn, skeleton.up).numpy()
+    return rotated if skeleton.up == "z" else np.stack([rotated[..., 0], -rotated[..., 2], rotated[..., 1]], -1)
 
 
 @pytest.mark.parametrize("skeleton", [WALKER, HUMAN36M], ids=["y up", "z up"])
-def test_the_page_shows_the_motion_itself(bodies, skeleton):
+def test_the_page_contains_the_motion(bodies, skeleton):
     observed, samples, truth = bodies
     if skeleton.up == "z":
         observed, samples, truth = (a[..., [2, 0, 1]] for a in bodies)
     scene = scene_of(skeleton, observed, samples, truth, every=1, view=0.3, fixed=[5, 3])
-    whole = np.stack([np.concatenate([observed, ahead]) for ahead in (truth, *samples)])
-    np.testing.assert_allclose(unpacked(scene), seen(skeleton, whole, observed[-1], 0.3), atol=MILLIMETRE)
+    expected = np.stack([np.concatenate([observed, ahead]) for ahead in (truth, *samples)])
+    np.testing.assert_allclose(unpacked(scene), project(skeleton, expected, observed[-1], 0.3), atol=MILLIMETRE)
     assert np.array_equal(scene["bones"], skeleton.edges)
     assert [person["name"] for person in scene["people"]] == ["truth", "sample 1", "sample 2", "sample 3"]
     assert [person["fixed"] for person in scene["people"]] == [[], *[[3, 5]] * 3]  # in samples alone
@@ -73,7 +73,7 @@ def test_the_page_shows_the_motion_itself(bodies, skeleton):
     assert (scene["past"], scene["observed"]) == (PAST, NOW)
 
 
-def test_frames_are_left_out_but_not_the_present_nor_the_speed(bodies):
+def test_skipping_frames_keeps_the_present_and_the_speed(bodies):
     scene = scene_of(WALKER, *bodies, every=3)
     assert (scene["frames"], scene["observed"]) == (4, 2)
     assert scene["milliseconds"] == pytest.approx(3000 / WALKER.fps)
@@ -81,7 +81,7 @@ def test_frames_are_left_out_but_not_the_present_nor_the_speed(bodies):
     assert scene_of(fast, *bodies)["milliseconds"] == pytest.approx(40)
 
 
-def test_what_does_not_fit_is_refused(bodies):
+def test_mismatched_arrays_are_errors(bodies):
     observed, samples, truth = bodies
     for wrong in ((observed[..., :2], samples, truth), (observed, samples[:, :3], truth), (observed[:1],)):
         with pytest.raises(ValueError, match=r"expected observed \(O, J, 3\), samples"):
@@ -95,7 +95,7 @@ def test_what_does_not_fit_is_refused(bodies):
 
 
 @pytest.mark.parametrize("title", ["Gehen: größer", "</script><b>"])
-def test_the_page_needs_no_network_and_its_title_is_text(bodies, tmp_path, title):
+def test_the_page_needs_no_network_and_escapes_its_title(bodies, tmp_path, title):
     player = animate(WALKER, *bodies, title=title)
     assert "srcdoc" in player._repr_mimebundle_()["text/html"]
     player.save(tmp_path / "page.html")
@@ -119,14 +119,14 @@ def forecasts(clips, bodies):
 
 def test_a_forecast_file_is_read_back(forecasts, tmp_path):
     forecasts.save(tmp_path / "deep" / "futures.npz")
-    read = motion.Forecasts.load(tmp_path / "deep" / "futures.npz")
-    assert read.skeleton == forecasts.skeleton
-    assert list(read.keys) == list(forecasts.keys)
+    loaded = motion.Forecasts.load(tmp_path / "deep" / "futures.npz")
+    assert loaded.skeleton == forecasts.skeleton
+    assert list(loaded.keys) == list(forecasts.keys)
     for name in ("forecasts", "observed", "truth"):
-        np.testing.assert_array_equal(getattr(read, name), getattr(forecasts, name))
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(forecasts, name))
     with np.load(tmp_path / "deep" / "futures.npz", allow_pickle=False) as file:
         assert all(file[name].dtype != object for name in file.files)
-    one = read.window(1, samples=2)
+    one = loaded.window(1, samples=2)
     np.testing.assert_array_equal(one.forecasts, forecasts.forecasts[:2, 1:])
     assert one.keys == [("test", "stand", 40)]
 
@@ -139,7 +139,7 @@ def test_a_forecast_file_is_read_back(forecasts, tmp_path):
         ({"truth": np.zeros((2, 6, 3, 3), np.float32)}, "expected forecasts (S, 2, H, 17, 3)"),
     ],
 )
-def test_strange_forecast_files_are_refused(forecasts, tmp_path, capsys, change, message):
+def test_invalid_forecast_files_are_errors(forecasts, tmp_path, capsys, change, message):
     file, page = tmp_path / "futures.npz", tmp_path / "page.html"
     forecasts.save(file)
     with np.load(file) as stored:

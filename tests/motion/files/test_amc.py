@@ -1,4 +1,4 @@
-"""ASF/AMC and exponential maps: the same motion in both, as it stands in the archive of positions."""
+"""ASF/AMC files and exponential maps: the same motion as in the archive of positions."""
 
 import numpy as np
 import pytest
@@ -41,40 +41,40 @@ ASF = """:version 1.10
 AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 0 0 0 0 0\nthigh 0\n2\nroot 1 2 3 0 90 0\nthigh 90\n"
 
 
-def seen(recording):
+def projected(recording):
     return recording.metres * recording.positions[:, [recording.names.index(joint) for joint in JOINTS]]
 
 
 @pytest.mark.parametrize(
-    ("read", "file", "key"),
+    ("reader", "file", "key"),
     [
         (read_amc, "asfamc/02_01.amc", ("train", "walking_1")),
-        (read_expmap, "expmap/train_walking_extra_22.txt", ("train", "walking_extra_22")),  # turns, and faces away
+        (read_expmap, "expmap/train_walking_extra_22.txt", ("train", "walking_extra_22")),  # half a turn, facing away
     ],
 )
-def test_motion_is_that_of_the_archive_to_a_tenth_of_a_millimetre(read, file, key, shared, real):
+def test_motion_equals_the_archive_to_a_tenth_of_a_millimetre(reader, file, key, shared, real):
     positions = real("cmu/cmu8.npz")[key].positions
-    found = read(shared(f"cmu_raw/{file}"))
-    assert (found.fps, found.up) == (120, "y")
-    every_fourth = seen(found)[::4]
+    recording = reader(shared(f"cmu_raw/{file}"))
+    assert (recording.fps, recording.up) == (120, "y")
+    every_fourth = projected(recording)[::4]
     assert every_fourth.shape == positions.shape
     np.testing.assert_allclose(every_fourth, positions, atol=1e-4)
 
 
-def test_a_bone_turns_about_its_own_axes_and_carries_what_hangs_from_it(tmp_path):
+def test_a_bone_rotates_about_its_own_axes_together_with_its_children(tmp_path):
     (tmp_path / "a.asf").write_text(ASF)
     (tmp_path / "a_1.amc").write_text(AMC)
-    found = read_amc(tmp_path / "a_1.amc")
-    assert found.names == ["root", "thigh", "shin", "shinEnd"]
-    assert found.metres == 0.0254
-    np.testing.assert_allclose(found.positions[0], [[0, 0, 0], [0, 0, 0], [0, -4, 0], [0, -7, 0]], atol=1e-9)
-    # its x axis is the world's y, about which it turns by 90 degrees, and so nowhere; then the root does
-    np.testing.assert_allclose(found.positions[1], [[1, 2, 3], [1, 2, 3], [1, -2, 3], [1, -5, 3]], atol=1e-9)
+    recording = read_amc(tmp_path / "a_1.amc")
+    assert recording.names == ["root", "thigh", "shin", "shinEnd"]
+    assert recording.metres == 0.0254
+    np.testing.assert_allclose(recording.positions[0], [[0, 0, 0], [0, 0, 0], [0, -4, 0], [0, -7, 0]], atol=1e-9)
+    # its x axis is the world's y; a bone along it is not moved by its own 90 degrees, but by the root's
+    np.testing.assert_allclose(recording.positions[1], [[1, 2, 3], [1, 2, 3], [1, -2, 3], [1, -5, 3]], atol=1e-9)
     (tmp_path / "a.asf").write_text(ASF.replace("0 0 90 XYZ", "0 0 0 XYZ"))
-    found = read_amc(tmp_path / "a_1.amc")  # -y about x to -z, and that about y to -x
-    np.testing.assert_allclose(found.positions[1], [[1, 2, 3], [1, 2, 3], [-3, 2, 3], [-6, 2, 3]], atol=1e-9)
+    recording = read_amc(tmp_path / "a_1.amc")  # -y about x to -z, and that about y to -x
+    np.testing.assert_allclose(recording.positions[1], [[1, 2, 3], [1, 2, 3], [-3, 2, 3], [-6, 2, 3]], atol=1e-9)
     (tmp_path / "r.amc").write_text(AMC.replace("DEGREES", "RADIANS").replace("90", str(np.pi / 2)))
-    np.testing.assert_allclose(read_amc(tmp_path / "r.amc").positions, found.positions, atol=1e-9)
+    np.testing.assert_allclose(read_amc(tmp_path / "r.amc").positions, recording.positions, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_a_bone_turns_about_its_own_axes_and_carries_what_hangs_from_it(tmp_path
         ("amc", "thigh 90", "", "frame 2 has no row for thigh"),
     ],
 )
-def test_what_is_damaged_is_refused_with_its_place(file, old, new, message, tmp_path):
+def test_a_damaged_file_is_an_error_with_its_line(file, old, new, message, tmp_path):
     texts = {"asf": ASF, "amc": AMC}
     texts[file] = texts[file].replace(old, new, 1)
     for name, text in texts.items():
@@ -111,7 +111,7 @@ def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "0 " * 117, "0 " * 233 + "nan"])
-def test_what_are_no_exponential_maps_is_refused(text, tmp_path):
+def test_invalid_exponential_maps_are_errors(text, tmp_path):
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(ValueError, match=r"expected rows of 117|not a number"):
         read_expmap(tmp_path / "a.txt")

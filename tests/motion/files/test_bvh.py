@@ -1,4 +1,4 @@
-"""BVH files: read as animation programs do, written, and refused where they are damaged."""
+"""BVH files: read as animation programs do, written, and errors for damaged files."""
 
 import re
 
@@ -40,17 +40,17 @@ Frame Time: 0.0333333
 
 
 def turn(axis, degrees):
-    """About one axis, (F, 3, 3), written out."""
+    """Return rotation matrices (F, 3, 3) about one axis."""
     cos, sin = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     first, second = {"X": (1, 2), "Y": (2, 0), "Z": (0, 1)}[axis]
-    found = np.eye(3)[None].repeat(len(cos), 0)
-    found[:, first, first], found[:, second, second] = cos, cos
-    found[:, first, second], found[:, second, first] = -sin, sin
-    return found
+    matrices = np.eye(3)[None].repeat(len(cos), 0)
+    matrices[:, first, first], matrices[:, second, second] = cos, cos
+    matrices[:, first, second], matrices[:, second, first] = -sin, sin
+    return matrices
 
 
 def played(text):
-    """Positions (F, J, 3) by the letter of the format: token for token, joint for joint."""
+    """Return positions (F, J, 3) by the definition of the format, token by token."""
     head, _, frames = text.partition("MOTION")
     words, values = head.split(), np.array(frames.split()[5:], float)
     joints, above, place = [], [], 1
@@ -70,16 +70,16 @@ def played(text):
     values = values.reshape(-1, sum(len(joint["channels"]) for joint in joints))
     column = 0
     for joint in joints:
-        at, turned = joint["offset"][None].repeat(len(values), 0), np.eye(3)[None].repeat(len(values), 0)
+        position, rotated = joint["offset"][None].repeat(len(values), 0), np.eye(3)[None].repeat(len(values), 0)
         for channel in joint["channels"]:
             if channel.endswith("position"):
-                at[:, "XYZ".index(channel[0])] = values[:, column]
+                position[:, "XYZ".index(channel[0])] = values[:, column]
             else:
-                turned = turned @ turn(channel[0], values[:, column])
+                rotated = rotated @ turn(channel[0], values[:, column])
             column += 1
         parent = None if joint["parent"] is None else joints[joint["parent"]]
-        joint["at"] = at if parent is None else parent["at"] + np.einsum("fij,fj->fi", parent["turned"], at)
-        joint["turned"] = turned if parent is None else parent["turned"] @ turned
+        joint["at"] = position if parent is None else parent["at"] + np.einsum("fij,fj->fi", parent["turned"], position)
+        joint["turned"] = rotated if parent is None else parent["turned"] @ rotated
     return np.stack([joint["at"] for joint in joints], 1)
 
 
@@ -92,20 +92,20 @@ def sample(request, shared, tmp_path):
 
 
 def test_samples_are_read_as_the_format_says(sample):
-    read = read_bvh(sample)
-    np.testing.assert_allclose(read.positions, played(sample.read_text()), atol=1e-9)
-    assert read.rotations.shape == (*read.positions.shape[:2], 4)
+    recording = read_bvh(sample)
+    np.testing.assert_allclose(recording.positions, played(sample.read_text()), atol=1e-9)
+    assert recording.rotations.shape == (*recording.positions.shape[:2], 4)
     if sample.name == "small.bvh":
-        assert (read.names, read.fps) == (["hip", "knee", "kneeEnd", "arm", "armEnd"], 30)
+        assert (recording.names, recording.fps) == (["hip", "knee", "kneeEnd", "arm", "armEnd"], 30)
 
 
 def test_samples_are_written_and_read_back_to_a_tenth_of_a_millimetre(shared, tmp_path):
-    read = read_bvh(shared("cmu_raw/bvh/indian_13.bvh"))  # in centimetres
-    rest, root = read.offsets / 100, read.positions[:, 0] / 100
-    write_bvh(tmp_path / "a.bvh", read.names, read.parents, rest, read.rotations, root, read.fps)
+    recording = read_bvh(shared("cmu_raw/bvh/indian_13.bvh"))  # in centimetres
+    rest, root = recording.offsets / 100, recording.positions[:, 0] / 100
+    write_bvh(tmp_path / "a.bvh", recording.names, recording.parents, rest, recording.rotations, root, recording.fps)
     again = read_bvh(tmp_path / "a.bvh")
-    assert (again.names, again.parents, again.fps) == (read.names, read.parents, read.fps)
-    np.testing.assert_allclose(again.positions, read.positions, atol=1e-3)
+    assert (again.names, again.parents, again.fps) == (recording.names, recording.parents, recording.fps)
+    np.testing.assert_allclose(again.positions, recording.positions, atol=1e-3)
 
 
 HEAD, FRAMES = SMALL.replace("a knee", "knee").split("Frame Time")
@@ -121,7 +121,7 @@ HEAD, FRAMES = SMALL.replace("a knee", "knee").split("Frame Time")
     ],
     ids=["brace at the name", "brace after a number", "a line each", "lower case"],
 )
-def test_words_may_be_anywhere_on_lines(head, tmp_path):
+def test_line_breaks_are_irrelevant(head, tmp_path):
     (tmp_path / "a.bvh").write_text(SMALL.replace("a knee", "knee"))
     (tmp_path / "b.bvh").write_text(f"{head}Frame Time{FRAMES}")
     usual, other = read_bvh(tmp_path / "a.bvh"), read_bvh(tmp_path / "b.bvh")
@@ -129,10 +129,18 @@ def test_words_may_be_anywhere_on_lines(head, tmp_path):
     np.testing.assert_array_equal(other.positions, usual.positions)
 
 
-def test_what_is_written_has_the_layout_that_animation_programs_import(tmp_path):
+def test_written_files_have_the_layout_that_animation_programs_import(tmp_path):
     (tmp_path / "a.bvh").write_text(SMALL.replace("a knee", "knee"))
-    read = read_bvh(tmp_path / "a.bvh")
-    write_bvh(tmp_path / "b.bvh", read.names, read.parents, read.offsets, read.rotations, read.positions[:, 0], 25.0)
+    recording = read_bvh(tmp_path / "a.bvh")
+    write_bvh(
+        tmp_path / "b.bvh",
+        recording.names,
+        recording.parents,
+        recording.offsets,
+        recording.rotations,
+        recording.positions[:, 0],
+        25.0,
+    )
     lines = [line.strip() for line in (tmp_path / "b.bvh").read_text().splitlines()]
     assert lines[:4] == ["HIERARCHY", "ROOT hip", "{", "OFFSET 0.000000 0.000000 0.000000"]
     assert lines[4] == "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation"
@@ -159,7 +167,7 @@ def test_what_is_written_has_the_layout_that_animation_programs_import(tmp_path)
         ("HIERARCHY", "<html>", "expected ROOT"),
     ],
 )
-def test_what_is_damaged_is_refused_with_its_place(old, new, message, tmp_path):
+def test_a_damaged_file_is_an_error_with_its_line(old, new, message, tmp_path):
     path = tmp_path / "a.bvh"
     path.write_text(SMALL.replace(old, new, 1))
     with pytest.raises(ValueError, match=message) as error:

@@ -1,4 +1,4 @@
-"""Files that are downloaded: from a server of ours, none kept that is not the one that is known."""
+"""Downloads from a local server: files are cached, and files with a wrong checksum are deleted."""
 
 import hashlib
 import threading
@@ -28,8 +28,8 @@ def url(tmp_path, monkeypatch):
     for name, content in FILES.items():
         (tmp_path / "there" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "there" / name).write_bytes(content)
-    known = {name: hashlib.sha256(content).hexdigest() for name, content in FILES.items()}
-    monkeypatch.setitem(download.COLLECTIONS, "cmu", ("http://127.0.0.1:1/", known))
+    checksums = {name: hashlib.sha256(content).hexdigest() for name, content in FILES.items()}
+    monkeypatch.setitem(download.COLLECTIONS, "cmu", ("http://127.0.0.1:1/", checksums))
     Quiet.asked.clear()
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path / "there")))
     thread = threading.Thread(target=server.serve_forever)
@@ -40,24 +40,24 @@ def url(tmp_path, monkeypatch):
     server.server_close()
 
 
-def test_files_come_once_and_are_where_they_were_at_the_address(url, tmp_path, capsys):
+def test_files_are_downloaded_once_to_the_path_of_their_address(url, tmp_path, capsys):
     assert main(["data", "get", "cmu", "--out", str(tmp_path / "here"), "--url", url]) == 0
     assert "2 files of cmu" in capsys.readouterr().err
     for name, content in FILES.items():
         assert (tmp_path / "here" / name).read_bytes() == content
-    asked = len(Quiet.asked)
+    n_requests = len(Quiet.asked)
     download.get("cmu", tmp_path / "here", url)
-    assert len(Quiet.asked) == asked == 2
+    assert len(Quiet.asked) == n_requests == 2
 
 
-def test_a_file_that_is_another_is_not_kept(url, tmp_path):
+def test_a_file_with_a_wrong_checksum_is_deleted(url, tmp_path):
     (tmp_path / "there" / "02" / "02_01.amc").write_bytes(b"something else")
     with pytest.raises(ValueError, match=r"02_01\.amc: the file differs from the known one"):
         download.get("cmu", tmp_path / "here", url)
     assert not (tmp_path / "here" / "02" / "02_01.amc").exists()
 
 
-def test_what_is_not_there_is_said_with_its_address(url, tmp_path):
+def test_a_missing_file_is_an_error_with_its_address(url, tmp_path):
     (tmp_path / "there" / "02" / "02_01.amc").unlink()
     with pytest.raises(OSError, match=r"02_01\.amc cannot be downloaded"):
         download.get("cmu", tmp_path / "here", url)
@@ -67,7 +67,7 @@ def test_what_is_not_there_is_said_with_its_address(url, tmp_path):
         download.get("cm", tmp_path)
 
 
-def test_what_is_known_of_the_real_files_is_right(shared):
+def test_checksums_of_the_real_files_are_right(shared):
     for name, digest in download.COLLECTIONS["cmu"][1].items():
         file = shared(f"cmu_raw/asfamc/{name.partition('/')[2]}")
         assert hashlib.sha256(file.read_bytes()).hexdigest() == digest

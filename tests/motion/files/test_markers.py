@@ -1,4 +1,4 @@
-"""C3D: what ezc3d writes, and the tree of markers."""
+"""C3D files as ezc3d writes them, and the tree of markers."""
 
 import numpy as np
 import pytest
@@ -8,63 +8,63 @@ from dvae.motion import read_motion
 from dvae.motion.files.markers import read_c3d, tree
 
 
-def test_markers_that_were_not_seen_are_gaps(tmp_path):
+def test_unseen_markers_are_missing_values(tmp_path):
     names, places = ["HEAD", "HIP", "LFT", "RFT"], standing(7)[..., :3]
     unseen = np.zeros((7, 4), bool)
     unseen[2:5, 0], unseen[6, 3] = True, True
     write_c3d(tmp_path / "a.c3d", names, np.concatenate([places, -unseen[..., None].astype(float)], 2))
     with pytest.raises(ValueError, match=r"has NaN.*missing=True \(--missing\) keeps the clip"):
         read_motion(tmp_path / "a.c3d")
-    found = read_motion(tmp_path / "a.c3d", missing=True)
-    order = [names.index(name) for name in found.skeleton.names]
+    motion_set = read_motion(tmp_path / "a.c3d", missing=True)
+    order = [names.index(name) for name in motion_set.skeleton.names]
     expected = np.where(unseen[..., None], np.nan, places / 1000)[:, order]
-    np.testing.assert_allclose(found.clips[0].positions, expected, atol=1e-6)
+    np.testing.assert_allclose(motion_set.clips[0].positions, expected, atol=1e-6)
 
 
 def standing(frames, *more):
-    """Four markers of a standing person, and further points (x, y, z) that move with them: (F, M, 4) in mm."""
+    """Return four markers of a standing person, and points (x, y, z) relative to them: (F, M, 4) in mm."""
     rest = np.array([[0, 0, 1700.0], [0, 0, 900], [100, 0, 10], [-100, 0, 10], *more])
     places = rest + np.random.default_rng(0).normal(0, 5, (frames, len(rest), 3))
     return np.concatenate([places, np.ones((frames, len(rest), 1))], 2)
 
 
-def test_points_that_a_model_of_the_body_computed_are_no_joints(tmp_path):
+def test_points_computed_by_a_body_model_are_no_joints(tmp_path):
     names = ["HEAD", "HIP", "LFT", "RFT"]
     lists = {"ANGLES": ["LKneeAngle"], "ANGLES2": ["RKneeAngle"], "POWERS": ["LKneePower"], "EXTRA": ["Spare"]}
     outputs = [name for texts in lists.values() for name in texts]
     places = standing(7, *[(30, 5, 0)] * len(outputs))
     write_c3d(tmp_path / "a.c3d", names + outputs, places, **lists, TYPE_GROUPS=["ANGLES", "EXTRA", "EXTRA_UNITS"])
-    read = read_motion(tmp_path / "a.c3d")
-    assert sorted(read.skeleton.names) == names
+    motion_set = read_motion(tmp_path / "a.c3d")
+    assert sorted(motion_set.skeleton.names) == names
     assert (
         "4 points computed by a model of the body are left out (LKneeAngle, RKneeAngle, LKneePower, Spare)"
-        in read.interpretation
+        in motion_set.interpretation
     )
 
 
-def test_points_that_are_left_out_or_renamed_are_named(tmp_path):
+def test_omitted_and_renamed_points_are_reported(tmp_path):
     names = ["HEAD", "HIP", "LFT", "LFT", "LFT_2", "GONE", "*8"]
     places = standing(7, (0, 50, 1000), (0, 0, 0), (50, 50, 1000), (0, 90, 900))
     places[:, 5] = 0
     places[2:5, 0] = 0
-    places[3, 1, :3] = 0  # measured there, as its residual says
+    places[3, 1, :3] = 0  # its residual marks it as measured
     write_c3d(tmp_path / "a.c3d", names, places)
-    read = read_c3d(tmp_path / "a.c3d")
-    assert sorted(read.names) == ["HEAD", "HIP", "LFT", "LFT_2", "LFT_3"]
-    np.testing.assert_allclose(read.positions[:, read.names.index("LFT_3")], places[:, 3, :3], rtol=1e-6)
-    assert read.notes == [
+    recording = read_c3d(tmp_path / "a.c3d")
+    assert sorted(recording.names) == ["HEAD", "HIP", "LFT", "LFT_2", "LFT_3"]
+    np.testing.assert_allclose(recording.positions[:, recording.names.index("LFT_3")], places[:, 3, :3], rtol=1e-6)
+    assert recording.notes == [
         "1 points never observed are left out (GONE)",
         "2 points without a name are left out (point 7, point 8)",
         "3 positions that are exactly 0, 0, 0 with residual 0 are read as missing",
         "another marker LFT is read as LFT_3",
     ]
-    assert np.isnan(read.positions).any(2).sum(0)[read.names.index("HEAD")] == 3
-    assert np.isfinite(read.positions[:, read.names.index("HIP")]).all()
+    assert np.isnan(recording.positions).any(2).sum(0)[recording.names.index("HEAD")] == 3
+    assert np.isfinite(recording.positions[:, recording.names.index("HIP")]).all()
 
 
-def test_markers_hang_from_those_that_move_with_them():
+def test_parents_of_markers_move_rigidly_with_them():
     random = np.random.default_rng(0)
-    bodies = [random.normal(0, 0.3, (1, 4, 3)) for _ in range(2)]  # two rigid bodies that go their own ways
+    bodies = [random.normal(0, 0.3, (1, 4, 3)) for _ in range(2)]  # two rigid bodies that move independently
     places = np.concatenate([body + random.normal(0, 1, (50, 1, 3)).cumsum(0) for body in bodies], 1)
     places[3:9, 2] = np.nan
     order, parents = tree(places)

@@ -1,4 +1,4 @@
-"""Files of every kind and folders of them: one set of clips, in metres, with what was found out about them."""
+"""Motion files of every format, and folders of them: one set of clips in metres, with notes."""
 
 import io
 import os
@@ -46,23 +46,27 @@ def printed(motion):
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_what_is_written_is_read_back(people, format, tmp_path):
-    # a tenth of a millimetre for files of positions. Bodies differ among people, and with rotations have the mean one
+def test_written_motion_is_read_back(people, format, tmp_path):
+    # Files of positions: 0.1 mm. Files of rotations have mean bone lengths, but people differ
     one = MotionSet(people.clips[:1], people.skeleton)
     write_motion(tmp_path / FORMATS[format], one, format)
-    read = read_motion(tmp_path / FORMATS[format], onto=WALKER if format != "npz" else None)
-    assert (read.skeleton.names, read.skeleton.parents, read.skeleton.fps) == (WALKER.names, WALKER.parents, 30)
-    assert (read.skeleton.left, read.skeleton.up) == (WALKER.left, "y")
-    assert [clip.key for clip in read] == [clip.key for clip in one]
+    motion_set = read_motion(tmp_path / FORMATS[format], onto=WALKER if format != "npz" else None)
+    assert (motion_set.skeleton.names, motion_set.skeleton.parents, motion_set.skeleton.fps) == (
+        WALKER.names,
+        WALKER.parents,
+        30,
+    )
+    assert (motion_set.skeleton.left, motion_set.skeleton.up) == (WALKER.left, "y")
+    assert [clip.key for clip in motion_set] == [clip.key for clip in one]
     within = {"npz": 0, "csv": 1e-6, "bvh": 1e-2, "amass": 3e-2}[format]  # inverse kinematics is within a centimetre
-    if format == "amass":  # the place of the pelvis is SMPL's but for a constant
+    if format == "amass":  # SMPL's pelvis differs by a constant
         assert read_motion(tmp_path / FORMATS[format]).skeleton.joints == 22
-    np.testing.assert_allclose(read.clips[0].positions, one.clips[0].positions, atol=within)
+    np.testing.assert_allclose(motion_set.clips[0].positions, one.clips[0].positions, atol=within)
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_rigid_motion_is_the_same_in_bvh_to_a_tenth_of_a_millimetre(people, up, tmp_path):
-    """Written once, a body is rigid; there and back it is the same, whichever axis is up."""
+    """A written body is rigid; read and written again it is unchanged, for each up axis."""
     write_motion(tmp_path / "a", MotionSet(people.clips[:1], people.skeleton), "bvh")
     rigid = read_motion(tmp_path / "a", onto=replace(WALKER, up=up))
     assert rigid.clips[0].rotations is not None
@@ -76,7 +80,7 @@ def test_rigid_motion_is_the_same_in_bvh_to_a_tenth_of_a_millimetre(people, up, 
 
 
 def placed(text, joint, moving):
-    """A BVH file in which channels of position place a joint, whose OFFSET is elsewhere."""
+    """Return a BVH file whose position channels place a joint, with another OFFSET."""
     head, rows = text.split("Frame Time: 0.03333333\n")
     before, after = head.split(f"JOINT {joint}\n")
     columns = sum(int(line.split()[1]) for line in before.splitlines() if "CHANNELS" in line)
@@ -89,47 +93,47 @@ def placed(text, joint, moving):
     return f"{before}JOINT {joint}\n{after}Frame Time: 0.03333333\n" + "\n".join(frames) + "\n"
 
 
-def test_a_joint_rests_where_its_channels_place_it(people, tmp_path):
+def test_position_channels_give_the_offset_of_a_joint(people, tmp_path):
     (path,) = write_motion(tmp_path / "a.bvh", MotionSet(people.clips[:1], people.skeleton))
-    whole, text = read_motion(path), path.read_text()
+    original, text = read_motion(path), path.read_text()
     path.write_text(placed(text, "LKnee", 0))
-    read = read_motion(path)
-    np.testing.assert_allclose(read.clips[0].positions, whole.clips[0].positions, atol=1e-6)
-    np.testing.assert_allclose(read.skeleton.offsets, whole.skeleton.offsets, atol=1e-6)
-    path.write_text(placed(text, "LKnee", 1.0))  # a centimetre along each axis, in every other frame
-    read = read_motion(path)
-    assert (read.clips[0].rotations, read.skeleton.rest) == (None, ())
-    assert "rotations are left out, because a joint moves relative to its parent" in read.interpretation
+    motion_set = read_motion(path)
+    np.testing.assert_allclose(motion_set.clips[0].positions, original.clips[0].positions, atol=1e-6)
+    np.testing.assert_allclose(motion_set.skeleton.offsets, original.skeleton.offsets, atol=1e-6)
+    path.write_text(placed(text, "LKnee", 1.0))  # 1 cm along each axis, in every second frame
+    motion_set = read_motion(path)
+    assert (motion_set.clips[0].rotations, motion_set.skeleton.rest) == (None, ())
+    assert "rotations are left out, because a joint moves relative to its parent" in motion_set.interpretation
     path.write_text(placed(text, "LKnee", 0.01))
     assert read_motion(path).clips[0].rotations is not None
 
 
 def test_skeletons_survive_bvh(people, tmp_path):
-    """Names and tree, of ends too: what was fitted on the one reads the other."""
-    read = read_motion(*write_motion(tmp_path / "a.bvh", MotionSet(people.clips[:1], WALKER)))
-    assert (read.skeleton.names, read.skeleton.parents) == (WALKER.names, WALKER.parents)
+    """Names, tree and end joints survive, so that a model of one reads the other."""
+    motion_set = read_motion(*write_motion(tmp_path / "a.bvh", MotionSet(people.clips[:1], WALKER)))
+    assert (motion_set.skeleton.names, motion_set.skeleton.parents) == (WALKER.names, WALKER.parents)
     names = [{"RKnee": "R Knee", "RFoot": "R_Knee", "Spine": "R{Knee"}.get(name, name) for name in WALKER.names]
     alike = MotionSet(people.clips[:1], replace(WALKER, names=names))
-    found = read_motion(*write_motion(tmp_path / "b.bvh", alike)).skeleton.names
-    assert found == tuple(
+    loaded_names = read_motion(*write_motion(tmp_path / "b.bvh", alike)).skeleton.names
+    assert loaded_names == tuple(
         {"RKnee": "R_Knee", "RFoot": "R_Knee_", "Spine": "R_Knee__"}.get(name, name) for name in WALKER.names
     )
 
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("file", "joints", "said"),
+    ("file", "joints", "note"),
     [
         ("bvh/indian_13.bvh", 57, "centimetres"),
         ("expmap/test_running_1.txt", 38, "as the file says"),
     ],
 )
-def test_samples_are_people_of_a_plausible_size(file, joints, said, shared, real):
-    read = read_motion(shared(f"cmu_raw/{file}"))
-    assert (read.skeleton.joints, read.skeleton.up, len(read)) == (joints, "y", 1)
-    assert said in read.interpretation
-    assert read.interpretation in printed(read)
-    assert len(read.skeleton.left) == len(read.skeleton.right) > 0
+def test_samples_are_people_of_a_plausible_size(file, joints, note, shared, real):
+    motion_set = read_motion(shared(f"cmu_raw/{file}"))
+    assert (motion_set.skeleton.joints, motion_set.skeleton.up, len(motion_set)) == (joints, "y", 1)
+    assert note in motion_set.interpretation
+    assert motion_set.interpretation in printed(motion_set)
+    assert len(motion_set.skeleton.left) == len(motion_set.skeleton.right) > 0
     assert read_motion(shared(f"cmu_raw/{file}"), onto=WALKER).skeleton.names == WALKER.names
     if not file.endswith("bvh"):
         onto = read_motion(shared(f"cmu_raw/{file}"), onto=real("cmu/cmu8.npz").skeleton).resampled(30)
@@ -138,27 +142,27 @@ def test_samples_are_people_of_a_plausible_size(file, joints, said, shared, real
 
 
 @pytest.mark.parametrize(("scale", "turn"), [(1.0, "z"), (100.0, "-y"), (1000.0, "x"), (1 / 0.0254, "-z"), (1.0, "y")])
-def test_units_and_axes_are_found_from_the_person(people, scale, turn):
-    turns = {"y": np.eye(3), "z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "-y": np.diag([-1.0, -1, 1])}
-    turns |= {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "-z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
+def test_units_and_axes_are_inferred_from_the_person(people, scale, turn):
+    matrices = {"y": np.eye(3), "z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "-y": np.diag([-1.0, -1, 1])}
+    matrices |= {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "-z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
     positions = people.clips[0].positions.astype(float)
-    seen = Recording(WALKER.names, WALKER.parents, scale * positions @ np.array(turns[turn], float).T, fps=30)
-    world = infer_world({"a": seen})
+    recording = Recording(WALKER.names, WALKER.parents, scale * positions @ np.array(matrices[turn], float).T, fps=30)
+    world = infer_world({"a": recording})
     assert world.metres == pytest.approx(1 / scale)
-    settled = to_world(seen, world)
+    settled = to_world(recording, world)
     assert settled.up == ("z" if turn == "z" else "y")
     vertical = 2 if turn == "z" else 1
     heights = positions[..., 1]
     np.testing.assert_allclose(settled.positions[..., vertical], heights, atol=1e-6)
     bones = [np.linalg.det(places[0, [1, 4, 8]] - places[0, 0]) for places in (settled.positions, positions)]
-    np.testing.assert_allclose(*bones, atol=1e-9)  # of a mirrored person, the negative
+    np.testing.assert_allclose(*bones, atol=1e-9)  # the negative for a mirrored person
 
 
-def test_what_is_given_goes_before_what_is_found(bvh, people):
-    read = read_motion(bvh, metres=0.005, fps=60)
-    assert "as given (0.005 m)" in read.interpretation
-    assert read.skeleton.fps == 60
-    np.testing.assert_allclose(2 * read.clips[0].positions, read_motion(bvh).clips[0].positions, rtol=1e-5)
+def test_given_units_override_inferred_ones(bvh, people):
+    motion_set = read_motion(bvh, metres=0.005, fps=60)
+    assert "as given (0.005 m)" in motion_set.interpretation
+    assert motion_set.skeleton.fps == 60
+    np.testing.assert_allclose(2 * motion_set.clips[0].positions, read_motion(bvh).clips[0].positions, rtol=1e-5)
     assert read_motion(bvh, up="z").skeleton.up == "z"
     for wrong, message in (({"metres": 1}, r"shows a person of 1\d\d"), ({"up": "x"}, "expected")):
         with pytest.raises(ValueError, match=message):
@@ -167,7 +171,7 @@ def test_what_is_given_goes_before_what_is_found(bvh, people):
 
 
 def scaled(path, factor):
-    """A BVH file of a larger or smaller body."""
+    """Return a BVH file of a larger or smaller body."""
 
     def larger(line):
         return " ".join(["OFFSET", *(str(factor * float(value)) for value in line[0].split()[1:])])
@@ -175,7 +179,7 @@ def scaled(path, factor):
     path.write_text(re.sub("OFFSET .*", larger, path.read_text()))
 
 
-def test_a_unit_that_no_person_has_is_asked_for_and_one_that_differs_in_a_folder_named(bvh):
+def test_an_implausible_unit_is_an_error_and_differing_units_are_reported(bvh):
     scaled(bvh / "train" / "person_0001.bvh", 1 / 2.54)
     with pytest.raises(ValueError, match=r"in centimetres, .*person_0001.* in inches|in inches, .* in centimetres"):
         read_motion(bvh)
@@ -186,28 +190,28 @@ def test_a_unit_that_no_person_has_is_asked_for_and_one_that_differs_in_a_folder
         read_motion(bvh / "train" / "person_0000.bvh")
 
 
-def test_who_lies_is_said_and_files_that_say_their_axis_are_turned(people, tmp_path):
+def test_lying_people_are_reported_and_files_with_an_up_axis_are_rotated(people, tmp_path):
     tilted = [replace(clip, positions=clip.positions[..., [2, 0, 1]]) for clip in people]  # z up
     save(tmp_path / "a.npz", MotionSet(tilted, WALKER))
-    read = read_motion(tmp_path / "a.npz")
-    assert read.interpretation == "heads are above feet along z, but y is assumed to be up in 3 of 3 clips"
-    assert read.interpretation in printed(read).replace("\n", " ")
+    motion_set = read_motion(tmp_path / "a.npz")
+    assert motion_set.interpretation == "heads are above feet along z, but y is assumed to be up in 3 of 3 clips"
+    assert motion_set.interpretation in printed(motion_set).replace("\n", " ")
     assert read_motion(tmp_path / "a.npz", up="z").interpretation == ""
     for name, up, clip in (("a", "y", people.clips[0]), ("b", "y", people.clips[1]), ("c", "z", tilted[2])):
-        whole = MotionSet([replace(clip, name=name, split="all")], replace(WALKER, up=up))
-        write_motion(tmp_path / "mixed" / name / "a.csv", whole)
-    read = read_motion(tmp_path / "mixed")
-    assert (read.skeleton.up, read.interpretation.count("heads")) == ("y", 0)
-    for clip, own in zip(read, people, strict=True):
-        np.testing.assert_allclose(clip.positions[..., 1], own.positions[..., 1], atol=1e-6)
-    given = read_motion(tmp_path / "mixed", up="y")
+        upright = MotionSet([replace(clip, name=name, split="all")], replace(WALKER, up=up))
+        write_motion(tmp_path / "mixed" / name / "a.csv", upright)
+    motion_set = read_motion(tmp_path / "mixed")
+    assert (motion_set.skeleton.up, motion_set.interpretation.count("heads")) == ("y", 0)
+    for clip, original in zip(motion_set, people, strict=True):
+        np.testing.assert_allclose(clip.positions[..., 1], original.positions[..., 1], atol=1e-6)
+    with_up = read_motion(tmp_path / "mixed", up="y")
     assert (
         "heads are above feet along z, but y is assumed to be up in 1 of 3 files, the first a.csv"
-        in given.interpretation
+        in with_up.interpretation
     )
 
 
-def test_a_folder_is_read_to_its_last_subfolder_without_its_links(bvh, tmp_path):
+def test_a_folder_is_read_recursively_without_links(bvh, tmp_path):
     (bvh / "train" / "deep").mkdir()
     (bvh / "train" / "person_0000.bvh").rename(bvh / "train" / "deep" / "walk 1.BVH")
     (bvh / "README.txt").write_text("not motion")
@@ -217,17 +221,17 @@ def test_a_folder_is_read_to_its_last_subfolder_without_its_links(bvh, tmp_path)
     (bvh / "linked").symlink_to(tmp_path / "other")
     write_motion(tmp_path / "other", read_motion(bvh), "bvh")
     (bvh / "labels.csv").write_text("split,clip,mood\ntrain/deep,walk 1,happy\n")
-    read = read_motion(bvh)
-    assert sorted(clip.key for clip in read) == [
+    motion_set = read_motion(bvh)
+    assert sorted(clip.key for clip in motion_set) == [
         ("test", "person_0002"),
         ("train", "person_0001"),
         ("train/deep", "walk 1"),
     ]
-    assert read["train/deep", "walk 1"].labels["mood"] == "happy"
-    assert read.skeleton.name == "bvh"
+    assert motion_set["train/deep", "walk 1"].labels["mood"] == "happy"
+    assert motion_set.skeleton.name == "bvh"
 
 
-def test_files_of_a_folder_are_alike_or_it_is_said_which_is_not(bvh, tmp_path):
+def test_a_file_unlike_the_others_of_its_folder_is_named(bvh, tmp_path):
     stranger = bvh / "train" / "stranger.bvh"
     text = (bvh / "train" / "person_0000.bvh").read_text()
     for old, new, message in (
@@ -262,24 +266,25 @@ def test_a_table_has_the_joints_of_its_skeleton(people, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["npz", "bvh"])
-def test_joints_are_chosen_by_place_name_or_new_name(kind, people, tmp_path):
+def test_joints_are_selected_by_index_or_name_and_renamed(kind, people, tmp_path):
     write_motion(tmp_path / "a.npz", people)
     write_motion(tmp_path / "b", MotionSet(people.clips[:1], people.skeleton), "bvh")
     path = tmp_path / ("a.npz" if kind == "npz" else "b")
-    whole = read_motion(path)
+    complete = read_motion(path)
     some = read_motion(path, joints=["Pelvis", "LHip", "LKnee"])
     np.testing.assert_array_equal(
-        some.clips[0].positions, whole.clips[0].positions[:, [whole.skeleton.find(n) for n in some.skeleton.names]]
+        some.clips[0].positions,
+        complete.clips[0].positions[:, [complete.skeleton.find(n) for n in some.skeleton.names]],
     )
     assert some.skeleton.parents == (-1, 0, 1)
-    named = read_motion(path, joints={"Pelvis": "hips", "LKnee": "left_knee", "RKnee": "right_knee"})
-    assert named.skeleton.names == ("hips", "left_knee", "right_knee")
-    assert (named.skeleton.left, named.skeleton.right) == ((1,), (2,))
+    renamed = read_motion(path, joints={"Pelvis": "hips", "LKnee": "left_knee", "RKnee": "right_knee"})
+    assert renamed.skeleton.names == ("hips", "left_knee", "right_knee")
+    assert (renamed.skeleton.left, renamed.skeleton.right) == ((1,), (2,))
     onto = read_motion(path, onto=HUMAN36M)
     assert (onto.skeleton.name, onto.skeleton.up, onto.skeleton.fps) == ("human36m", "z", 30)
 
 
-def test_motion_is_resampled_by_whole_frames_or_between_them(people):
+def test_motion_is_resampled_by_selection_or_interpolation(people):
     turning = people.with_rotations()
     clip = turning.clips[0]
     half = turning.resampled(15)
@@ -297,54 +302,54 @@ def test_motion_is_resampled_by_whole_frames_or_between_them(people):
             people.resampled(wrong)
 
 
-def test_recordings_that_nobody_divided_are(people):
-    alone = MotionSet([Clip("all", "walk", people.clips[0].positions)], WALKER)
-    parts = alone.divided(0.25, 10)
+def test_recordings_without_splits_are_divided(people):
+    single = MotionSet([Clip("all", "walk", people.clips[0].positions)], WALKER)
+    parts = single.divided(0.25, 10)
     assert [(clip.key, clip.frames) for clip in parts] == [
         (("train", "walk"), 20),
         (("train", "walk-1"), 10),
         (("test", "walk"), 10),
     ]
-    np.testing.assert_array_equal(np.concatenate([clip.positions for clip in parts]), alone.clips[0].positions)
+    np.testing.assert_array_equal(np.concatenate([clip.positions for clip in parts]), single.clips[0].positions)
     both = MotionSet([Clip("a/b", "x", people.clips[0].positions), Clip("c", "x", people.clips[1].positions)], WALKER)
 
     assert [clip.key for clip in both.divided(0.5, 30)] == [("train", "a-b-x"), ("test", "c-x")]  # too short for parts
-    assert [clip.split for clip in alone.divided(0.5, 30)] == ["train"]
+    assert [clip.split for clip in single.divided(0.5, 30)] == ["train"]
     with pytest.raises(ValueError, match="the share for test is 1"):
-        alone.divided(1)
+        single.divided(1)
 
 
-def test_one_recording_of_ones_own_has_windows_of_every_split(tmp_path):
+def test_a_single_recording_has_windows_of_every_split(tmp_path):
     people = simulate(1, 500)
     write_motion(tmp_path / "own.bvh", MotionSet([replace(people.clips[0], split="all")], people.skeleton))
-    opened = MotionData.open(tmp_path / "own.bvh")
-    assert (opened.protocol.observed, opened.protocol.predicted, opened.protocol.fps) == (15, 60, 30)
-    assert all(len(opened.windows(split)) for split in ("train", "validation", "test"))
-    again = MotionData.reopened(opened.recorded(), opened.schema)
-    assert (again.protocol, again.fingerprint) == (opened.protocol, opened.fingerprint)
+    data = MotionData.open(tmp_path / "own.bvh")
+    assert (data.protocol.observed, data.protocol.predicted, data.protocol.fps) == (15, 60, 30)
+    assert all(len(data.windows(split)) for split in ("train", "validation", "test"))
+    again = MotionData.reopened(data.recorded(), data.schema)
+    assert (again.protocol, again.fingerprint) == (data.protocol, data.fingerprint)
 
 
 @pytest.mark.parametrize("representation", ["positions", "6d"])
-def test_other_data_are_put_onto_the_skeleton_of_a_run(representation, tmp_path):
+def test_other_data_are_mapped_to_the_skeleton_of_a_run(representation, tmp_path):
     protocol = replace(PROTOCOLS["simulated"], representation=representation)
     people, others = simulate(3, 100, seed=1), simulate(2, 100, seed=2)
     write_motion(tmp_path / "a.npz", people)
-    own = MotionData.open(tmp_path / "a.npz", protocol)
+    data = MotionData.open(tmp_path / "a.npz", protocol)
     names = [f"mixamorig:{name.replace('L', 'Left', 1)}" if name[0] == "L" else name for name in WALKER.names]
     write_motion(tmp_path / "b", MotionSet(others.clips, replace(WALKER, names=names)), "bvh")
-    found = MotionData.reopened(own.recorded(), own.schema, tmp_path / "b")
-    assert (found.schema, found.onto) == (own.schema, True)
+    reopened = MotionData.reopened(data.recorded(), data.schema, tmp_path / "b")
+    assert (reopened.schema, reopened.onto) == (data.schema, True)
     for clip in others:
-        assert np.linalg.norm(found.motion[clip.key].positions - clip.positions, axis=-1).max() < 0.01
-    again = MotionData.reopened(own.recorded(), own.schema, tmp_path / "a.npz")
-    assert (again.fingerprint, again.onto) == (own.fingerprint, False)
+        assert np.linalg.norm(reopened.motion[clip.key].positions - clip.positions, axis=-1).max() < 0.01
+    again = MotionData.reopened(data.recorded(), data.schema, tmp_path / "a.npz")
+    assert (again.fingerprint, again.onto) == (data.fingerprint, False)
     write_motion(tmp_path / "c", MotionSet(others.clips, replace(WALKER, names=[*names[:-1], "Paw"])), "bvh")
-    strange = MotionData.reopened(own.recorded(), own.schema, tmp_path / "c")
-    assert (strange.schema == own.schema, strange.onto) == (False, False)
+    strange = MotionData.reopened(data.recorded(), data.schema, tmp_path / "c")
+    assert (strange.schema == data.schema, strange.onto) == (False, False)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
-def test_pipes_in_a_folder_are_refused_and_not_waited_for(bvh):
+def test_pipes_in_a_folder_are_errors_without_waiting(bvh):
     os.mkfifo(bvh / "train" / "a.bvh")
     with pytest.raises(ValueError, match=r"a\.bvh is no file but .* a FIFO"):
         read_motion(bvh)

@@ -1,4 +1,4 @@
-"""Motion written for other programs, and converted file by file on the command line."""
+"""Motion written for other programs, and `dvae data convert`."""
 
 import shutil
 from dataclasses import replace
@@ -22,18 +22,18 @@ from dvae.motion.files.smpl import JOINTS
 
 
 @pytest.fixture(scope="module")
-def three():
+def people():
     return simulate(clips=3, frames=12, seed=2)
 
 
 @pytest.fixture(scope="module")
-def recordings(three, tmp_path_factory):
+def recordings(people, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
-    write_motion(folder, three, "bvh")
+    write_motion(folder, people, "bvh")
     return folder
 
 
-def test_formats_and_names_fit_each_other_or_are_refused(three, tmp_path):
+def test_formats_and_names_that_do_not_fit_are_errors(people, tmp_path):
     for path, format, message in (
         ("a.bvh", None, "stores one clip per file, but there are 3"),
         ("a", None, "which format.*--format"),
@@ -41,79 +41,81 @@ def test_formats_and_names_fit_each_other_or_are_refused(three, tmp_path):
         ("a", "npz", "end its name in .npz"),
     ):
         with pytest.raises(ValueError, match=message):
-            write_motion(tmp_path / path, three, format)
+            write_motion(tmp_path / path, people, format)
     for split, name in (("..", "a"), ("/etc", "a"), ("a", "../../b")):
-        away = MotionSet([replace(three.clips[0], split=split, name=name)], WALKER)
+        outside = MotionSet([replace(people.clips[0], split=split, name=name)], WALKER)
         with pytest.raises(ValueError, match="leads out of the folder"):
-            write_motion(tmp_path / "inner", away, "csv")
+            write_motion(tmp_path / "inner", outside, "csv")
     assert not list(tmp_path.rglob("*.csv"))
 
 
-def test_amass_has_the_members_that_its_readers_ask_for(three, tmp_path):
-    (path,) = write_motion(tmp_path / "a.npz", MotionSet(three.clips[:1], WALKER), "amass")
+def test_amass_files_have_the_members_that_readers_expect(people, tmp_path):
+    (path,) = write_motion(tmp_path / "a.npz", MotionSet(people.clips[:1], WALKER), "amass")
     arrays = read_arrays(path)
     assert arrays["poses"].shape == (12, 156)
     assert arrays["trans"].shape == (12, 3)
     assert arrays["mocap_framerate"] == 30
     assert not arrays["betas"].any()
     assert not arrays["poses"][:, 3 * len(JOINTS) :].any()
-    heights = three.clips[0].positions[:, 0, 1]
+    heights = people.clips[0].positions[:, 0, 1]
     np.testing.assert_allclose(arrays["trans"][:, 2], heights, atol=1e-6)  # z up
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_folder_is_converted_as_it_would_be_read(jobs, recordings, tmp_path, capsys):
-    told = ["--fps", "15", "--onto", "human36m", "--jobs", str(jobs)]
-    assert main(["data", "convert", str(recordings), "--out", str(tmp_path / "a.npz"), *told]) == 0
+def test_a_converted_folder_equals_the_folder_as_read(jobs, recordings, tmp_path, capsys):
+    options = ["--fps", "15", "--onto", "human36m", "--jobs", str(jobs)]
+    assert main(["data", "convert", str(recordings), "--out", str(tmp_path / "a.npz"), *options]) == 0
     assert "3 clips; read as unit centimetres" in capsys.readouterr().err
-    read, whole = read_motion(tmp_path / "a.npz"), read_motion(recordings, onto=HUMAN36M).resampled(15)
-    assert [clip.key for clip in read] == [clip.key for clip in whole]
-    for clip in whole:
-        np.testing.assert_array_equal(read[clip.key].positions, clip.positions)
-    assert (read.skeleton.name, read.skeleton.up, read.skeleton.fps) == ("human36m", "z", 15)
+    converted, expected = read_motion(tmp_path / "a.npz"), read_motion(recordings, onto=HUMAN36M).resampled(15)
+    assert [clip.key for clip in converted] == [clip.key for clip in expected]
+    for clip in expected:
+        np.testing.assert_array_equal(converted[clip.key].positions, clip.positions)
+    assert (converted.skeleton.name, converted.skeleton.up, converted.skeleton.fps) == ("human36m", "z", 15)
 
 
 @pytest.mark.parametrize("format", ["npz", "bvh", "csv", "amass"])
-def test_labels_go_with_the_clips(format, three, tmp_path):
-    moods = [replace(clip, labels={"mood": name}) for clip, name in zip(three, ("sad, or so", "glad", ""), strict=True)]
+def test_labels_are_written_with_the_clips(format, people, tmp_path):
+    moods = [
+        replace(clip, labels={"mood": name}) for clip, name in zip(people, ("sad, or so", "glad", ""), strict=True)
+    ]
     sad = MotionSet(moods, WALKER)
-    known = {clip.key: clip.labels["mood"] for clip in sad}
+    moods_by_clip = {clip.key: clip.labels["mood"] for clip in sad}
 
-    def told(path):
+    def read_moods(path):
         return {clip.key: clip.labels["mood"] for clip in read_motion(path)}
 
     out = "a.npz" if format == "npz" else "a"
     write_motion(tmp_path / "out" / out, sad, format)
-    assert told(tmp_path / "out" / out) == known
+    assert read_moods(tmp_path / "out" / out) == moods_by_clip
     save(tmp_path / "npz" / "b.npz", sad)
     for number, source in enumerate((tmp_path / "out" / out, tmp_path / "npz" / "b.npz")):
-        there = tmp_path / str(number) / out
-        assert main(["data", "convert", str(source), "--out", str(there), "--format", format, "--jobs", "1"]) == 0
-        assert told(there) == known
+        target = tmp_path / str(number) / out
+        assert main(["data", "convert", str(source), "--out", str(target), "--format", format, "--jobs", "1"]) == 0
+        assert read_moods(target) == moods_by_clip
     if format == "csv":
         both = [str(tmp_path / "out" / "a" / split) for split in ("train", "test")]
         (tmp_path / "out" / "a" / "train" / "labels.csv").write_text("clip,mood\nperson_0001,wild\n")
         assert main(["data", "convert", *both, "--out", str(tmp_path / "both.npz"), "--jobs", "1"]) == 0
-        read = read_motion(tmp_path / "both.npz")
-        assert read["train", "person_0001"].labels["mood"] == "wild"
+        joined = read_motion(tmp_path / "both.npz")
+        assert joined["train", "person_0001"].labels["mood"] == "wild"
 
 
 @pytest.mark.parametrize("older", [False, True], ids=["own files", "files of the folder"])
-def test_archives_of_one_folder_keep_their_skeletons_and_labels(older, three, tmp_path):
-    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={"mood": "glad"}) for clip in three], WALKER))
+def test_archives_of_one_folder_keep_their_skeletons_and_labels(older, people, tmp_path):
+    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={"mood": "glad"}) for clip in people], WALKER))
     if older:  # as earlier versions wrote them
         for name in ("skeleton.json", "labels.csv"):
             (tmp_path / f"a.npz.{name}").rename(tmp_path / name)
-    save(tmp_path / "c.npz", MotionSet([replace(three.clips[0], labels={})], replace(WALKER, fps=60.0)))
+    save(tmp_path / "c.npz", MotionSet([replace(people.clips[0], labels={})], replace(WALKER, fps=60.0)))
     first, other = (read_motion(tmp_path / name) for name in ("a.npz", "c.npz"))
     assert (first.skeleton, other.skeleton.fps) == (WALKER, 60)
     assert [each.clips[0].labels.get("mood") for each in (first, other)] == ["glad", None]
-    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={}) for clip in three], WALKER))
+    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={}) for clip in people], WALKER))
     assert read_motion(tmp_path / "a.npz").clips[0].labels.get("mood") is None
 
 
-def test_an_archive_with_the_skeleton_of_another_is_refused(three, tmp_path):
-    save(tmp_path / "a.npz", three)
+def test_an_archive_with_another_skeleton_is_an_error(people, tmp_path):
+    save(tmp_path / "a.npz", people)
     arm = Skeleton(("shoulder", "elbow"), (-1, 0))
     arm.to_json(tmp_path / "skeleton.json")
     assert read_motion(tmp_path / "a.npz").skeleton == WALKER
@@ -122,48 +124,65 @@ def test_an_archive_with_the_skeleton_of_another_is_refused(three, tmp_path):
         read_motion(tmp_path / "a.npz")
 
 
-def test_what_is_refused_leaves_nothing_and_what_is_skipped_no_file(recordings, three, tmp_path, capsys):
+def test_an_error_leaves_no_files_and_skipped_clips_are_not_written(recordings, people, tmp_path, capsys):
     shutil.copytree(recordings, tmp_path / "in")
     stranger = tmp_path / "in" / "train" / "stranger.bvh"
     text = (tmp_path / "in" / "train" / "person_0000.bvh").read_text()
     stranger.write_text(text.replace("JOINT LShoulder", "JOINT Wing"))
-    told = ["data", "convert", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--format", "csv", "--jobs", "1"]
-    assert main(told) == 1
+    command = [
+        "data",
+        "convert",
+        str(tmp_path / "in"),
+        "--out",
+        str(tmp_path / "out"),
+        "--format",
+        "csv",
+        "--jobs",
+        "1",
+    ]
+    assert main(command) == 1
     assert "has Wing" in capsys.readouterr().err
     assert not list((tmp_path / "out").rglob("*"))
-    assert main([*told, "--skip-bad"]) == 0
+    assert main([*command, "--skip-bad"]) == 0
     assert "3 clips" in capsys.readouterr().err
-    written = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.csv"))
-    assert written == ["labels.csv", "test/person_0002.csv", "train/person_0000.csv", "train/person_0001.csv"]
-    for wrong in (["convert", told[2]], ["info", *told[2:]], ["get", "cmu2", *told[3:5]], [*told[1:], "--url", "x"]):
+    files = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.csv"))
+    assert files == ["labels.csv", "test/person_0002.csv", "train/person_0000.csv", "train/person_0001.csv"]
+    for wrong in (
+        ["convert", command[2]],
+        ["info", *command[2:]],
+        ["get", "cmu2", *command[3:5]],
+        [*command[1:], "--url", "x"],
+    ):
         assert main(["data", *wrong]) == 2
 
 
-def test_forecasts_of_a_run_are_bvh(run, tmp_path, capsys):
+def test_forecasts_of_a_run_are_written_as_bvh(run, tmp_path, capsys):
     assert main(["forecast", str(run), "--out", str(tmp_path / "one.bvh"), "--samples", "2"]) == 0
-    told = " ".join(capsys.readouterr().err.split())
-    assert "the first of 2 futures of 60 frames for each of 1 windows, after 15 observed frames" in told
-    assert "relative to the root: the protocol simulated removes the root's path" in told
-    read = read_motion(tmp_path / "one.bvh", onto=WALKER, metres=0.01)  # hardly fitted: no person yet
-    assert read.clips[0].frames == 75
+    notes = " ".join(capsys.readouterr().err.split())
+    assert "the first of 2 futures of 60 frames for each of 1 windows, after 15 observed frames" in notes
+    assert "relative to the root: the protocol simulated removes the root's path" in notes
+    motion_set = read_motion(
+        tmp_path / "one.bvh", onto=WALKER, metres=0.01
+    )  # a barely fitted model is no plausible person
+    assert motion_set.clips[0].frames == 75
 
 
-def test_archives_of_clips_are_joined(three, tmp_path, capsys):
+def test_archives_of_clips_are_joined(people, tmp_path, capsys):
     folder, out = tmp_path / "in", str(tmp_path / "all.npz")
     folder.mkdir()
-    paths = [folder / f"{clip.name}.npz" for clip in three]
-    for path, clip in zip(paths, three, strict=True):
-        save(path, replace(three, clips=[clip]))
+    paths = [folder / f"{clip.name}.npz" for clip in people]
+    for path, clip in zip(paths, people, strict=True):
+        save(path, replace(people, clips=[clip]))
     assert main(["data", "info", str(folder)]) == 1
     assert f"dvae data convert {folder}/*.npz --out ALL.npz" in " ".join(capsys.readouterr().err.split())
     assert main(["data", "convert", *map(str, paths), "--out", out]) == 0
-    assert read_motion(out).fingerprint() == three.fingerprint()
-    write_motion(tmp_path / "a.bvh", replace(three, clips=[three.clips[0]]))
+    assert read_motion(out).fingerprint() == people.fingerprint()
+    write_motion(tmp_path / "a.bvh", replace(people, clips=[people.clips[0]]))
     for other, message in (
-        (tmp_path / "a.bvh", "is an archive of clips and"),  # which was left out without a word
+        (tmp_path / "a.bvh", "is an archive of clips and"),  # which was silently left out
         (paths[0], "occurs twice"),
         (folder / "z.npz", "z is up, and y in"),
     ):
-        save(folder / "z.npz", MotionSet([three.clips[0]], replace(WALKER, up="z")))
+        save(folder / "z.npz", MotionSet([people.clips[0]], replace(WALKER, up="z")))
         assert main(["data", "convert", str(paths[0]), str(other), "--out", out]) == 1
         assert message in " ".join(capsys.readouterr().err.split())

@@ -51,20 +51,22 @@ TREES = {
     "LWrist RClavicle RShoulder RElbow RWrist",
 }
 SKELETONS = {s.name: s for s in (HUMAN36M, WALKER, HUMANEVA)} | {
-    name: Skeleton(tuple(joints.split()), (-1, *[0] * (len(joints.split()) - 1)), name=name)  # angles know no parents
+    name: Skeleton(
+        tuple(joints.split()), (-1, *[0] * (len(joints.split()) - 1)), name=name
+    )  # angles do not depend on parents
     for name, joints in TREES.items()
 }
 every_skeleton = pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=list(SKELETONS))
 
 
 def pose(skeleton, base=STANDING, **moved):
-    """(D,) without the root."""
+    """Return (D,) without the root."""
     places = base | moved
     return torch.tensor([places[name] for name in skeleton.names[1:]], dtype=torch.float64).flatten()
 
 
 def angles(poses, skeleton):
-    """Name -> the cosines of that name, left first."""
+    """Return the cosines by name, left first."""
     values = cosines(poses, skeleton)
     names = angle_names(skeleton)
     return {name: [values[i].item() for i, other in enumerate(names) if other == name] for name in names}
@@ -75,7 +77,7 @@ def random_poses(skeleton, *shape):
 
 
 def swapped_sides(skeleton):
-    """For each joint the joint of the other side."""
+    """Return for each joint the joint of the other side."""
     other = {"L": "R", "R": "L"}
     return [skeleton.names.index(other.get(name[0], name[0]) + name[1:]) for name in skeleton.names]
 
@@ -86,22 +88,22 @@ class TestCosines:
         skeleton = SKELETONS[name]
         bent = {"LAnkle": (0.1, -0.4, -0.4), "LToe": (0.1, -0.5, -0.4)}
         arm = {"RElbow": (-0.2, 0.4, 0.3), "RWrist": (-0.2, 0.7, 0.3)}
-        found = angles(pose(skeleton, UPRIGHT, **bent, **arm), skeleton)
-        assert found["Shank2Thigh"] == pytest.approx([0, 1])
-        assert found["Shank2ThighPlane"] == pytest.approx([1, 0])
-        assert found["Foot2Shank"] == pytest.approx([0, 0])
-        assert found["Foot2ThighPlane"] == pytest.approx([0, -1])
-        assert found["Thigh2Spine"] == pytest.approx([-1, -1])
-        assert found["Arm2Trunk"] == pytest.approx([-1, 0])
-        assert found["Arm2ChestPlane"] == pytest.approx([0, 1])  # forwards
-        assert found["Forearm2Arm"] == pytest.approx([1, 0])
-        assert [found[name][0] for name in ("Trunk2Pelvis", "Shoulders2Hips", "Head2Trunk")] == pytest.approx([1] * 3)
+        cosines = angles(pose(skeleton, UPRIGHT, **bent, **arm), skeleton)
+        assert cosines["Shank2Thigh"] == pytest.approx([0, 1])
+        assert cosines["Shank2ThighPlane"] == pytest.approx([1, 0])
+        assert cosines["Foot2Shank"] == pytest.approx([0, 0])
+        assert cosines["Foot2ThighPlane"] == pytest.approx([0, -1])
+        assert cosines["Thigh2Spine"] == pytest.approx([-1, -1])
+        assert cosines["Arm2Trunk"] == pytest.approx([-1, 0])
+        assert cosines["Arm2ChestPlane"] == pytest.approx([0, 1])  # forwards
+        assert cosines["Forearm2Arm"] == pytest.approx([1, 0])
+        assert [cosines[name][0] for name in ("Trunk2Pelvis", "Shoulders2Hips", "Head2Trunk")] == pytest.approx([1] * 3)
         thigh = angles(pose(skeleton, UPRIGHT, LKnee=(0.1, 0, 0.4), RKnee=(-0.5, 0, 0)), skeleton)
         assert thigh["Thigh2HipPlane"] == pytest.approx([1, 0])  # forwards
         assert thigh["Thigh2Hips"] == pytest.approx([0, 1])  # outwards
 
     def test_of_humaneva(self):
-        """An independent spelling of the definitions, by indices without the root."""
+        """Write out the definitions by indices without the root."""
         poses = random_poses(HUMANEVA, 5)
         v = poses.unflatten(-1, (-1, 3)).unbind(-2)
         cross, cos = torch.linalg.cross, torch.nn.functional.cosine_similarity
@@ -152,22 +154,22 @@ class TestCosines:
         }
         self.compare(cosines(poses, HUMAN36M), angle_names(HUMAN36M), expected)
 
-    def compare(self, found, names, expected):
+    def compare(self, cosines, names, expected):
         assert set(names) == set(expected)
         for name, columns in expected.items():
             same = [i for i, other in enumerate(names) if other == name]
-            torch.testing.assert_close(found[..., same], torch.stack(columns, -1), equal_nan=True)
+            torch.testing.assert_close(cosines[..., same], torch.stack(columns, -1), equal_nan=True)
 
     @every_skeleton
-    def test_turning_scaling_and_the_layout_change_nothing(self, skeleton):
+    def test_rotation_scale_and_joint_order_change_nothing(self, skeleton):
         poses = random_poses(skeleton, 7)
         expected = cosines(poses, skeleton)
         turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))
         turn = turn * torch.linalg.det(turn)
         joints = poses.unflatten(-1, (-1, 3))
         torch.testing.assert_close(cosines((1.7 * joints @ turn).flatten(-2), skeleton), expected, equal_nan=True)
-        kept = torch.cat([torch.zeros_like(joints[:, :1]), joints], 1) + torch.randn(3)
-        torch.testing.assert_close(cosines(kept.flatten(-2), skeleton), expected, equal_nan=True)
+        with_root = torch.cat([torch.zeros_like(joints[:, :1]), joints], 1) + torch.randn(3)
+        torch.testing.assert_close(cosines(with_root.flatten(-2), skeleton), expected, equal_nan=True)
 
     @every_skeleton
     def test_a_mirrored_person_has_the_angles_of_the_other_side(self, skeleton):
@@ -180,7 +182,7 @@ class TestCosines:
             torch.testing.assert_close(second[:, same], first[:, same[::-1]], equal_nan=True)
 
     @every_skeleton
-    def test_a_limb_without_length_leaves_the_other_gradients(self, skeleton):
+    def test_a_limb_of_length_zero_keeps_the_other_gradients(self, skeleton):
         poses = random_poses(skeleton, 2).requires_grad_()
         knee, hip = (skeleton.names.index(name) for name in ("LKnee", "LHip"))
         joints = list(poses.unflatten(-1, (-1, 3)).unbind(-2))
@@ -195,7 +197,7 @@ class TestCosines:
         poses = random_poses(skeleton, 3).requires_grad_()
         assert torch.autograd.gradcheck(lambda x: cosines(x, skeleton).nan_to_num(), poses)
 
-    def test_skeletons_without_angles_and_other_sizes_are_refused(self):
+    def test_skeletons_without_angles_and_other_sizes_are_errors(self):
         stick = Skeleton(("a", "b"), (-1, 0), name="stick")
         with pytest.raises(ValueError, match="no joint angles for skeleton 'stick': there are some for human36m"):
             cosines(torch.zeros(3), stick)
@@ -215,7 +217,7 @@ class TestLimits:
             assert limits.low[column] == values[:, [left, right]].min()
             assert limits.high[column] == values[:, [left, right]].max()
 
-    def test_bad_input_is_refused(self):
+    def test_invalid_input_is_an_error(self):
         with pytest.raises(ValueError, match=r"quantile is 0\.5"):
             estimate_angle_limits(pose(WALKER), WALKER, quantile=0.5)
         with pytest.raises(ValueError, match="at least one"):

@@ -1,4 +1,4 @@
-"""The action classifier: what it reads, that it learns and repeats, and the scores ACC and FID that rest on it."""
+"""The action classifier: its inputs, training, and the scores ACC and FID."""
 
 import json
 from dataclasses import replace
@@ -28,16 +28,16 @@ def draw(*shape, seed=0):
 
 
 def people(count=24, ways=("up", "down"), frames=40):
-    """Simulated people, of whom every second one hangs upside down."""
+    """Simulate people; every second one is upside down."""
     clips = motion.simulate(clips=count, frames=frames, test=0.4)
     flip = {"up": np.float32([1, 1, 1]), "down": np.float32([1, -1, 1])}
-    made = [
+    simulated = [
         replace(
             clip, positions=clip.positions * flip[("up", "down")[i % 2]], labels={"way": ways[i % 2], "who": f"{i}"}
         )
         for i, clip in enumerate(clips)
     ]
-    return motion.MotionSet(made, clips.skeleton, "people")
+    return motion.MotionSet(simulated, clips.skeleton, "people")
 
 
 def windows(split, clips=None, protocol=SHORT):
@@ -58,7 +58,7 @@ def classifier(train=None, **options):
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A classifier of who is up and who is down, fitted for long enough."""
+    """Return a fitted classifier of upright and upside-down people."""
     train, method = windows("train"), ActionClassifier(**SMALL)
     model = classifier(train)
     dvae.fit(
@@ -98,7 +98,7 @@ def test_its_bound_is_the_log_likelihood_of_the_class_from_the_predicted_frames(
     log_softmax = model.logits(model.features(x[:, 4:])).log_softmax(-1)
     terms = dvae.SequenceELBO().terms(model, {"x": x, "c": c})
     torch.testing.assert_close(terms.log_likelihood["c"], log_softmax[torch.arange(len(c)), c])
-    torch.testing.assert_close(terms.per_frame, terms.log_likelihood["c"])  # a window counts once
+    torch.testing.assert_close(terms.per_frame, terms.log_likelihood["c"])  # each window counts once
     elsewhere = torch.cat([draw(len(x), 4, x.shape[2]), x[:, 4:]], 1)
     assert torch.equal(dvae.SequenceELBO().terms(model, {"x": elsewhere, "c": c}).bound, terms.bound)
 
@@ -109,9 +109,9 @@ def test_its_features_follow_the_formula_from_a_zero_state():
     weights = {name: value.detach() for name, value in model.gru.named_parameters()}
     for frame in futures[3, 1]:
         for layer in range(2):
-            ours = weights[f"weight_ih_l{layer}"] @ frame + weights[f"bias_ih_l{layer}"]
+            gates = weights[f"weight_ih_l{layer}"] @ frame + weights[f"bias_ih_l{layer}"]
             last = weights[f"weight_hh_l{layer}"] @ state[layer] + weights[f"bias_hh_l{layer}"]
-            (r, z, n), (r_, z_, n_) = ours.chunk(3), last.chunk(3)
+            (r, z, n), (r_, z_, n_) = gates.chunk(3), last.chunk(3)
             new = torch.tanh(n + torch.sigmoid(r + r_) * n_)
             gate = torch.sigmoid(z + z_)
             frame = state[layer] = (1 - gate) * new + gate * state[layer]
@@ -121,17 +121,17 @@ def test_its_features_follow_the_formula_from_a_zero_state():
     assert torch.equal(model.train().features(futures), features)
 
 
-def test_it_learns_what_can_be_told_apart(fitted):
+def test_it_learns_distinguishable_classes(fitted):
     test = windows("test")
     predicted = fitted.logits(fitted.features(test.all()["x"][:, 4:].double())).argmax(-1)
     assert [fitted.classes[c] for c in predicted.tolist()] == test.labels("way")
 
 
-def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsys):
-    loaded = dvae.load(run)
-    assert isinstance(loaded.model, ActionClassifierModel)
-    assert loaded.model.classes == ("down", "up")
-    assert configured(json.loads(json.dumps(loaded.method.config()))) == loaded.method
+def test_a_fitted_classifier_is_loaded_and_resumed(run, file, tmp_path, capsys):
+    run_contents = dvae.load(run)
+    assert isinstance(run_contents.model, ActionClassifierModel)
+    assert run_contents.model.classes == ("down", "up")
+    assert configured(json.loads(json.dumps(run_contents.method.config()))) == run_contents.method
     parts, method = tmp_path / "parts", metric_model("action-classifier", **SMALL)
     training = replace(method.trainings[""], steps=10, batch_size=16, validate_every=10, progress=False)
     dvae.fit(method, MotionData.open(file), out=parts, **vars(training))
@@ -165,7 +165,7 @@ def test_a_fitted_classifier_is_read_back_and_goes_on(run, file, tmp_path, capsy
         (lambda: classifier().features(draw(2, 9, 51)), "frames have 51 numbers, .* fitted to frames of 48"),
     ],
 )
-def test_what_it_refuses(call, message):
+def test_wrong_arguments_are_errors(call, message):
     with pytest.raises(ValueError, match=message):
         call()
 
@@ -174,13 +174,13 @@ def test_what_it_refuses(call, message):
 
 
 def brute_force(real, generated, places):
-    """The distance of all windows, and without each clip."""
+    """Return the distance of all windows, and those without each clip."""
     keep = [torch.ones(len(places), dtype=bool), *(places != clip for clip in places.unique())]
-    found = [frechet_distance(real[kept], generated[kept].flatten(0, 1)).item() for kept in keep]
-    return np.array(found[0]), np.array(found[1:])
+    distances = [frechet_distance(real[subset], generated[subset].flatten(0, 1)).item() for subset in keep]
+    return np.array(distances[0]), np.array(distances[1:])
 
 
-def test_pseudo_values_are_those_of_leaving_each_clip_out():
+def test_pseudo_values_equal_those_of_leaving_out_each_clip():
     places = torch.tensor([0, 0, 0, 1, 2, 2, 2, 2, 3, 4, 4, 1, 0, 5, 5])
     real, generated = draw(15, 4) + 20, 1.3 * draw(15, 3, 4, seed=1) + 20.5
     value, without = brute_force(real, generated, places)
@@ -213,16 +213,18 @@ def test_scores_of_reference_rows_by_hand(fitted):
     assert against_real.mean == -result["zero velocity"]["FID way"].mean
 
 
-def test_classes_that_it_does_not_know_count_for_fid_alone_and_the_record_says_so(fitted):
+def test_unknown_classes_count_for_fid_only_and_are_reported(fitted):
     clips = people()
-    made = [replace(c, labels={"way": "sideways"}) if c.split == "test" and n % 3 else c for n, c in enumerate(clips)]
-    some = windows("test", motion.MotionSet(made, clips.skeleton, "people"))
+    relabelled = [
+        replace(c, labels={"way": "sideways"}) if c.split == "test" and n % 3 else c for n, c in enumerate(clips)
+    ]
+    some = windows("test", motion.MotionSet(relabelled, clips.skeleton, "people"))
     result = evaluate(some, {"way": fitted, "a": classifier()})
-    unknown, used = some.labels("way").count("sideways"), result.basis["classifier way"]
-    assert used["unknown"] == unknown > 0
-    assert used["weights"] != result.basis["classifier a"]["weights"]
+    unknown, n_used = some.labels("way").count("sideways"), result.basis["classifier way"]
+    assert n_used["unknown"] == unknown > 0
+    assert n_used["weights"] != result.basis["classifier a"]["weights"]
     assert f"{unknown} of {len(some)} windows have a class that it does not know" in " ".join(str(result).split())
-    assert f"ACC, FID way: classifier {used['weights'][:12]}" in str(result)
+    assert f"ACC, FID way: classifier {n_used['weights'][:12]}" in str(result)
     assert result["real motion"]["ACC way"] == Score(1, 0)
     assert list(result.metrics)[-4:] == ["ACC a", "ACC way", "FID a", "FID way"]
     assert Evaluation.from_json(result.to_json()).to_json() == result.to_json()
@@ -232,7 +234,7 @@ def test_classes_that_it_does_not_know_count_for_fid_alone_and_the_record_says_s
 
 
 @pytest.mark.parametrize(
-    ("held", "message"),
+    ("condition", "message"),
     [
         (lambda: windows("test", protocol=replace(SHORT, root="relative")), "the skeleton 'walker' and 51"),
         (lambda: windows("test", protocol=replace(SHORT, predicted=5)), "fitted to 6 predicted frames at .* have 5 at"),
@@ -243,9 +245,9 @@ def test_classes_that_it_does_not_know_count_for_fid_alone_and_the_record_says_s
         (lambda: windows("test", people(3), replace(SHORT, test_stride=99)), "these are 1 windows of 1 clips"),
     ],
 )
-def test_windows_that_do_not_suit_a_classifier_are_refused(held, message, fitted):
+def test_windows_unlike_those_of_a_classifier_are_errors(condition, message, fitted):
     with pytest.raises(ValueError, match=message):
-        evaluate(held(), {"way": fitted})
+        evaluate(condition(), {"way": fitted})
 
 
 def test_the_command_line_scores_runs_by_classifiers(run, file, tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""The metric model of quality: at guessing where nobody can tell, never wrong where everybody can, and reproducible."""
+"""The quality score: chance level for true futures, no errors for noise, and reproducible results."""
 
 import math
 from dataclasses import replace
@@ -14,8 +14,8 @@ from dvae.motion.metric_models.quality import QualityScores, RealOrGenerated, qu
 SHORT = replace(motion.PROTOCOLS["simulated"], observed=4, predicted=6, test_stride=5)
 
 
-class Makes(nn.Module):
-    """A model of nothing but futures."""
+class FutureModel(nn.Module):
+    """A model that only returns futures."""
 
     def __init__(self, futures):
         super().__init__()
@@ -38,7 +38,7 @@ def people():
 
 
 def remembering(windows):
-    """Copies the future of whoever began so."""
+    """Return a function that copies the future of the nearest past."""
     x = torch.cat([each.all(1)["x"] for each in windows.values()])
 
     def futures(past, horizon):
@@ -47,107 +47,113 @@ def remembering(windows):
     return futures
 
 
-def judged(models, people, **options):
+def quality_scores(models, people, **options):
     fit = {"examples": 300, "steps": 120, "seeds": (0, 1), "learning_rate": 0.2, "batch_size": 64}
     options = {"references": False, **fit, **options}
-    models = {name: Makes(futures) for name, futures in models.items()}
+    models = {name: FutureModel(futures) for name, futures in models.items()}
     common = {"method": RealOrGenerated(16), "progress": False, "accelerator": "cpu"}
     return quality(models, people["train"], people["test"], **common, **options)
 
 
-def test_noise_is_told_and_noise_half_the_time_is_told_then(people):
+def test_noise_is_detected_always_and_half_noise_half_the_time(people):
     copied = remembering(people)
 
     def half(x, horizon):
         return torch.where(torch.rand(len(x), 1, 1) < 0.5, noise(x, horizon), copied(x, horizon))
 
-    found = judged({"noise": noise, "half of each": half}, people)
-    assert list(found.rows) == ["noise", "half of each"]
-    assert found["noise"]["quality"].mean < 8
-    # who makes noise half the time can be told then, and then alone: at best with an accuracy of (1 + 1 / 2) / 2
-    mixed = found["half of each"]
-    assert 25 - 4 * mixed["quality"].sequences < mixed["quality"].mean < 40
-    assert 25 < mixed["taken for real"].mean < 75
-    worse = found.difference("noise", "half of each")
-    assert worse.mean == pytest.approx(found["noise"]["quality"].mean - found["half of each"]["quality"].mean)
+    result = quality_scores({"noise": noise, "half of each": half}, people)
+    assert list(result.rows) == ["noise", "half of each"]
+    assert result["noise"]["quality"].mean < 8
+    # only the noise half of the futures is detectable: the best accuracy is (1 + 1 / 2) / 2
+    half_noise = result["half of each"]
+    assert 25 - 4 * half_noise["quality"].sequences < half_noise["quality"].mean < 40
+    assert 25 < half_noise["taken for real"].mean < 75
+    worse = result.difference("noise", "half of each")
+    assert worse.mean == pytest.approx(result["noise"]["quality"].mean - result["half of each"]["quality"].mean)
     assert worse.interval(error="sequences")[1] < 0
 
 
-def test_true_futures_leave_the_judge_at_guessing_whatever_it_has_learned(people):
-    found = judged({"copied": remembering(people)}, people, steps=5)["copied"]
-    assert found["quality"].mean == pytest.approx(50)  # the same windows twice: half of the answers are wrong
-    assert found["quality"].sequences == pytest.approx(0)
+def test_true_futures_score_at_chance_level(people):
+    result = quality_scores({"copied": remembering(people)}, people, steps=5)["copied"]
+    assert result["quality"].mean == pytest.approx(
+        50
+    )  # the same windows as true and forecast: half of the answers are wrong
+    assert result["quality"].sequences == pytest.approx(0)
 
 
-def test_zero_velocity_is_judged_beside_them(people):
-    found = judged({"mine": lambda x, horizon: x[:, -1:].expand(-1, horizon, -1)}, people, references=True, steps=2)
-    assert list(found.rows) == ["mine", "zero velocity"]
-    assert found["mine"] == found["zero velocity"]
+def test_zero_velocity_is_a_reference_row(people):
+    result = quality_scores(
+        {"mine": lambda x, horizon: x[:, -1:].expand(-1, horizon, -1)}, people, references=True, steps=2
+    )
+    assert list(result.rows) == ["mine", "zero velocity"]
+    assert result["mine"] == result["zero velocity"]
 
 
-def test_other_draws_of_real_motion_leave_the_judge_at_guessing():
-    """Where every frame is a draw of its own, futures drawn anew are as real as the true ones."""
+def test_new_samples_of_real_motion_score_at_chance_level():
+    """If frames are independent, new samples of the future are as real as the true ones."""
     clips = motion.simulate(clips=30, frames=40, test=0.5)
     generator = np.random.default_rng(0)
-    made = [replace(clip, positions=generator.normal(0, 0.2, clip.positions.shape).astype("f4")) for clip in clips]
-    windows = motion.MotionSet(made, clips.skeleton, "noise")
+    independent = [
+        replace(clip, positions=generator.normal(0, 0.2, clip.positions.shape).astype("f4")) for clip in clips
+    ]
+    windows = motion.MotionSet(independent, clips.skeleton, "noise")
     windows = {split: motion.windows(windows, SHORT, split) for split in ("train", "test")}
 
     def again(x, horizon):
         joints, pelvis = torch.randn(len(x), horizon, 16, 3), torch.randn(len(x), horizon, 1, 3)
         return 0.2 * (joints - pelvis).flatten(-2)
 
-    found = judged({"again": again}, windows, steps=40)["again"]["quality"]
-    assert abs(found.mean - 50) < 4 * found.sequences
-    assert found.sequences > 0
+    score = quality_scores({"again": again}, windows, steps=40)["again"]["quality"]
+    assert abs(score.mean - 50) < 4 * score.sequences
+    assert score.sequences > 0
 
 
-def test_who_faces_where_and_where_the_pelvis_is_tell_nobody_apart(people):
+def test_heading_and_root_position_change_no_score(people):
     metric_model, fixed = (RealOrGenerated(32, heading=each).build(people["train"]).double() for each in (True, False))
     skeleton, x = people["train"].skeleton, people["test"].all()["x"][:5].double()
-    turned = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), torch.rand(5, 1, 1).double(), skeleton.up)
-    moved = skeleton.with_root(turned) + torch.randn(5, 10, 1, 3).double()
-    for other in (turned, moved):
+    rotated = motion.rotate_about_up(x.unflatten(-1, (-1, 3)), torch.rand(5, 1, 1).double(), skeleton.up)
+    translated = skeleton.with_root(rotated) + torch.randn(5, 10, 1, 3).double()
+    for other in (rotated, translated):
         torch.testing.assert_close(metric_model.logits(other.flatten(-2)), metric_model.logits(x))
     assert metric_model.logits(x).std() > 0
-    assert (fixed.logits(turned.flatten(-2)) != fixed.logits(x)).all()
+    assert (fixed.logits(rotated.flatten(-2)) != fixed.logits(x)).all()
     with pytest.raises(ValueError, match="frames have 5 numbers; expected 51 for the skeleton 'walker', or 48"):
         metric_model.logits(x[..., :5])
 
 
-def test_the_same_seeds_give_the_same_scores_which_are_kept(people, tmp_path):
+def test_the_same_seeds_give_the_same_scores_and_scores_are_stored(people, tmp_path):
     state = torch.get_rng_state()
-    first, other = (judged({"noise": noise}, people, steps=4, seeds=seeds) for seeds in ((3, 4), (3, 5)))
+    first, other = (quality_scores({"noise": noise}, people, steps=4, seeds=seeds) for seeds in ((3, 4), (3, 5)))
     assert torch.equal(torch.get_rng_state(), state)
     assert np.array_equal(first.rows["noise"]["quality"][0], other.rows["noise"]["quality"][0])
     assert not np.array_equal(first.rows["noise"]["quality"][1], other.rows["noise"]["quality"][1])
     first.save(tmp_path / "found.json")
-    read = QualityScores.load(tmp_path / "found.json")
-    assert str(read) == str(first)
-    assert read["noise"] == first["noise"]
-    assert read.record["training"]["momentum"] == 0.9
-    one = judged({"noise": noise}, people, steps=2, seeds=(0,))["noise"]["quality"]
+    loaded = QualityScores.load(tmp_path / "found.json")
+    assert str(loaded) == str(first)
+    assert loaded["noise"] == first["noise"]
+    assert loaded.record["training"]["momentum"] == 0.9
+    one = quality_scores({"noise": noise}, people, steps=2, seeds=(0,))["noise"]["quality"]
     assert math.isnan(one.total)
     assert not math.isnan(one.sequences)
 
 
-def test_what_it_refuses(people):
+def test_wrong_arguments_are_errors(people):
     other = motion.windows(motion.simulate(clips=8, frames=40, test=0.5), replace(SHORT, observed=5), "test")
-    lacking = motion.windows(motion.occlude(motion.simulate(8, 40, test=0.5), 0.2, 5.0), SHORT, "test")
+    incomplete = motion.windows(motion.occlude(motion.simulate(8, 40, test=0.5), 0.2, 5.0), SHORT, "test")
     for options, message in (
         ({"people": {**people, "test": other}}, "training and test windows differ in skeleton or frames"),
-        ({"people": {**people, "test": lacking}}, "these have missing joints; fill the gaps"),
+        ({"people": {**people, "test": incomplete}}, "these have missing joints; fill the gaps"),
         ({"seeds": ()}, "at least one example and one seed"),
         ({"models": {"zero velocity": noise}, "references": True}, "must not have the name of a reference row: zero"),
     ):
         with pytest.raises(ValueError, match=message):
-            judged(**{"models": {"noise": noise}, "people": people, **options})
+            quality_scores(**{"models": {"noise": noise}, "people": people, **options})
     with pytest.raises(FloatingPointError, match="the forecast of broken is not finite"):
-        judged({"broken": lambda x, horizon: noise(x, horizon) / 0}, people)
+        quality_scores({"broken": lambda x, horizon: noise(x, horizon) / 0}, people)
     with pytest.raises(
         ValueError, match="a metric model of quality needs the description of poses, but was given sequences"
     ):
         RealOrGenerated().build({"x": 48})
 
     with pytest.raises(KeyError, match=r"no model 'nois' here \(did you mean 'noise'\?\)"):
-        judged({"noise": noise}, people, steps=1)["nois"]
+        quality_scores({"noise": noise}, people, steps=1)["nois"]

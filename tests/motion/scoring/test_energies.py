@@ -63,28 +63,28 @@ def gradient(value, samples):
 
 
 class TestEveryEnergy:
-    def test_is_held_to_these_laws(self):
-        found = inspect.getmembers(energies, inspect.isfunction)
-        own = {name for name, function in found if function.__module__ == energies.__name__}
-        assert set(ENERGIES) == {name for name in own if not name.startswith("_")}
+    def test_all_energies_are_in_the_table(self):
+        functions = inspect.getmembers(energies, inspect.isfunction)
+        names = {name for name, function in functions if function.__module__ == energies.__name__}
+        assert set(ENERGIES) == {name for name in names if not name.startswith("_")}
 
     @every_energy
-    def test_is_one_number_a_sequence_in_the_precision_of_the_samples(self, energy):
+    def test_is_one_number_per_sequence_in_the_precision_of_the_samples(self, energy):
         for dtype in (torch.float32, torch.float64):
-            given = {name: x.to(dtype) if x.is_floating_point() else x for name, x in SEQUENCES.items()}
-            values = energy(normal(S, B, T, D).to(dtype), **given)
+            arguments = {name: x.to(dtype) if x.is_floating_point() else x for name, x in SEQUENCES.items()}
+            values = energy(normal(S, B, T, D).to(dtype), **arguments)
             assert values.shape == (B,)
             assert values.dtype == dtype
 
     @every_energy
     def test_gradient(self, energy):
         samples = normal(2, B, 2, D).requires_grad_()
-        given = SEQUENCES | {"truth": SEQUENCES["truth"][:, :2], "pseudo": SEQUENCES["pseudo"][:, :, :2]}
-        assert gradcheck(lambda x: energy(x, **given), samples, fast_mode=True)
-        assert gradient(energy(samples, **given), samples).any()
+        arguments = SEQUENCES | {"truth": SEQUENCES["truth"][:, :2], "pseudo": SEQUENCES["pseudo"][:, :, :2]}
+        assert gradcheck(lambda x: energy(x, **arguments), samples, fast_mode=True)
+        assert gradient(energy(samples, **arguments), samples).any()
 
     @every_energy
-    def test_limbs_without_length_give_no_nan(self, energy):
+    def test_limbs_of_length_zero_give_no_nan(self, energy):
         samples = torch.zeros(S, B, T, D, dtype=torch.float64)
         samples[:, 0] = normal(T, D)
         samples[:, 0, :, 3:6] = samples[:, 0, :, :3]  # the right thigh
@@ -96,15 +96,15 @@ class TestEveryEnergy:
     @every_energy
     def test_blocks_change_nothing(self, energy, monkeypatch):
         samples = normal(S, B, T, D).requires_grad_()
-        found = []
+        results = []
         for block in (1, 10**9):
             monkeypatch.setattr(energies, "BLOCK", block)
             values = energy(samples, **SEQUENCES)
-            found.append((values, torch.autograd.grad((values * torch.arange(1, B + 1)).sum(), samples)[0]))
-        torch.testing.assert_close(*found)
+            results.append((values, torch.autograd.grad((values * torch.arange(1, B + 1)).sum(), samples)[0]))
+        torch.testing.assert_close(*results)
 
     @every_energy
-    def test_refuses_other_shapes(self, energy):
+    def test_wrong_shapes_are_errors(self, energy):
         with pytest.raises(ValueError, match=r"samples have shape \(5, 4, 48\), expected \(S, B, T, D\)"):
             energy(normal(S, T, D), **SEQUENCES)
         with pytest.raises(ValueError, match="with no size 0"):
@@ -133,7 +133,7 @@ class TestEveryEnergy:
             ),
         ],
     )
-    def test_refuses_other_options(self, call, message):
+    def test_wrong_options_are_errors(self, call, message):
         with pytest.raises(ValueError, match=message):
             call(normal(S, B, T, D))
 
@@ -155,18 +155,18 @@ NAIVE = {
 @pytest.mark.parametrize("name", NAIVE)
 def test_an_energy_is_its_formula_and_has_its_gradient(name):
     samples = normal(S, B, T, D).requires_grad_()
-    found, naive = ENERGIES[name](samples, **SEQUENCES), NAIVE[name](samples)
-    torch.testing.assert_close(found, naive)
-    torch.testing.assert_close(gradient(found, samples), gradient(naive, samples))
+    value, naive = ENERGIES[name](samples, **SEQUENCES), NAIVE[name](samples)
+    torch.testing.assert_close(value, naive)
+    torch.testing.assert_close(gradient(value, samples), gradient(naive, samples))
 
 
 @pytest.mark.parametrize("diversity", [pairwise_diversity, gaussian_diversity])
 def test_equal_samples_are_not_diverse_and_one_sample_has_no_pair(diversity):
     assert diversity(normal(1, B, T, D).expand(S, B, T, D), 1).tolist() == pytest.approx([1] * B)
     samples = normal(1, B, T, D).requires_grad_()
-    found = diversity(samples, 1)
-    assert found.tolist() == [0] * B
-    assert not gradient(found, samples).any()
+    value = diversity(samples, 1)
+    assert value.tolist() == [0] * B
+    assert not gradient(value, samples).any()
 
 
 class TestMultimodalBestOfMany:
@@ -174,16 +174,16 @@ class TestMultimodalBestOfMany:
         errors = (samples[:, :, None] - pseudo).square().sum((3, 4)).amin(0)
         return torch.where(valid, errors, 0).sum(1) * len(valid) / valid.sum()
 
-    def test_is_the_naive_form_and_its_gradient(self):
+    def test_equals_the_naive_form_and_its_gradient(self):
         samples = normal(S, B, T, D).requires_grad_()
         pseudo, valid = SEQUENCES["pseudo"], SEQUENCES["valid"]
         naive = self.naive(samples, pseudo, valid)
-        found = multimodal_best_of_many(samples, pseudo, valid)
-        torch.testing.assert_close(found, naive)
-        torch.testing.assert_close(gradient(found, samples), gradient(naive, samples))
+        value = multimodal_best_of_many(samples, pseudo, valid)
+        torch.testing.assert_close(value, naive)
+        torch.testing.assert_close(gradient(value, samples), gradient(naive, samples))
 
     def test_finds_the_best_among_close_samples_far_from_the_origin(self):
-        """In single precision the squared norms alone, 10^9, would hide differences of a millimetre."""
+        """In single precision, squared norms of 1e9 would hide differences of a millimetre."""
         samples = 1000 + 0.001 * torch.randn(20, B, T, D)
         pseudo = 1000 + 0.001 * torch.randn(B, M, T, D)
         valid = torch.ones(B, M).bool()
@@ -191,37 +191,37 @@ class TestMultimodalBestOfMany:
         torch.testing.assert_close(multimodal_best_of_many(samples, pseudo, valid).double(), naive, rtol=1e-5, atol=0)
 
     @pytest.mark.parametrize("filler", [torch.nan, 1e30])
-    def test_invalid_futures_do_not_leak(self, filler):
+    def test_invalid_futures_change_nothing(self, filler):
         samples, valid = normal(S, B, T, D).requires_grad_(), SEQUENCES["valid"]
         pseudo = SEQUENCES["pseudo"].where(valid[..., None, None], filler)
         expected = multimodal_best_of_many(samples, SEQUENCES["pseudo"], valid)
-        found = multimodal_best_of_many(samples, pseudo, valid)
-        torch.testing.assert_close(found, expected, rtol=0, atol=0)
-        torch.testing.assert_close(gradient(found, samples), gradient(expected, samples), rtol=0, atol=0)
+        value = multimodal_best_of_many(samples, pseudo, valid)
+        torch.testing.assert_close(value, expected, rtol=0, atol=0)
+        torch.testing.assert_close(gradient(value, samples), gradient(expected, samples), rtol=0, atol=0)
 
     @pytest.mark.parametrize("futures", [0, M])
     def test_without_any_future_it_is_zero(self, futures):
         samples = normal(S, B, T, D).requires_grad_()
         pseudo = torch.full((B, futures, T, D), torch.nan)
-        found = multimodal_best_of_many(samples, pseudo, torch.zeros(B, futures).bool())
-        assert found.tolist() == [0] * B
-        assert not gradient(found, samples).any()
+        value = multimodal_best_of_many(samples, pseudo, torch.zeros(B, futures).bool())
+        assert value.tolist() == [0] * B
+        assert not gradient(value, samples).any()
 
 
 class TestGaussianDiversity:
-    def test_distances_of_what_is_far_away_lose_no_digits(self):
+    def test_distances_far_from_the_origin_keep_their_digits(self):
         near = 0.01 * normal(S, B, T, D)
         expected = gaussian_diversity(near, 0.04)
-        found = gaussian_diversity((near + 100).float(), 0.04)
-        torch.testing.assert_close(found, expected.float(), rtol=1e-3, atol=0)
+        value = gaussian_diversity((near + 100).float(), 0.04)
+        torch.testing.assert_close(value, expected.float(), rtol=1e-3, atol=0)
 
 
 class TestDeterminantalDiversity:
-    def test_is_minus_the_expected_size_of_a_random_subset_of_the_samples(self):
+    def test_equals_minus_the_expected_size_of_a_random_subset(self):
         """P(A) = det L_A / det (L + I), over all subsets A."""
         samples, quality = normal(S, 1, T, D), 1 + torch.rand(S, 1).double()
-        apart = (samples[:, None] - samples[None]).square().sum((3, 4))[..., 0]
-        kernel = quality * quality.T * (-apart / 300).exp()
+        differences = (samples[:, None] - samples[None]).square().sum((3, 4))[..., 0]
+        kernel = quality * quality.T * (-differences / 300).exp()
         subsets = [torch.tensor(c, dtype=torch.long) for n in range(S + 1) for c in combinations(range(S), n)]
         weights = torch.stack([torch.linalg.det(kernel[c][:, c]) for c in subsets])
         torch.testing.assert_close(weights.sum(), torch.linalg.det(kernel + torch.eye(S)))
@@ -243,7 +243,7 @@ class TestLimbLength:
 
 class TestJointAngles:
     def naive(self, samples, limits, skeleton):
-        """The term as the paper's code has it, a scalar."""
+        """Return the term as in the paper's code, a scalar."""
         values = cosines(samples, skeleton).flatten(0, 2)
         total = samples.new_zeros(())
         for name in dict.fromkeys(limits.names):
@@ -256,15 +256,15 @@ class TestJointAngles:
         return total
 
     @pytest.mark.parametrize(("skeleton", "spread"), [(HUMAN36M, 0.3), (HUMANEVA, 0.3), (HUMANEVA, 0.001)])
-    def test_mean_and_gradient_are_those_of_the_naive_form(self, skeleton, spread):
+    def test_mean_and_gradient_equal_those_of_the_naive_form(self, skeleton, spread):
         people = normal(1, 1, 1, 3 * (skeleton.joints - 1))
         limits = estimate_angle_limits(people + 0.05 * normal(500, people.shape[-1]), skeleton, 0.02)
         samples = (people + spread * normal(S, B, T, 1)).requires_grad_()
-        naive, found = self.naive(samples, limits, skeleton), joint_angles(samples, limits, skeleton).mean()
-        torch.testing.assert_close(found, naive)
+        naive, value = self.naive(samples, limits, skeleton), joint_angles(samples, limits, skeleton).mean()
+        torch.testing.assert_close(value, naive)
         if spread == 0.3:
-            torch.testing.assert_close(gradient(found, samples), gradient(naive, samples))
-            assert found > 0
+            torch.testing.assert_close(gradient(value, samples), gradient(naive, samples))
+            assert value > 0
 
 
 class TestPosePriorEnergy:

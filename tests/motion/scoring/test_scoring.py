@@ -1,4 +1,4 @@
-"""Scores of bodies and of how much they move: definitions written out with loops, and what they do not see."""
+"""Scores of bodies and of their motion: definitions written out with loops, and invariances."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -24,14 +24,14 @@ def windows():
 
 @pytest.fixture(scope="module")
 def futures(windows):
-    """Three noisy futures of each window (N, K, T, D)."""
+    """Return three noisy futures of each window (N, K, T, D)."""
     x = windows.all()["x"][:, None, 4:]
     noise = torch.randn(len(x), 3, 6, x.shape[-1], generator=torch.Generator().manual_seed(0))
     return x + 0.03 * noise
 
 
-class Known(torch.nn.Module):
-    """Forecasts what it is given, window after window."""
+class FixedForecasts(torch.nn.Module):
+    """Returns given forecasts, window by window."""
 
     def __init__(self, windows, futures):
         super().__init__()
@@ -46,17 +46,17 @@ class Known(torch.nn.Module):
 
 
 def scores(windows, futures, **options):
-    model = Known(windows, futures)
-    found = dvae.evaluate(
+    model = FixedForecasts(windows, futures)
+    evaluation = dvae.evaluate(
         model, windows, scores=motion.scores, samples=futures.shape[1], references=False, progress=False, **options
     )
-    (row,) = found.rows
-    return {name: score.mean for name, score in found[row].items()}
+    (row,) = evaluation.rows
+    return {name: score.mean for name, score in evaluation[row].items()}
 
 
-def by_the_letter(windows, futures):
-    """The scores of limbs, of one window, future, frame and limb after another."""
-    found = {name: [] for name in LIMBS}
+def by_definition(windows, futures):
+    """Return the limb scores by loops over windows, futures, frames and limbs."""
+    result = {name: [] for name in LIMBS}
     skeleton, truths = windows.skeleton, windows.positions(windows.all()["x"][:, 4:]).double().numpy()
     joints = windows.positions(futures).double().numpy()
     bones = skeleton.edges
@@ -78,44 +78,44 @@ def by_the_letter(windows, futures):
                 off = [abs(each - m) / m for each in lengths]
                 steps = [abs(after - before) / m for before, after in pairwise(lengths)]
                 for name, values in (("limb stretch", off), ("limb jitter", steps)):
-                    found[name].append(np.mean(values))
-                    found[f"{name} RMS"].append(np.sqrt(np.mean(np.square(values))))
+                    result[name].append(np.mean(values))
+                    result[f"{name} RMS"].append(np.sqrt(np.mean(np.square(values))))
         errors = [
             np.mean([abs(angle(p, c) - angle(q, c)) for p, q in zip(f, truth, strict=True) for c in chains])
             for f in poses
         ]
-        found["limb-angle error"].append(min(errors))
-    return {name: np.mean(values) for name, values in found.items()}
+        result["limb-angle error"].append(min(errors))
+    return {name: np.mean(values) for name, values in result.items()}
 
 
 def moved(windows, x):
     return windows.positions(x)[..., 1:, :].diff(dim=-3).norm(dim=-1).mean(-1)
 
 
-def test_scores_of_limbs_are_their_definitions(windows, futures):
-    found, expected = scores(windows, futures), by_the_letter(windows, futures)
-    assert {name: found[name] for name in LIMBS} == pytest.approx(expected, rel=1e-4)
-    assert scores(windows, futures, batch_size=2) == pytest.approx(found, rel=1e-5)
+def test_limb_scores_equal_their_definitions(windows, futures):
+    values, expected = scores(windows, futures), by_definition(windows, futures)
+    assert {name: values[name] for name in LIMBS} == pytest.approx(expected, rel=1e-4)
+    assert scores(windows, futures, batch_size=2) == pytest.approx(values, rel=1e-5)
 
 
-def test_what_does_not_count(windows, futures):
-    """Where bodies face; and steps, of one predicted frame, which has none."""
-    turned = rotate_about_up(futures.unflatten(-1, (-1, 3)), torch.tensor(1.0), windows.skeleton.up).flatten(-2)
-    found, expected = scores(windows, turned), scores(windows, futures)
+def test_heading_and_missing_steps_change_no_score(windows, futures):
+    """The heading changes no score, and a single predicted frame has no step score."""
+    rotated = rotate_about_up(futures.unflatten(-1, (-1, 3)), torch.tensor(1.0), windows.skeleton.up).flatten(-2)
+    values, expected = scores(windows, rotated), scores(windows, futures)
     names = (*LIMBS, "CMD")
-    assert [found[name] for name in names] == pytest.approx([expected[name] for name in names], rel=1e-4)
+    assert [values[name] for name in names] == pytest.approx([expected[name] for name in names], rel=1e-4)
     short = motion.windows(motion.simulate(clips=4, frames=40, test=0.5), replace(PROTOCOL, predicted=1), "test")
     measures = {measure.name for measure in _measures(motion.scores, short)}
     assert {"limb stretch", "limb-angle error", "jerk"} <= measures  # with the seam there are four frames
     assert not {"limb jitter", "CMD"} & measures
 
 
-def test_cmd_is_of_each_class_where_clips_say_what_they_show(windows, futures):
+def test_cmd_is_computed_by_class_for_labelled_clips(windows, futures):
     contents = windows.labels("content") if any("content" in clip.labels for clip in windows.clips) else None
-    real, ours = moved(windows, windows.all()["x"][:, 4:]).mean(-1), moved(windows, futures).mean(1)
+    real, predicted = moved(windows, windows.all()["x"][:, 4:]).mean(-1), moved(windows, futures).mean(1)
 
     def area(rows):
-        return sum((5 - t) * abs(float(ours[rows, t].mean() - real[rows].mean())) for t in range(5))
+        return sum((5 - t) * abs(float(predicted[rows, t].mean() - real[rows].mean())) for t in range(5))
 
     def expected(labels):
         groups = [[n for n, each in enumerate(labels) if each == label] for label in set(labels)]
@@ -125,45 +125,47 @@ def test_cmd_is_of_each_class_where_clips_say_what_they_show(windows, futures):
     assert scores(windows, futures)["CMD"] == pytest.approx(expected(contents or everything), rel=1e-4)
     names = {clip.name: "ab"[n % 2] for n, clip in enumerate(windows.clips)}
     clips = [replace(clip, labels={**clip.labels, "content": names[clip.name]}) for clip in windows.clips]
-    named = motion.windows(motion.MotionSet(clips, windows.skeleton), PROTOCOL, "test")
-    labels = [names[clip] for _, clip, _ in named.keys]
-    assert scores(named, futures)["CMD"] == pytest.approx(expected(labels), rel=1e-4)
+    labelled = motion.windows(motion.MotionSet(clips, windows.skeleton), PROTOCOL, "test")
+    labels = [names[clip] for _, clip, _ in labelled.keys]
+    assert scores(labelled, futures)["CMD"] == pytest.approx(expected(labels), rel=1e-4)
 
 
-def test_apde_is_of_windows_that_share_a_last_pose(windows, futures):
-    """Truths by a plain loop; alone, a window says nothing."""
+def test_apde_compares_windows_with_the_same_last_pose(windows, futures):
+    """Select truths by a plain loop; a window without similar ones has no score."""
     x = windows.all()["x"].double()
-    apart = [[float((a[3] - b[3]).norm()) for b in x] for a in x]
-    near = float(np.median([each for row in apart for each in row if each]))
+    distances = [[float((a[3] - b[3]).norm()) for b in x] for a in x]
+    near = float(np.median([each for row in distances for each in row if each]))
     for threshold in (near, 1e-9):
         some = windows.with_protocol(replace(PROTOCOL, multimodal_threshold=threshold))
-        truths = [[m for m in range(len(x)) if apart[n][m] < threshold] for n in range(len(x))]
+        truths = [[m for m in range(len(x)) if distances[n][m] < threshold] for n in range(len(x))]
 
         def apd(motions):
             return np.mean([float((a - b).norm()) for i, a in enumerate(motions) for b in motions[:i]])
 
-        errors = [abs(apd(futures[n].double()) - apd(x[own, 4:])) for n, own in enumerate(truths) if len(own) > 1]
-        found = scores(some, futures)
-        assert found.get("APDE") == (pytest.approx(np.mean(errors), rel=1e-4) if errors else None)
+        errors = [
+            abs(apd(futures[n].double()) - apd(x[indices, 4:])) for n, indices in enumerate(truths) if len(indices) > 1
+        ]
+        values = scores(some, futures)
+        assert values.get("APDE") == (pytest.approx(np.mean(errors), rel=1e-4) if errors else None)
 
 
-def test_jerk_is_the_third_derivative_and_counts_the_seam(windows):
+def test_jerk_is_the_third_derivative_including_the_seam(windows):
     (measure,) = (each for each in motion.scores(windows) if each.name == "jerk")
     x, index, fps = windows.all()["x"].double(), torch.arange(len(windows)), PROTOCOL.fps
     times = torch.arange(10, dtype=torch.float64)[:, None] / fps
 
     def jerk(path):
-        """Of a pose of which all joints go along a path (10, 3), m."""
-        whole = x[:, :1] + path.repeat(1, x.shape[-1] // 3)
-        past, future = whole[:, :4], whole[:, None, 4:].repeat(1, 3, 1, 1)
-        found = measure.function(future, future[:, 0], Batch(x=past), index)
-        torch.testing.assert_close(found, found[:1].expand(len(x)))
-        return found[0].item()
+        """Return the jerk of a pose whose joints all follow a path (10, 3), in m."""
+        future_path = x[:, :1] + path.repeat(1, x.shape[-1] // 3)
+        past, future = future_path[:, :4], future_path[:, None, 4:].repeat(1, 3, 1, 1)
+        value = measure.function(future, future[:, 0], Batch(x=past), index)
+        torch.testing.assert_close(value, value[:1].expand(len(x)))
+        return value[0].item()
 
     assert jerk(torch.cat([times, times**2, 0 * times], -1)) == pytest.approx(0, abs=1e-6)
     assert jerk(torch.cat([0 * times, 2 * times**3, 0 * times], -1)) == pytest.approx(12)
     leap = torch.zeros(10, 3, dtype=torch.float64)
-    leap[4:] = 0.1  # between the last observed frame and the first of the future: by 1, -2, 1 in six third differences
+    leap[4:] = 0.1  # a jump between past and future gives 1, -2, 1 in six third differences
     assert jerk(leap) == pytest.approx(0.1 * 3**0.5 * fps**3 * 4 / 6)
     real = np.linalg.norm(np.diff(windows.positions(x)[:, 1:, 1:].numpy(), 3, axis=1), axis=-1).mean() * fps**3
     assert measure.note == f"jerk: {real:.1f} m/s³ of real motion"

@@ -1,4 +1,4 @@
-"""Pseudo ground truth: the same as by comparing all pairs, a fair draw, and people of the right size."""
+"""Pseudo ground truth: equal to a comparison of all pairs, sampled uniformly, with bone lengths of the window."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ SMALL = replace(PROTOCOLS["simulated"], observed=OBSERVED, predicted=8)
 
 @pytest.fixture(scope="module")
 def people():
-    """Their limb lengths differ from person to person."""
+    """Return people with different limb lengths."""
     return motion.simulate(clips=10, frames=60, seed=1)
 
 
@@ -38,7 +38,7 @@ def drawn(windows, count=12, seed=0):
 
 
 def posed(windows, positions, lengths):
-    """Positions (T, J, 3) with other limb lengths, joint by joint from the root."""
+    """Return positions (T, J, 3) with other limb lengths, joint by joint from the root."""
     skeleton = windows.skeleton
     length = dict(zip([child for _, child in skeleton.edges], lengths.tolist(), strict=True))
     result = positions.clone()
@@ -50,18 +50,20 @@ def posed(windows, positions, lengths):
 
 
 def shared_futures(windows, x, near=NEAR, apart=APART, heading=False):
-    """Every admissible future (F, D) of a window (T, D), from a comparison with all candidates."""
-    kept = [j for j in range(windows.skeleton.joints) if windows.protocol.root != "drop" or j != windows.skeleton.root]
-    own = windows.positions(x).double()
+    """Return all admissible futures (F, D) of a window (T, D) by comparing all candidates."""
+    joints = [
+        j for j in range(windows.skeleton.joints) if windows.protocol.root != "drop" or j != windows.skeleton.root
+    ]
+    positions = windows.positions(x).double()
     futures = []
     for candidate in windows.positions(windows.all(STRIDE)["x"]).double():
         if heading:
             angle = windows.skeleton.heading(candidate[OBSERVED - 1])
             candidate = rotate_about_up(candidate, -angle, windows.skeleton.up)
-        other = posed(windows, candidate, windows.skeleton.bone_lengths(own[0]))
-        distances = (other - own)[:, kept].norm(dim=-1)
+        other = posed(windows, candidate, windows.skeleton.bone_lengths(positions[0]))
+        distances = (other - positions)[:, joints].norm(dim=-1)
         if distances[OBSERVED - 1].norm() < near and distances[OBSERVED:].mean() >= apart:
-            futures.append(other[OBSERVED:, kept].flatten(1).float())
+            futures.append(other[OBSERVED:, joints].flatten(1).float())
     return futures
 
 
@@ -71,26 +73,26 @@ def find(future, futures):
 
 
 @pytest.mark.parametrize(("heading", "root"), [(False, "relative"), (True, "drop")])
-def test_futures_are_those_found_by_comparing_all_pairs(people, root, heading):
+def test_futures_equal_those_of_comparing_all_pairs(people, root, heading):
     windows = motion.windows(people, replace(SMALL, root=root), "train")
     truths = PseudoTruths(windows, NEAR, APART, most=30, stride=STRIDE, heading=heading)
     x = drawn(windows, 20)
     x = truths.turn(x) if heading else x
     pseudo, valid = truths.of(x, generator())
     assert pseudo.shape == (20, 30, *x.shape[1:])
-    found = 0
-    for own, others, real in zip(x, pseudo, valid, strict=True):
-        expected = shared_futures(windows, own, heading=heading)
+    n_matches = 0
+    for window, others, real in zip(x, pseudo, valid, strict=True):
+        expected = shared_futures(windows, window, heading=heading)
         assert len(expected) < 30
         places = [find(other[OBSERVED:], expected) for other in others[real]]
         assert sorted(places) == list(range(len(expected)))
-        found += len(places)
-    assert found > 10
+        n_matches += len(places)
+    assert n_matches > 10
 
 
-def test_at_most_m_of_them_are_drawn_without_replacement_each_as_likely(windows):
+def test_at_most_m_futures_are_sampled_uniformly_without_replacement(windows):
     x = drawn(windows)
-    counts = [len(shared_futures(windows, own)) for own in x]
+    counts = [len(shared_futures(windows, window)) for window in x]
     place = int(np.argmax(counts))
     futures = shared_futures(windows, x[place])
     assert len(futures) > 4
@@ -105,7 +107,7 @@ def test_at_most_m_of_them_are_drawn_without_replacement_each_as_likely(windows)
     assert (places.flatten().bincount(minlength=len(futures)) - 600 * share).abs().max() < 4 * deviation
 
 
-def test_the_past_is_the_windows_own_and_the_rest_is_zero(windows, truths):
+def test_pseudo_truths_keep_the_past_and_are_padded_with_zeros(windows, truths):
     x = drawn(windows, 40)
     pseudo, valid = truths.of(x, generator())
     assert valid.any()
@@ -116,7 +118,7 @@ def test_the_past_is_the_windows_own_and_the_rest_is_zero(windows, truths):
     assert (valid.int().diff(dim=1) <= 0).all()  # real ones first
 
 
-def test_limbs_without_length_make_no_nan(people):
+def test_limbs_of_length_zero_give_no_nan(people):
     clips = []
     for clip in people:
         positions = clip.positions.copy()
@@ -129,7 +131,7 @@ def test_limbs_without_length_make_no_nan(people):
     assert torch.isfinite(pseudo).all()
 
 
-def test_what_has_no_future_or_heading_is_refused(people, windows, truths):
+def test_windows_without_futures_or_heading_are_errors(people, windows, truths):
     for options, message in (({"threshold": 0}, "threshold above 0"), ({"most": 0}, "stride of at least 1")):
         with pytest.raises(ValueError, match=message):
             PseudoTruths(windows, **options)

@@ -1,4 +1,4 @@
-"""Gait cycles: found where they are, of either foot, and nowhere else."""
+"""Gait cycles: found for either foot, with bounded length and overlap."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -15,17 +15,17 @@ SKELETON = simulate(clips=4, frames=60).with_rotations().skeleton
 
 
 def walk(seconds=5.0, period=1.0, swing=0.4, fps=30.0, start=0.0, name="walk"):
-    """Somebody whose left thigh is furthest forward at the start and after every period, the right one between."""
+    """Return a walk whose left thigh is furthest forward at the start and after each period, the right one between."""
     time = torch.arange(round(seconds * fps) + 1, dtype=torch.float64) / fps
     phase = 2 * torch.pi * time / period + start
     vectors = torch.zeros(len(time), SKELETON.joints, 3, dtype=torch.float64)
-    for side, own in (("L", phase), ("R", phase + torch.pi)):
-        vectors[:, SKELETON.names.index(f"{side}Hip"), 0] = -swing * own.cos()
-        vectors[:, SKELETON.names.index(f"{side}Knee"), 0] = swing * (1 - own.sin())
-    turns = rotations.to_matrix(vectors, "vector")
+    for side, side_phase in (("L", phase), ("R", phase + torch.pi)):
+        vectors[:, SKELETON.names.index(f"{side}Hip"), 0] = -swing * side_phase.cos()
+        vectors[:, SKELETON.names.index(f"{side}Knee"), 0] = swing * (1 - side_phase.sin())
+    matrices = rotations.to_matrix(vectors, "vector")
     root = torch.stack([0 * time, 1 + 0 * time, time], -1)
-    positions, _ = kinematics.forward(SKELETON.parents, turns, SKELETON.offsets, root)
-    quaternions = rotations.from_matrix(turns, "quaternion").numpy()
+    positions, _ = kinematics.forward(SKELETON.parents, matrices, SKELETON.offsets, root)
+    quaternions = rotations.from_matrix(matrices, "quaternion").numpy()
     return Clip("train", name, positions.numpy(), {"content": "walk"}, rotations=quaternions)
 
 
@@ -34,22 +34,22 @@ def of(*clips, fps=30.0):
 
 
 @pytest.mark.parametrize("period", [0.7, 1.6])
-def test_a_gait_is_cut_into_cycles_of_its_period_by_either_foot(period):
+def test_a_walk_is_cut_into_cycles_of_its_period_for_either_foot(period):
     people = of(walk(period=period, seconds=5 * period))
     left, right = reference_cycles(people)
     assert (left.side, right.side) == ("left", "right")
     assert left.seconds == pytest.approx(period, abs=1 / 30 + 1e-9)
-    found = find_cycles(people.clips[0], people.skeleton, (left, right), Cycles())
+    cycles = find_cycles(people.clips[0], people.skeleton, (left, right), Cycles())
     for side, first, many in (("left", 0.0, 5), ("right", 0.5, 4)):
-        own = [cycle for cycle in found if cycle.side == side]
-        assert len(own) == many
-        starts = np.array([cycle.first for cycle in own])
+        side_cycles = [cycle for cycle in cycles if cycle.side == side]
+        assert len(side_cycles) == many
+        starts = np.array([cycle.first for cycle in side_cycles])
         np.testing.assert_allclose(starts, 30 * period * (first + np.arange(many)), atol=2)
-        np.testing.assert_allclose([cycle.last - cycle.first for cycle in own], 30 * period, atol=2)
-        assert max(cycle.cost for cycle in own) < 0.05
+        np.testing.assert_allclose([cycle.last - cycle.first for cycle in side_cycles], 30 * period, atol=2)
+        assert max(cycle.cost for cycle in side_cycles) < 0.05
 
 
-def test_who_stands_or_marches_on_one_leg_walks_no_cycle():
+def test_standing_and_moving_one_leg_give_no_cycles():
     references = reference_cycles(of(walk()))
     still = walk(swing=0.0)
     assert not find_cycles(still, SKELETON, references, Cycles())
@@ -67,20 +67,20 @@ def test_who_stands_or_marches_on_one_leg_walks_no_cycle():
 
 
 @pytest.mark.parametrize(("shortest", "longest", "share"), [(0.3, 3.0, 0.1), (0.8, 1.5, 0.0), (0.3, 0.9, 0.5)])
-def test_cycles_are_as_long_as_allowed_and_those_of_one_foot_overlap_no_more_than_said(shortest, longest, share):
+def test_cycles_respect_limits_of_length_and_overlap(shortest, longest, share):
     people = simulate(clips=6, frames=150, seed=1).with_rotations()
     references = reference_cycles(people)
     limits = Cycles(threshold=0.4, shortest=shortest, longest=longest, overlap=share)
     for clip in people:
-        found = find_cycles(clip, people.skeleton, references, limits)
-        assert all(shortest * 30 - 1e-6 <= cycle.last - cycle.first <= longest * 30 + 1e-6 for cycle in found)
+        cycles = find_cycles(clip, people.skeleton, references, limits)
+        assert all(shortest * 30 - 1e-6 <= cycle.last - cycle.first <= longest * 30 + 1e-6 for cycle in cycles)
         for side in ("left", "right"):
-            for one, other in combinations([cycle for cycle in found if cycle.side == side], 2):
+            for one, other in combinations([cycle for cycle in cycles if cycle.side == side], 2):
                 shared = min(one.last, other.last) - max(one.first, other.first)
                 assert shared <= share * min(one.last - one.first, other.last - other.first)
 
 
-def test_any_rate_has_the_same_cycles():
+def test_the_frame_rate_changes_no_cycles():
     people = of(walk(fps=120.0), fps=120.0)
     references = reference_cycles(people)
     assert [len(reference.hips) for reference in references] == pytest.approx([31, 31], abs=1)
@@ -88,7 +88,7 @@ def test_any_rate_has_the_same_cycles():
     np.testing.assert_allclose(starts, np.arange(9) / 2, atol=2 / 30)
 
 
-def test_cycles_are_clips_that_know_where_they_are_from():
+def test_cycles_are_clips_with_their_source():
     people = of(walk(), replace(walk(period=1.2, name="later"), split="test"))
     segments = gait_cycles(people, cycles=Cycles(threshold=0.1))
     assert segments.splits == ["train", "test"]
@@ -102,13 +102,13 @@ def test_cycles_are_clips_that_know_where_they_are_from():
     assert {segment.labels["cycle"] for segment in segments} == {"left", "right"}
 
 
-def test_references_are_of_training_clips_and_typical():
+def test_reference_cycles_are_typical_training_cycles():
     odd = walk(swing=0.7, name="odd")
     people = of(walk(), walk(start=1.0, name="second"), odd, replace(walk(swing=0.9, name="held out"), split="test"))
     assert {reference.source for reference in reference_cycles(people)} <= {("train", "walk"), ("train", "second")}
 
 
-def test_what_cannot_be_cut_is_refused():
+def test_motion_that_cannot_be_cut_is_an_error():
     people = of(walk())
     references, clip = reference_cycles(people), people.clips[0]
     assert not find_cycles(clip.between(0, 1), SKELETON, references, Cycles())
@@ -135,7 +135,7 @@ def test_what_cannot_be_cut_is_refused():
             call()
 
 
-def test_two_sources_get_one_tree_and_rest_poses_of_their_own(real):
+def test_two_sources_share_a_tree_and_keep_their_rest_poses(real):
     bandai, cmu = real("bandai/bandai2.npz"), real("cmu/cmu8.npz")
     bandai = MotionSet([clip for clip in bandai if clip.labels["content"] == "walk"][::40], bandai.skeleton, "bandai")
     cmu = MotionSet([clip for clip in cmu if clip.labels["content"] == "walking"][::4], cmu.skeleton, "cmu")
@@ -143,9 +143,13 @@ def test_two_sources_get_one_tree_and_rest_poses_of_their_own(real):
     assert (first.skeleton.names, first.skeleton.parents) == (second.skeleton.names, second.skeleton.parents)
     assert first.skeleton.rest != second.skeleton.rest
     assert [clip.key for clip in second] == [clip.key for clip in cmu]
-    for motion, given in ((first, bandai), (second, cmu)):
-        shared = [name for name in motion.skeleton.names if name in given.skeleton.names]
+    for motion, source in ((first, bandai), (second, cmu)):
+        shared = [name for name in motion.skeleton.names if name in source.skeleton.names]
         assert len(shared) == 19
-        theirs, ours = ([each.names.index(name) for name in shared] for each in (given.skeleton, motion.skeleton))
-        np.testing.assert_array_equal(motion.clips[0].positions[:, ours], given.clips[0].positions[:, theirs])
+        source_joints, motion_joints = (
+            [each.names.index(name) for name in shared] for each in (source.skeleton, motion.skeleton)
+        )
+        np.testing.assert_array_equal(
+            motion.clips[0].positions[:, motion_joints], source.clips[0].positions[:, source_joints]
+        )
         assert len(gait_cycles(motion)) > 4 * len(motion) / 2

@@ -1,4 +1,4 @@
-"""Segments of motion data as runs keep them: split by take, cut and seen alike when they are opened again."""
+"""Datasets of segments in runs: splits by take, and equal segments when a run is reopened."""
 
 import json
 from dataclasses import replace
@@ -20,16 +20,16 @@ def data():
 
 @pytest.fixture(scope="module")
 def written(data):
-    """The schema of warped ones, as a run writes it."""
+    """Return the schema of warped segments as a run writes it."""
     return json.dumps(replace(data, warped=True).schema.config())
 
 
-def test_splits_are_by_take_and_leave_nothing_out_and_segments_have_names(data):
+def test_splits_partition_the_takes_and_segments_have_names(data):
     windows = {split: data.windows(split) for split in ("train", "validation", "test")}
-    found = {split: {clip.labels["source"] for clip in each.motion} for split, each in windows.items()}
-    assert all(found.values())
-    assert sum(map(len, found.values())) == len(set.union(*found.values()))
-    assert found["test"] == {clip.labels["source"] for clip in data.segments if clip.split == "test"}
+    sources = {split: {clip.labels["source"] for clip in each.motion} for split, each in windows.items()}
+    assert all(sources.values())
+    assert sum(map(len, sources.values())) == len(set.union(*sources.values()))
+    assert sources["test"] == {clip.labels["source"] for clip in data.segments if clip.split == "test"}
     assert sum(map(len, windows.values())) == len(data.segments)
     first = data.segments.clips[0]
     for name in (first.name, f"{first.split}/{first.name}", first.labels["source"]):
@@ -43,7 +43,7 @@ def test_splits_are_by_take_and_leave_nothing_out_and_segments_have_names(data):
 
 
 @pytest.mark.parametrize("options", [{}, {"scaling": "deviation", "warped": True}], ids=["plain", "warped"])
-def test_what_is_reopened_is_cut_and_seen_as_it_was(options, tmp_path):
+def test_reopened_data_have_the_same_segments(options, tmp_path):
     motion.save(tmp_path / "people.npz", PEOPLE)
     data = SegmentData.open(tmp_path / "people.npz", **options)
     source, schema = data.recorded(), SegmentSchema.from_config(json.loads(json.dumps(data.schema.config())))
@@ -51,33 +51,41 @@ def test_what_is_reopened_is_cut_and_seen_as_it_was(options, tmp_path):
     assert again.fingerprint == source.fingerprint
     assert (bool(schema.timed.mean), len(schema.timed.references)) == ((True, 2) if options else (False, 0))
     assert torch.equal(again.windows("test").all()["x"], data.windows("test").all()["x"])
-    other = SegmentData.reopened(source, schema, "simulated")  # under the frames of the run, not frames of its own
+    other = SegmentData.reopened(source, schema, "simulated")  # with the time grid of the run
     assert other.timed is schema.timed
     assert other.fingerprint != source.fingerprint
 
 
-def test_training_segments_are_drawn_on_other_bodies_with_places_in_lengths_of_legs(data):
-    train, held, own = data.windows("train"), data.windows("validation"), replace(data, bodies=0.0).windows("train")
-    drawn, again, kept = (each.sample(len(train), torch.Generator().manual_seed(3)) for each in (train, train, own))
-    assert torch.equal(drawn["x"], again["x"])
-    for known in (held.sample(1, torch.Generator())["beta"], kept["beta"][:1]):
-        assert any(torch.equal(known[0], beta) for each in (held, own) for beta in each.all()["beta"])
-    assert 0.8 < drawn["beta"].std() < 1.2
-    turns = train.timed.parts["rotations"]
-    order = torch.cdist(drawn["x"][..., turns].flatten(1), train.all()["x"][..., turns].flatten(1)).argmin(1)
+def test_training_segments_are_retargeted_to_random_bodies(data):
+    train, validation, without_bodies = (
+        data.windows("train"),
+        data.windows("validation"),
+        replace(data, bodies=0.0).windows("train"),
+    )
+    sampled, again, original = (
+        each.sample(len(train), torch.Generator().manual_seed(3)) for each in (train, train, without_bodies)
+    )
+    assert torch.equal(sampled["x"], again["x"])
+    for batch in (validation.sample(1, torch.Generator())["beta"], original["beta"][:1]):
+        assert any(torch.equal(batch[0], beta) for each in (validation, without_bodies) for beta in each.all()["beta"])
+    assert 0.8 < sampled["beta"].std() < 1.2
+    rotation_columns = train.timed.parts["rotations"]
+    order = torch.cdist(
+        sampled["x"][..., rotation_columns].flatten(1), train.all()["x"][..., rotation_columns].flatten(1)
+    ).argmin(1)
     assert order.sort().values.equal(torch.arange(len(train)))
-    chosen = replace(train.motion, clips=[train.motion.clips[n] for n in order])
-    moved = motion.bodies.retarget(chosen, motion.bodies.human(), drawn["beta"].double())
-    for ours, theirs in zip(*map(_whatever_the_heading, (drawn["x"], train.timed.to(moved)["x"])), strict=True):
-        torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=0)
+    reordered = replace(train.motion, clips=[train.motion.clips[n] for n in order])
+    retargeted = motion.bodies.retarget(reordered, motion.bodies.human(), sampled["beta"].double())
+    for value, expected in zip(*map(_heading_free, (sampled["x"], train.timed.to(retargeted)["x"])), strict=True):
+        torch.testing.assert_close(value, expected, atol=1e-5, rtol=0)
 
 
-def _whatever_the_heading(x):
-    """Of frames: turns of joints but the root, how far it is gone, and time; its heading is seen in joints' places."""
+def _heading_free(x):
+    """Return joint rotations without the root, distance, time, and the heading as seen in joint positions."""
     return x[..., 6:-4], x[..., -4:-1:2].norm(dim=-1), x[..., -3], x[..., -1]
 
 
-def test_clips_are_segments_as_they_are_where_they_last_as_long_as_one():
+def test_clips_as_long_as_a_segment_are_segments():
     clips = [replace(clip, positions=clip.positions[: 5 + 12 * n]) for n, clip in enumerate(PEOPLE)]
     data = SegmentData("simulated", replace(PEOPLE, clips=clips), "clips")
     assert [clip.frames for clip in data.segments] == [clip.frames for clip in clips if clip.frames > 9]
@@ -87,12 +95,12 @@ def test_clips_are_segments_as_they_are_where_they_last_as_long_as_one():
 
 
 @pytest.mark.parametrize("count", [1, 6])
-def test_takes_that_nobody_divided_are_whole_in_a_split(count, tmp_path):
+def test_takes_without_splits_are_assigned_to_one_split_each(count, tmp_path):
     clips = [replace(clip, split="all") for clip in PEOPLE.clips[:count]]
     motion.save(tmp_path / "walks.npz", replace(PEOPLE, clips=clips))
-    found = SegmentData.open(tmp_path / "walks.npz").motion
-    assert {*found.splits} == {"train", "test"}
-    assert count == 1 or [clip.frames for clip in found] == [clip.frames for clip in clips]
+    motion_set = SegmentData.open(tmp_path / "walks.npz").motion
+    assert {*motion_set.splits} == {"train", "test"}
+    assert count == 1 or [clip.frames for clip in motion_set] == [clip.frames for clip in clips]
 
 
 @pytest.mark.parametrize(
@@ -104,14 +112,14 @@ def test_takes_that_nobody_divided_are_whole_in_a_split(count, tmp_path):
         (lambda config: config["timed"]["references"][0].update(hips=[[1, 0, 0, 0]]), "hips of a reference are"),
     ],
 )
-def test_a_schema_that_no_run_writes_is_refused(written, change, message):
+def test_an_invalid_schema_is_an_error(written, change, message):
     config = json.loads(written)
     change(config)
     with pytest.raises(ValueError, match=message):
         SegmentSchema.from_config(config)
 
 
-def test_options_out_of_range_are_refused():
+def test_options_out_of_range_are_errors():
     for options, message in (({"cut": "steps"}, "unknown cut 'steps'"), ({"scaling": "own"}, "unknown scaling")):
         with pytest.raises(ValueError, match=message):
             SegmentData.open(**options)
