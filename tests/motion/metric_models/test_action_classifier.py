@@ -220,11 +220,11 @@ def test_unknown_classes_count_for_fid_only_and_are_reported(fitted):
     ]
     some = windows("test", motion.MotionSet(relabelled, clips.skeleton, "people"))
     result = evaluate(some, {"way": fitted, "a": classifier()})
-    unknown, n_used = some.labels("way").count("sideways"), result.basis["classifier way"]
-    assert n_used["unknown"] == unknown > 0
-    assert n_used["weights"] != result.basis["classifier a"]["weights"]
+    unknown, used = some.labels("way").count("sideways"), result.basis["classifier way"]
+    assert used["unknown"] == unknown > 0
+    assert used["weights"] != result.basis["classifier a"]["weights"]
     assert f"{unknown} of {len(some)} windows have a class that it does not know" in " ".join(str(result).split())
-    assert f"ACC, FID way: classifier {n_used['weights'][:12]}" in str(result)
+    assert f"ACC, FID way: classifier {used['weights'][:12]}" in str(result)
     assert result["real motion"]["ACC way"] == Score(1, 0)
     assert list(result.metrics)[-4:] == ["ACC a", "ACC way", "FID a", "FID way"]
     assert Evaluation.from_json(result.to_json()).to_json() == result.to_json()

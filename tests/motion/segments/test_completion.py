@@ -86,7 +86,7 @@ def test_times_are_matched_in_decoded_time(model):
     torch.testing.assert_close(after, x[:, [-1]])
     torch.testing.assert_close(reached, times[:, [-1]])
     # later times of all frames match an earlier frame
-    gradient = torch.autograd.grad(_met(model.timed, x, {"times": between.detach()})[0].sum(), x)[0]
+    gradient = torch.autograd.grad(_at_moments(model.timed, x, {"times": between.detach()})[0].sum(), x)[0]
     assert gradient[..., 1:5, -1].abs().min() > 0
 
 
@@ -185,7 +185,7 @@ def test_known_segments_determine_the_prior(model, segments):
     informed, uninformed = (
         complete(model, observed, known=batch, aggregate=each, **options).posterior for each in (True, False)
     )
-    wide = _shrunk(distribution.mean, distribution.variance.mean(0)).diagonal()
+    wide = _shrink(distribution.mean, distribution.variance.mean(0)).diagonal()
     torch.testing.assert_close(informed.mode["z"], distribution.mean.mean(0).expand(2, -1))
     torch.testing.assert_close(informed.deviation["z"], wide.sqrt().expand(2, -1))
     torch.testing.assert_close(uninformed.mode["z"], torch.zeros_like(z))
@@ -194,7 +194,7 @@ def test_known_segments_determine_the_prior(model, segments):
 
 def test_a_covariance_of_few_draws_is_shrunk():
     """By hand for 50 draws with covariance diag(3, 1): the share is 4^2 / (50 (10 - 4^2 / 2)) = .16, towards 2."""
-    by_hand = _shrunk(torch.zeros(50, 2), torch.tensor([3.0, 1.0]))
+    by_hand = _shrink(torch.zeros(50, 2), torch.tensor([3.0, 1.0]))
     torch.testing.assert_close(by_hand, torch.tensor([2.84, 1.16]).diag())
     root = torch.randn(6, 6).double() * torch.tensor([2.0, 1, 1, 0.5, 0.5, 0.1])
     truth, none = root @ root.mT, torch.zeros(6).double()
