@@ -62,17 +62,17 @@ class Registry(UserDict[str, Any]):
     """A mapping from names to classes, each imported on access.
 
     Args:
-        own: mapping from name to "module:class".
+        builtin: mapping from name to "module:class".
         group: entry-point group through which installed packages add classes.
 
     Raises:
         ValueError: if an entry point has a name that already exists.
     """
 
-    def __init__(self, own: Mapping[str, str], group: str) -> None:
-        super().__init__({name: EntryPoint(name, value, group) for name, value in own.items()})
+    def __init__(self, builtin: Mapping[str, str], group: str) -> None:
+        super().__init__({name: EntryPoint(name, value, group) for name, value in builtin.items()})
         for entry in entry_points(group=group):
-            if entry.name in own:
+            if entry.name in builtin:
                 raise ValueError(f"the name of entry point {entry.value} is already taken in {group}: {entry.name}")
             self[entry.name] = entry
 

@@ -301,7 +301,7 @@ def turned(model: Any, people: motion.MotionSet) -> tuple[Tensor, Tensor]:
     windows = motion.windows(people, cut, "test", cut.observed)
     with torch.no_grad():
         x = model.model(model.read(windows.all()), length=cut.predicted, mean_emission=True)[WHOLE]
-    places, turning = x[..., :3], model.turns.turning
+    places, turning = x[..., :3], model.rotations.turning
     rotations = torch.eye(3).repeat(*x.shape[:-1], skeleton.joints, 1, 1)
     rotations[..., turning, :, :] = to_matrix(x[..., 3:].unflatten(-1, (-1, 4)), "quaternion")
     first, last = (

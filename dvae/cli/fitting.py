@@ -140,7 +140,7 @@ class DataOptions(ColumnOptions):
         """
         kinds = {method.fitted_on: method.name for method in methods}
         if len(kinds) > 1:
-            descriptions = " and ".join(f"{name} on {SAID.get(kind, kind)}" for kind, name in kinds.items())
+            descriptions = " and ".join(f"{name} on {DATA_NAMES.get(kind, kind)}" for kind, name in kinds.items())
             raise UsageError(
                 f"these methods are fitted on different kinds of data, {descriptions}; give methods of one kind"
             )
@@ -154,8 +154,8 @@ class DataOptions(ColumnOptions):
         for other, options in OF_KINDS.items():
             if other != kind and (inapplicable := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
                 raise UsageError(
-                    f"--{min(inapplicable).replace('_', '-')} is for {SAID[other]}, and {name} is fitted on "
-                    f"{SAID[kind]}"
+                    f"--{min(inapplicable).replace('_', '-')} is for {DATA_NAMES[other]}, and {name} is fitted on "
+                    f"{DATA_NAMES[kind]}"
                 )
         columns = {field.name for field in fields(ColumnOptions)}
         given = {name: value for name, value in given.items() if name not in columns} | self.given()
@@ -178,7 +178,7 @@ OF_KINDS = {
     ),
 }
 """Options by kind of data."""
-SAID = {"windows": "windows", "motion": "motion", "segments": "segments of motion", "panel": "a table"}
+DATA_NAMES = {"windows": "windows", "motion": "motion", "segments": "segments of motion", "panel": "a table"}
 
 
 def fit(

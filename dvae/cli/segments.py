@@ -137,7 +137,7 @@ class Recovery:
         model, truth, takes = loaded.model, None, set()
         if self.file is None:
             data_set = loading.data_of(data, loaded)
-            selected = [data_set.found(name) for name in self.source]
+            selected = [data_set.segments_of(name) for name in self.source]
             clips = [clip for segments in selected for clip in segments.motion]
             keys, takes = [clip.key for clip in clips], {clip.labels["source"] for clip in clips}
             if len({*keys}) < len(keys):
@@ -183,13 +183,13 @@ def _other_segments(data_set: Any, takes: Collection[str]) -> Mapping[str, Any] 
 
 def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:
     """Yield warnings for readers of the table."""
-    remaining = recovered.found.posterior.left
+    remaining = recovered.completed.posterior.left
     if n_unconverged := int((remaining > APART).sum()):
         yield (
             f"{n_unconverged} of {len(remaining)} segments not converged, with up to {float(remaining.max()):,.0f} "
             "nats left; give more --steps or --starts, or allow larger deviations"
         )
-    for name, distances in recovered.away.items():
+    for name, distances in recovered.distances.items():
         option, allowed = name.removesuffix("s"), deviations.of(name)
         deviation = float(distances.max()) / (8 / pi) ** 0.5  # the mean length of three normal coordinates
         if deviation > FARTHER * allowed:

@@ -50,7 +50,7 @@ from .precise import BoundedDistribution, DoublePrecision
 ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
 """Equivalent parameters; the network provides the first of each group."""
 
-Moved = Callable[[Tensor, Tensor, Tensor], Tensor]  # (parameter, mean, scale) -> parameter of mean + scale * variable
+Affine = Callable[[Tensor, Tensor, Tensor], Tensor]  # (parameter, mean, scale) -> parameter of mean + scale * variable
 
 
 def _location(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
@@ -78,7 +78,7 @@ def _rows(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
     return (value.unflatten(-1, (len(scale), -1)) * scale[:, None]).flatten(-2)
 
 
-UNITS: Mapping[str, Mapping[str, Moved]] = {
+UNITS: Mapping[str, Mapping[str, Affine]] = {
     name: moves
     for names, moves in (
         ("Cauchy Gumbel Laplace Logistic Normal SoftLaplace StudentT", {"loc": _location, "scale": _scale}),

@@ -175,13 +175,13 @@ def repeat_batch(values: Tensor, n: int) -> Tensor:
 
 
 def steps_of(values: Tensor) -> Sequence[Tensor]:
-    """Return the steps of values (B, T, ...); `whole_of` can restore the values without a copy."""
+    """Return the steps of values (B, T, ...); `join_steps` can restore the values without a copy."""
     steps = values.unbind(1)
     store_result(steps_of, steps, values)
     return steps
 
 
-def whole_of(steps: Sequence[Tensor]) -> Tensor:
+def join_steps(steps: Sequence[Tensor]) -> Tensor:
     """Return values (B, T, ...) from their steps, without a copy if `steps_of` returned them."""
     return memoize(steps_of, steps, lambda: torch.stack(list(steps), dim=1))
 
@@ -226,7 +226,7 @@ def extend_features(
         return (
             [(change or module)(values[0])]
             if len(values) == 1
-            else steps_of(memoize_valid(module, whole_of(values), None))
+            else steps_of(memoize_valid(module, join_steps(values), None))
         )
 
     for s, feature in zip(fresh, memoize(module, [lengths, *values], compute) if fresh else [], strict=True):

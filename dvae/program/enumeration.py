@@ -32,7 +32,7 @@ LARGEST = 4096
 """Maximum number of joint states of a window and the static latents."""
 WIDE = 2**11
 """Maximum number of transition terms of a step, over all sequences, for blocks; above it they cost more time."""
-COURSES = 2**17
+MAX_SEQUENCES = 2**17
 """Maximum number of state sequences that are enumerated one by one."""
 
 
@@ -188,10 +188,10 @@ class EnumerationPlan:
             ValueError: if there are too many to enumerate.
         """
         sizes = [self.sizes[name] for name in self.sizes for _ in range(length if name in self.chain else 1)]
-        if (count := math.prod(sizes)) > COURSES:
+        if (count := math.prod(sizes)) > MAX_SEQUENCES:
             raise ValueError(
-                f"{', '.join(self.sizes)} have {count:.3g} state sequences in {length} steps, but at most {COURSES:,} "
-                "are enumerated; use fewer steps"
+                f"{', '.join(self.sizes)} have {count:.3g} state sequences in {length} steps, but at most "
+                f"{MAX_SEQUENCES:,} are enumerated; use fewer steps"
             )
         digits = np.stack(np.unravel_index(np.arange(count), sizes)).T
         sequences = {}

@@ -24,10 +24,10 @@ from .parsing import (
     UnparsedDates,
     compact,
     dates,
+    describe_marks,
     index_levels,
     is_duration,
     is_number,
-    said_of_marks,
     tabular,
     texts,
 )
@@ -147,7 +147,7 @@ class ColumnHints:
         )
         for column in numbers:
             if column_marks := inference.numbers[column.name].marks:
-                warnings.warn(f"column {column.name!r} {said_of_marks(column_marks)}", stacklevel=3)
+                warnings.warn(f"column {column.name!r} {describe_marks(column_marks)}", stacklevel=3)
         for name in (column.name for column in numbers if column.role == "target" and column.name in roles):
             if inference.is_constant(name):
                 warnings.warn(

@@ -18,7 +18,7 @@ from .numerals import read_numbers
 LONGEST = 64
 """Maximum characters of a date; longer text is not matched."""
 MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-WANTED = "2024-12-31"
+DATE_EXAMPLE = "2024-12-31"
 _DAY = r"(?P<day>\d{1,2})(?:st|nd|rd|th)?"
 _WEEKDAY = r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*[.,]{0,2}\s+)?"
 _WORD = rf"(?P<word>{'|'.join(MONTHS)})[a-z]*\.?"
@@ -57,7 +57,7 @@ class UnparsedDates(ValueError):
     def __init__(self, cells: Any, wrong: np.ndarray):
         self.wrong = wrong
         row = int(np.argmax(wrong))
-        super().__init__(f"{brief(cells.iloc[row])} in row {row}; write dates as {WANTED}, durations as 02:30:00")
+        super().__init__(f"{brief(cells.iloc[row])} in row {row}; write dates as {DATE_EXAMPLE}, durations as 02:30:00")
 
 
 class AmbiguousDates(ValueError):
@@ -226,11 +226,11 @@ def _order(parts: Any, example: str) -> dict[str, str]:
     """Return which of two numbers is the day: a number above 12."""
     first, second = (parts[name].astype(int).max() > 12 for name in ("first", "second"))
     if first and second:
-        raise ValueError(f"some begin with the day and others with the month; write dates as {WANTED}")
+        raise ValueError(f"some begin with the day and others with the month; write dates as {DATE_EXAMPLE}")
     if not (first or second) or (parts.year.str.len() == 2).any():
         raise AmbiguousDates(
             f"dates such as {example!r} are ambiguous: the order of day, month and year is not known; "
-            f"write them as {WANTED}"
+            f"write them as {DATE_EXAMPLE}"
         )
     return {"first": "day", "second": "month"} if first else {"first": "month", "second": "day"}
 
@@ -343,11 +343,11 @@ def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: s
     numbers = read_numbers(column, na_values, decimal, column.attrs.get("decimal"))
     numbers.check(column, "or give the column the family 'category'")
     if numbers.marks:
-        warnings.warn(f"column {told.name!r} {said_of_marks(numbers.marks)}", stacklevel=2)
+        warnings.warn(f"column {told.name!r} {describe_marks(numbers.marks)}", stacklevel=2)
     return numbers.values
 
 
-def said_of_marks(marks: Mapping[str, tuple[int, int]]) -> str:
+def describe_marks(marks: Mapping[str, tuple[int, int]]) -> str:
     """Describe the cells of a column of numbers that are read as missing."""
     cells = ", ".join(f"{brief(mark)} (row {row}, {count} in all)" for mark, (row, count) in marks.items())
     quoted = ", ".join(f'"{mark}"' for mark in marks)

@@ -55,7 +55,7 @@ class GatedTransition(Network):
     def __init__(self, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, 2 * size)
         previous, *others = inputs
-        self.name, self.size, self.beside = previous.name, size, [parent.name for parent in others]
+        self.name, self.size, self.others = previous.name, size, [parent.name for parent in others]
         width = size + sum(parent.size for parent in others)
         self.gate, self.proposal = (
             nn.Sequential(nn.Linear(width, size), nn.ReLU(), nn.Linear(size, size)) for _ in range(2)
@@ -71,7 +71,7 @@ class GatedTransition(Network):
     def _other_parents(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
         """Return the parents other than z_{t-1}, (B, T, E)."""
         empty = self.linear.weight.new_empty(batch, length, 0)
-        return torch.cat(aligned([empty, *(parents[name] for name in self.beside)]), -1)
+        return torch.cat(aligned([empty, *(parents[name] for name in self.others)]), -1)
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:

@@ -155,13 +155,13 @@ class EnergyModel(DynamicalVAE):
                 terms["multimodal"] = energies.multimodal_best_of_many(samples, others, batch["valid"])
         return terms
 
-    def realism(self, samples: Tensor, truth: Tensor, judged: Tensor) -> dict[str, Tensor]:
+    def realism(self, samples: Tensor, truth: Tensor, frames: Tensor) -> dict[str, Tensor]:
         """Return the energies of limb lengths, angles and pose prior that have a weight, (B,) each.
 
         Args:
             samples: (S, B, T, D), whose limb lengths are scored in all frames.
             truth: (B, T, D); the first of the frames with the most joints defines the true lengths.
-            judged: (S, B, T, D), frames whose angles and poses are scored.
+            frames: (S, B, T, D), frames whose angles and poses are scored.
         """
         terms: dict[str, Tensor] = {}
         if self.method.limb:
@@ -171,10 +171,10 @@ class EnergyModel(DynamicalVAE):
         if self.limits is not None:
             if self.angles is None or self.angles.low is not self.angle_low:  # only once, as the checks synchronise
                 self.angles = AngleLimits(self.limits, self.angle_low, self.angle_high)
-            terms["angles"] = energies.joint_angles(judged, self.angles, self.skeleton)
+            terms["angles"] = energies.joint_angles(frames, self.angles, self.skeleton)
         if self.pose_prior is not None:
-            offset = int(torch.randint(min(3, judged.shape[2]), ()))  # every third frame, randomly shifted at each step
-            terms["pose_prior"] = energies.pose_prior_energy(judged[:, :, offset::3], self.pose_prior, self.skeleton)
+            offset = int(torch.randint(min(3, frames.shape[2]), ()))  # every third frame, randomly shifted at each step
+            terms["pose_prior"] = energies.pose_prior_energy(frames[:, :, offset::3], self.pose_prior, self.skeleton)
         return terms
 
     def turned(self, x: Tensor) -> Tensor:

@@ -197,7 +197,7 @@ class MixAndMatchModel(DynamicalVAE):
     def __init__(self, method: MixAndMatchMotion, schema: Poses, **options: Any) -> None:
         assert isinstance(schema.view, Rotations)
         super().__init__(view=Views(schema.view, Past(HISTORY, schema.protocol.observed)), **options)
-        self.method, self.turns = method, schema.view
+        self.method, self.rotations = method, schema.view
 
     @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
@@ -207,8 +207,8 @@ class MixAndMatchModel(DynamicalVAE):
         value = rollout.values[WHOLE]
         predicted = rollout.parameters(WHOLE, value)[0]
         with torch.no_grad():
-            target = _unrotated_positions(value, data[LENGTHS], self.turns)
-        positions = _unrotated_positions(predicted, data[LENGTHS], self.turns)
+            target = _unrotated_positions(value, data[LENGTHS], self.rotations)
+        positions = _unrotated_positions(predicted, data[LENGTHS], self.rotations)
         return {"skeleton": (positions - target).square().mean(-1).sum(-1)}
 
 

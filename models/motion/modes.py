@@ -381,16 +381,16 @@ class Sampler(nn.Module):
     Args:
         size: D, size of a pose.
         modes: K, number of modes.
-        told: L, number of parameters of each mode.
+        parameters: L, number of parameters of each mode.
         spec: specification with the widths.
     """
 
-    def __init__(self, size: int, modes: int, told: int, spec: ModesDecoder) -> None:
+    def __init__(self, size: int, modes: int, parameters: int, spec: ModesDecoder) -> None:
         super().__init__()
         self.modes = modes
         self.past = LastState(size, spec.sampler_width)
         shape = (spec.sampler_width, *spec.sampler_hidden)
-        self.behind, self.heads = perceptron(shape, "tanh"), nn.Linear(shape[-1], modes * told)
+        self.behind, self.heads = perceptron(shape, "tanh"), nn.Linear(shape[-1], modes * parameters)
 
     def forward(self, history: Tensor) -> Tensor:
         """Return the parameters (R, K, L) of the modes from the past (N, O D).

@@ -41,7 +41,7 @@ from ...program.model import DynamicalVAE
 from .poses import PoseMethod
 
 FIRST, GIVEN, REST = "s", "y", "r"
-NEEDED = "relative", 1
+REQUIRED_PROTOCOL = "relative", 1
 """Root and number of observed frames that the protocol must have."""
 
 
@@ -92,11 +92,12 @@ class TrajectoryMethod(PoseMethod):
         if not isinstance(schema, Poses):
             return self.with_presets(self.presets[HUMAN36M.name])._build_model(DynamicalVAE, schema.size(WHOLE))
         protocol = Poses.of(schema, self.name).protocol
-        if (protocol.root, protocol.observed) != NEEDED:
+        if (protocol.root, protocol.observed) != REQUIRED_PROTOCOL:
+            suitable = (name for name, other in PROTOCOLS.items() if (other.root, other.observed) == REQUIRED_PROTOCOL)
             raise ValueError(
                 f"{self.name} moves a body through space from one pose, but the protocol {protocol.name} has "
                 f"root={protocol.root!r} and {protocol.observed} observed frames; use one with root='relative' and "
-                f"observed=1, such as {', '.join(n for n, p in PROTOCOLS.items() if (p.root, p.observed) == NEEDED)}"
+                f"observed=1, such as {', '.join(suitable)}"
             )
         return self.build_on(schema.skeleton, schema.frames - 1)
 

@@ -382,13 +382,13 @@ def test_recurrent_poses_are_put_where_segments_start(short):
     assert len(windows) == len(people)
 
     class Oracle:
-        turns = windows.schema.view
+        rotations = windows.schema.view
 
         def read(self, batch):
             return batch
 
         def model(self, batch, length, mean_emission):
-            return {"x": self.turns(windows.all())["x"][:, cut.observed :]}
+            return {"x": self.rotations(windows.all())["x"][:, cut.observed :]}
 
     errors = completion.references(held, Oracle())["rows"]
     assert max(max(row) for row in errors[completion.SUP].values()) < 5  # mm; frames of chi account for 2

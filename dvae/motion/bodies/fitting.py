@@ -56,7 +56,7 @@ STRETCHED = 0.25
 STILL = 0.15
 """Speed in metres a second below which ankle and toes belong to a foot that stands flat."""
 
-APART = 0.03
+MIN_DISTANCE = 0.03
 """Minimum distance in metres between clavicles; closer ones begin in the middle of the body and are ignored."""
 
 ALIKE = 0.5
@@ -198,7 +198,7 @@ class _Source(NamedTuple):
         source_joints, body_joints = parts(skeleton.names), parts(body.names)
         if {"l clavicle", "r clavicle"} <= source_joints.keys():
             ends = [source_joints.pop(f"{side} clavicle") for side in "lr"]
-            if np.linalg.norm(pose[ends[0]] - pose[ends[1]]) > APART:
+            if np.linalg.norm(pose[ends[0]] - pose[ends[1]]) > MIN_DISTANCE:
                 source_joints |= {"l clavicle": ends[0], "r clavicle": ends[1]}
         # if there are two, the lower one is in the chest
         for part, higher in (("neck", "upperneck"), ("head", "headtop")):

@@ -213,7 +213,7 @@ _PARTS = {
 _MOST = 4
 """Maximum number of joints that move a vertex."""
 
-_REACH = 0.015
+_WEIGHT_WIDTH = 0.015
 """Additional distance of a bone, in metres, at which its skinning weight is smaller by a factor of e."""
 
 
@@ -336,7 +336,7 @@ def _weights(part: _Part, side: str, vertices: Tensor) -> Tensor:
     nearest, indices = torch.stack(distances, -1).topk(min(_MOST, len(joints)), largest=False)
     columns = torch.tensor([_joint(joint, side) for joint in joints])
     weights = vertices.new_zeros(len(vertices), len(JOINTS))
-    return weights.scatter(1, columns[indices], (-nearest / _REACH).softmax(-1))
+    return weights.scatter(1, columns[indices], (-nearest / _WEIGHT_WIDTH).softmax(-1))
 
 
 def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:

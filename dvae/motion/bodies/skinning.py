@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ...constants import indices
 from ..geometry.kinematics import forward
 
-UNTOLD = 1e-5
+RANK_TOLERANCE = 1e-5
 """Relative singular value below which joint offsets do not determine a shape parameter."""
 
 
@@ -99,7 +99,7 @@ class Body(nn.Module):
         give the nearest shape.
         """
         average, changes = self._bones()
-        parameters = torch.linalg.pinv(changes.flatten(0, 1), rtol=UNTOLD)
+        parameters = torch.linalg.pinv(changes.flatten(0, 1), rtol=RANK_TOLERANCE)
         values: Tensor = parameters @ (offsets.to(average) - average).flatten(-2)[..., None]
         return values.squeeze(-1).to(offsets)
 

@@ -37,7 +37,7 @@ class Bone:
     parent: str
     vector: Vector
     axes: Tensor
-    turns: str
+    axis_order: str
 
 
 def joints_of(bones: Mapping[str, Bone]) -> tuple[list[str], list[int], np.ndarray]:
@@ -145,7 +145,7 @@ def read_amc(path: str | Path) -> Recording:
     skeleton = _skeleton_of(path)
     bones, metres, degrees, order = read_asf(skeleton)
     names, parents, offsets = joints_of(bones)
-    columns = {"root": 6} | {name: len(bone.turns) for name, bone in bones.items() if bone.turns}
+    columns = {"root": 6} | {name: len(bone.axis_order) for name, bone in bones.items() if bone.axis_order}
     values: dict[str, list[str]] = {name: [] for name in columns}
     frames = 0
     for number, line in enumerate(read_lines(path), 1):
@@ -183,8 +183,10 @@ def read_amc(path: str | Path) -> Recording:
 
     rotations[:, 0] = _rotation(radians(root[:, turning]), "".join(channels[column][1] for column in turning))
     for name, bone in bones.items():
-        if bone.turns:
-            rotations[:, names.index(name)] = bone.axes @ _rotation(radians(angles_of[name]), bone.turns) @ bone.axes.mT
+        if bone.axis_order:
+            rotations[:, names.index(name)] = (
+                bone.axes @ _rotation(radians(angles_of[name]), bone.axis_order) @ bone.axes.mT
+            )
     places = torch.from_numpy(offsets).repeat(frames, 1, 1)
     places[:, 0] = root_position
     return Recording.turned(names, parents, places, rotations, fps=FPS, metres=metres, up="y")

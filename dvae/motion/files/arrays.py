@@ -197,7 +197,7 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
 
 
 def _skeleton_of(
-    path: Path, clips: Sequence[_Read], selected: Sequence[int] | None
+    path: Path, clips: Sequence[_ClipArrays], selected: Sequence[int] | None
 ) -> tuple[Skeleton, tuple[int, ...] | None]:
     """Return the skeleton of a file, read or known by its subjects, and the indices of its joints in the file.
 
@@ -379,11 +379,11 @@ def write_table(path: str | Path, names: Sequence[str], positions: np.ndarray) -
         file.write(table.getvalue().encode())
 
 
-_Read = tuple[str, str, np.ndarray, np.ndarray | None]
+_ClipArrays = tuple[str, str, np.ndarray, np.ndarray | None]
 """Split, clip, positions, and optional rotations."""
 
 
-def _read_clips(path: Path) -> list[_Read]:
+def _read_clips(path: Path) -> list[_ClipArrays]:
     with archive(path, mapping=True) as members:
         if list(members) == ["positions_3d"]:
             return [(*clip, None) for clip in members["positions_3d"].clips()]

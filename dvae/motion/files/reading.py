@@ -14,7 +14,7 @@ import numpy as np
 from ..data.clips import Clip, MotionSet, defect, extents, fullest
 from ..geometry.skeleton import Skeleton
 from ..naming import sides
-from ..scoring.matching import RIGID, Kept
+from ..scoring.matching import RIGID, JointSubset
 from .amc import read_amc, read_expmap
 from .archive import LARGEST, holds
 from .arrays import LABELS, check_key, companion, read_archive, read_labels, read_table
@@ -332,9 +332,9 @@ def select_recording_joints(
         return recording if recording.loose <= RIGID else replace(recording, rotations=None, offsets=None)
     names, parents = recording.names, recording.parents
     if onto is None:
-        subset = Kept.of(names, parents, joints or ())
+        subset = JointSubset.of(names, parents, joints or ())
     else:
-        subset = Kept.onto(names, onto, joints if isinstance(joints, Mapping) else None)
+        subset = JointSubset.onto(names, onto, joints if isinstance(joints, Mapping) else None)
     positions, rotations, offsets = subset.motion(parents, recording.positions, recording.rotations)
     selected = replace(
         recording, names=subset.names, parents=subset.parents, positions=positions, rotations=rotations, offsets=offsets

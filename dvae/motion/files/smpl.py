@@ -23,7 +23,7 @@ from ..geometry.kinematics import inverse
 from ..geometry.rotations import from_matrix, to_matrix
 from ..geometry.skeleton import Skeleton
 from ..naming import sides
-from ..scoring.matching import Kept, against_world, parts
+from ..scoring.matching import JointSubset, against_world, parts
 from .archive import archive, write_arrays
 from .recording import Recording, check_size
 
@@ -129,7 +129,7 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     names = [name for name in JOINTS if name in joint_of_name]
     parents_of_names = [_above(name, names) for name in names]
     parents = [names.index(parent) if parent else -1 for parent in parents_of_names]
-    subset = Kept(tuple(joint_of_name[name] for name in names), tuple(names), tuple(parents))
+    subset = JointSubset(tuple(joint_of_name[name] for name in names), tuple(names), tuple(parents))
     positions, rotations, offsets = subset.motion(skeleton.parents, clip.positions.astype(np.float64), clip.rotations)
     if rotations is None or offsets is None:  # a bone between these joints is not rigid, usually in the back
         tree = Skeleton(subset.names, subset.parents, *sides(names), skeleton.up, skeleton.fps)

@@ -155,19 +155,19 @@ class Angles:
         now = self.windows.protocol.observed - 1
         frames = [now, *(now + frame for frame in self.protocol.frames)]
         if self.protocol.inverse:
-            return torch.cat([self.found(x[:, frames]) for x in self._batch[WHOLE].split(512)])
+            return torch.cat([self.angles_of(x[:, frames]) for x in self._batch[WHOLE].split(512)])
         rotations = self._batch.view_inputs[ROTATIONS][:, frames].unflatten(-1, (-1, 4))[..., self.joints, :]
         return self.of(to_matrix(rotations, "quaternion"))
 
-    def found(self, x: Tensor) -> Tensor:
+    def angles_of(self, x: Tensor) -> Tensor:
         """Return angles (..., 3 J') of positions (..., D), by inverse kinematics."""
         positions = self.windows.positions(x)
         rotations = kinematics.inverse(self.windows.skeleton, positions, self.offsets.to(positions))
         return self.of(rotations[..., self.joints, :, :])
 
-    def of(self, turns: Tensor) -> Tensor:
+    def of(self, rotations: Tensor) -> Tensor:
         """Return angles (..., 3 J') of joint rotations (..., J', 3, 3)."""
-        return from_matrix(turns, FORM).flatten(-2)
+        return from_matrix(rotations, FORM).flatten(-2)
 
 
 class AngleModel(nn.Module):
@@ -189,8 +189,8 @@ class AngleModel(nn.Module):
         self.generative, self.inference = model.generative, model.inference
         view = model.view if isinstance(model, DynamicalVAE) else None
         views = view.views if isinstance(view, Views) else (view,)
-        self.turns = next((view_of_part for view_of_part in views if isinstance(view_of_part, Rotations)), None)
-        if self.turns is None and not angles.protocol.inverse:
+        self.rotations = next((view_of_part for view_of_part in views if isinstance(view_of_part, Rotations)), None)
+        if self.rotations is None and not angles.protocol.inverse:
             raise ValueError(
                 "a model of positions predicts no rotations; score it with inverse=True, which computes them from "
                 "positions, and score compared models likewise"
@@ -208,13 +208,15 @@ class AngleModel(nn.Module):
             at_once = {} if inverse else {"chunk": 2**62}
             futures = self.model.forecast(batch[MOTION], last, samples, **options, **at_once)[WHOLE]
         if inverse:
-            angles = self.angles.found(futures[:, :, indices])
+            angles = self.angles.angles_of(futures[:, :, indices])
         else:
-            assert self.turns is not None
-            turning = self.turns.turning
+            assert self.rotations is not None
+            turning = self.rotations.turning
             columns = [turning.index(joint) for joint in self.angles.joints]
-            rotations = recorder.value[:, -last:][:, indices, 3 * self.turns.root :].unflatten(-1, (len(turning), -1))
-            matrices = to_matrix(rotations[..., columns, :].unflatten(0, futures.shape[:2]), self.turns.form)
+            rotations = recorder.value[:, -last:][:, indices, 3 * self.rotations.root :].unflatten(
+                -1, (len(turning), -1)
+            )
+            matrices = to_matrix(rotations[..., columns, :].unflatten(0, futures.shape[:2]), self.rotations.form)
             angles = self.angles.of(matrices)
         return {WHOLE: angles[..., self.angles.varying.to(angles.device)]}
 

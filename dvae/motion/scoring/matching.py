@@ -148,7 +148,7 @@ def find(names: Sequence[str], joint: str) -> int:
 
 
 @dataclass(frozen=True)
-class Kept:
+class JointSubset:
     """A subset of the joints of a skeleton, and its tree.
 
     Args:
@@ -162,7 +162,9 @@ class Kept:
     parents: tuple[int, ...]
 
     @classmethod
-    def of(cls, names: Sequence[str], parents: Sequence[int], joints: Sequence[int | str] | Mapping[str, str]) -> Kept:
+    def of(
+        cls, names: Sequence[str], parents: Sequence[int], joints: Sequence[int | str] | Mapping[str, str]
+    ) -> JointSubset:
         """Select joints by index or name, or by a mapping from names to new names.
 
         The parent of each joint is its nearest kept ancestor.
@@ -192,7 +194,7 @@ class Kept:
         return cls(tuple(selected), tuple(renamed or (names[joint] for joint in selected)), tuple(parents_of))
 
     @classmethod
-    def onto(cls, names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> Kept:
+    def onto(cls, names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> JointSubset:
         """Select the joints of a known skeleton, which `match` finds by the meaning of their names."""
         return cls(tuple(match(names, skeleton, said)), skeleton.names, skeleton.parents)
 

@@ -141,7 +141,7 @@ class SegmentCompletion:
         )
 
     @torch.no_grad()
-    def away(self, seen: Mapping[str, Any], z: Tensor, shape: Tensor) -> dict[str, Tensor]:
+    def distances(self, seen: Mapping[str, Any], z: Tensor, shape: Tensor) -> dict[str, Tensor]:
         """Return mean distances (B,) in metres between the observations and the motion decoded from z and beta.
 
         Args:

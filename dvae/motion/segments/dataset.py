@@ -160,7 +160,7 @@ class SegmentData:
         """
         return self._training if split == "train" else Segments(self._of(split), self.timed)
 
-    def found(self, name: str) -> Segments:
+    def segments_of(self, name: str) -> Segments:
         """Return one segment by its name, or the first segment of a take.
 
         Args:

@@ -90,7 +90,7 @@ class Reference:
         return (len(self.hips) - 1) / self.rate
 
 
-class Found(NamedTuple):
+class FoundCycle(NamedTuple):
     """A cycle in a clip: its starting foot, its first and last frame, and its cost in radians."""
 
     side: str
@@ -165,7 +165,7 @@ def on_common_joints(first: MotionSet, second: MotionSet) -> tuple[MotionSet, Mo
     return motions[0].with_rotations(), motions[1].with_rotations()
 
 
-def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference], cycles: Cycles) -> list[Found]:
+def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference], cycles: Cycles) -> list[FoundCycle]:
     """Return the gait cycles of a clip, ordered by their first frames.
 
     Raises:
@@ -191,7 +191,7 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
         costs[~possible] = np.inf
         for first, frames in _select_cheapest(costs, cycles.threshold, cycles.overlap):
             start, end = (min(round(frame * ratio), clip.frames - 1) for frame in (first, first + frames))
-            found_cycles.append(Found(reference.side, start, end, float(costs[first, frames])))
+            found_cycles.append(FoundCycle(reference.side, start, end, float(costs[first, frames])))
     return sorted(found_cycles, key=lambda each: (each.first, each.side))
 
 

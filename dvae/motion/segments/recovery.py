@@ -62,19 +62,19 @@ class Recovered:
     """Completed segments, with draws from the posterior and distances from the observations.
 
     Args:
-        found: most probable segments.
+        completed: most probable segments.
         keys: (split, name) of each.
-        drawn: frames (n, B, N, D) and bodies (n, B, S) drawn from the posterior.
+        draws: frames (n, B, N, D) and bodies (n, B, S) drawn from the posterior.
         khat: (B,), from `Posterior.evidence`.
-        away: mean distances (B,) from the observations in metres by name, from `SegmentCompletion.away`.
+        distances: mean distances (B,) from the observations in metres by name, from `SegmentCompletion.distances`.
         truth: x (B, N, D) and beta (B, S), if known.
     """
 
-    found: Completed
+    completed: Completed
     keys: Sequence[tuple[str, str]]
-    drawn: tuple[Tensor, Tensor]
+    draws: tuple[Tensor, Tensor]
     khat: Tensor
-    away: Mapping[str, Tensor]
+    distances: Mapping[str, Tensor]
     truth: Mapping[str, Any] | None = None
 
     @property
@@ -82,7 +82,7 @@ class Recovered:
         """Errors (B,) if the truth is known: of vertices in metres, per frame of chi, and of durations in seconds."""
         if self.truth is None:
             return {}
-        model, (x, shape), truth = self.found.model, (self.found.x, self.found.shape), self.truth
+        model, (x, shape), truth = self.completed.model, (self.completed.x, self.completed.shape), self.truth
         rows = [slice(row, row + 1) for row in range(len(x))]  # one segment at a time: surfaces are large
         vertices = [
             vertex_error(model.vertices(x[row], shape[row]), model.vertices(truth[WHOLE][row], truth[SHAPE][row]))
@@ -93,9 +93,9 @@ class Recovered:
 
     def table(self) -> Group:
         """Return the results with their intervals and, below, diagnostics; one row per segment in both tables."""
-        timed, draws = self.found.model.timed, len(self.drawn[0])
+        timed, draws = self.completed.model.timed, len(self.draws[0])
         measures = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
-        errors = {f"from\n{name}\nmm": value for name, value in self.away.items()}
+        errors = {f"from\n{name}\nmm": value for name, value in self.distances.items()}
         titles = {"vertex error": "vertex\nerror\nmm", "duration error": "duration\nerror\nms"}
         errors |= {titles[name]: value for name, value in self.errors.items()}
         caption = f"[ ]: {100 * LEVEL:g} % of {draws} draws; too narrow if errors are correlated or exceed deviations"
@@ -107,8 +107,8 @@ class Recovered:
             "bent: number of directions with less curvature than the prior, where a normal does not fit\n"
             f"k-hat: above {UNRELIABLE}, draws and intervals are unreliable",
         )
-        posterior = self.found.posterior
-        measured = [(measure(self.found.x), measure(self.drawn[0])) for measure in measures.values()]
+        posterior = self.completed.posterior
+        measured = [(measure(self.completed.x), measure(self.draws[0])) for measure in measures.values()]
         for row, key in enumerate(self.keys):
             others = posterior.behind[1:, row].tolist()
             results.add_row(
@@ -129,7 +129,7 @@ class Recovered:
         """Return the most probable segments, each followed by some of its draws, as clips.
 
         All clips start at the origin with heading zero."""
-        pairs = zip((self.found.x, self.found.shape), self.drawn, strict=True)
+        pairs = zip((self.completed.x, self.completed.shape), self.draws, strict=True)
         x, shape = (torch.cat([mode[None], samples[:draws]]).transpose(0, 1).flatten(0, 1) for mode, samples in pairs)
         ends = ["found", *(f"draw-{n:02d}" for n in range(1, draws + 1))]
         return self._motion(x, shape, [(split, f"{name}-{end}") for split, name in self.keys for end in ends])
@@ -139,7 +139,7 @@ class Recovered:
         return None if self.truth is None else self._motion(self.truth[WHOLE], self.truth[SHAPE], self.keys)
 
     def _motion(self, x: Tensor, shape: Tensor, keys: Sequence[tuple[str, str]]) -> MotionSet:
-        model = self.found.model
+        model = self.completed.model
         motion: MotionSet = model.timed.back({WHOLE: x, OFFSETS: model.body.offsets(shape)})
         clips = zip(motion, keys, strict=True)
         return replace(motion, clips=[replace(clip, split=split, name=name) for clip, (split, name) in clips])
@@ -172,7 +172,7 @@ def recover(
     options: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
     completed = complete(model, seen, **options, seed=seed, progress=progress)
     bound = completed.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
-    distances = completed.program.away(completed.seen, completed.posterior.mode[LATENT], completed.shape)
+    distances = completed.program.distances(completed.seen, completed.posterior.mode[LATENT], completed.shape)
     return Recovered(completed, keys, completed.draw(DRAWS, seed), bound.khat, distances, truth)
 
 

@@ -129,7 +129,10 @@ def test_the_loss_adds_errors_of_quaternions_and_positions_and_the_annealed_kl(w
     size, lengths = model.sizes["x"], data["bone_lengths"]
     rotations = (means - data["x"]).square().mean()
     positions = (
-        (_unrotated_positions(means, lengths, model.turns) - _unrotated_positions(data["x"], lengths, model.turns))
+        (
+            _unrotated_positions(means, lengths, model.rotations)
+            - _unrotated_positions(data["x"], lengths, model.rotations)
+        )
         .square()
         .mean()
     )

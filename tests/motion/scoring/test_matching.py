@@ -9,7 +9,7 @@ from dvae.motion.files.smpl import JOINTS
 from dvae.motion.geometry.kinematics import forward
 from dvae.motion.geometry.rotations import to_matrix
 from dvae.motion.naming import sides
-from dvae.motion.scoring.matching import Kept, match, parts
+from dvae.motion.scoring.matching import JointSubset, match, parts
 
 SIDED = ("{}Hip", "{}Knee", "{}Foot", "{}Shoulder", "{}Elbow", "{}Wrist")
 DIALECTS = {  # words for SIDED, words for the trunk from pelvis to head, and templates around them
@@ -80,30 +80,32 @@ def test_unmatched_joints_are_listed_and_can_be_given():
 
 
 def test_the_parent_of_a_kept_joint_is_its_nearest_kept_ancestor():
-    reduction = Kept.of(WALKER.names, WALKER.parents, ["Pelvis", "LFoot", "LHip", "Head"])
+    reduction = JointSubset.of(WALKER.names, WALKER.parents, ["Pelvis", "LFoot", "LHip", "Head"])
     assert reduction.parents == (-1, 2, 0, 0)
-    renamed = Kept.of(WALKER.names, WALKER.parents, {"Pelvis": "hips", "Head": "top"})
+    renamed = JointSubset.of(WALKER.names, WALKER.parents, {"Pelvis": "hips", "Head": "top"})
     assert (renamed.names, renamed.parents) == (("hips", "top"), (-1, 0))
-    assert Kept.of(WALKER.names, WALKER.parents, [3, 0]).names == ("RFoot", "Pelvis")
+    assert JointSubset.of(WALKER.names, WALKER.parents, [3, 0]).names == ("RFoot", "Pelvis")
     for wrong, message in (
         (["LFoot", "RFoot"], "their roots are LFoot, RFoot"),
         (["Leg"], "no joint 'Leg'"),
         ([0, 0], "is not one of 17, or occurs twice"),
     ):
         with pytest.raises(ValueError, match=message):
-            Kept.of(WALKER.names, WALKER.parents, wrong)
+            JointSubset.of(WALKER.names, WALKER.parents, wrong)
 
 
 def test_rotations_of_kept_joints_give_the_same_motion_or_are_dropped():
     people = simulate(1, 40).with_rotations()
     clip, double = people.clips[0], people.skeleton
     # with only the thighs, nothing bends at the pelvis
-    reduction = Kept.of(double.names, double.parents, [n for n in double.names if n not in ("LWrist", "Head", "RFoot")])
+    reduction = JointSubset.of(
+        double.names, double.parents, [n for n in double.names if n not in ("LWrist", "Head", "RFoot")]
+    )
     places, quaternions, offsets = reduction.motion(double.parents, clip.positions.astype(float), clip.rotations)
     root = torch.from_numpy(places[:, 0])
     positions, _ = forward(
         reduction.parents, to_matrix(torch.from_numpy(quaternions), "quaternion"), torch.from_numpy(offsets), root
     )
     np.testing.assert_allclose(positions.numpy(), places, atol=1e-3)
-    bent = Kept.of(double.names, double.parents, [n for n in double.names if n not in ("LKnee", "RKnee")])
+    bent = JointSubset.of(double.names, double.parents, [n for n in double.names if n not in ("LKnee", "RKnee")])
     assert bent.motion(double.parents, clip.positions.astype(float), clip.rotations)[1:] == (None, None)

@@ -234,9 +234,9 @@ def test_recovered_segments_are_scored_and_become_motion(model):
     observed = simulate_observations(model, x, shape, "markers", frames=range(0, 100, 20))
     keys, truth = [("a", "first"), ("b", "second")], {"x": x, SHAPE: shape}
     recovered = recover(model, {**observed, SHAPE: shape}, keys, truth=truth, descent=THOROUGH)
-    assert recovered.away["markers"].max() < 1e-3
+    assert recovered.distances["markers"].max() < 1e-3
     assert recovered.errors["vertex error"].max() < 2e-3
-    lasts = model.timed.lasts(recovered.found.x)
+    lasts = model.timed.lasts(recovered.completed.x)
     torch.testing.assert_close(recovered.errors["duration error"], (lasts - model.timed.lasts(x)).abs())
     moving, true = recovered.motion(draws=2), recovered.true_motion()
     assert [clip.key for clip in moving][::3] == [("a", "first-found"), ("b", "second-found")]

@@ -33,11 +33,11 @@ def test_splits_partition_the_takes_and_segments_have_names(data):
     assert sum(map(len, windows.values())) == len(data.segments)
     first = data.segments.clips[0]
     for name in (first.name, f"{first.split}/{first.name}", first.labels["source"]):
-        assert data.found(name).motion.clips[0].key == first.key
+        assert data.segments_of(name).motion.clips[0].key == first.key
     with pytest.raises(
         ValueError, match=r"no segment or take 'person_00' .did you mean 'person_00.*the first is train"
     ):
-        data.found("person_00")
+        data.segments_of("person_00")
     with pytest.raises(ValueError, match="no split 'all': expected train, validation or test"):
         data.windows("all")
 
