@@ -378,7 +378,7 @@ def test_a_method_with_a_custom_objective_resumes(people, tmp_path, monkeypatch)
 
 def test_scheduled_sampling_is_an_option_of_the_method(people, tmp_path):
     with pytest.raises(
-        ValueError, match=r"instead of scheduled_sampling=0\.5 here write dvae\.method\(…, scheduled_sampling=…\)"
+        ValueError, match=r"pass it to the method: dvae\.method\(…, scheduled_sampling=…\)"
     ):
         dvae.fit(
             dvae.method("vrnn"),
@@ -633,7 +633,7 @@ def test_prediction_bands_are_calibrated_on_validation_windows_or_labelled_clips
         (["--label", "style"], "select the test clips for calibration; give both"),
         (["--label", "style", "--values", "c"], "no test clip has style c; there are a, b"),
         (["--label", "style", "--values", "a", "b"], "selects all test clips"),
-        (["--level", ".9"], "90 % need 9 clips"),
+        (["--level", ".9"], "90 % need at least 9 clips"),
     ):
         assert main(["check", "coverage", str(run), "--samples", "4", *arguments])
         assert message in " ".join(capsys.readouterr().err.split())

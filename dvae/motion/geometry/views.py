@@ -276,7 +276,7 @@ class Rotations(View):
     @property
     def measured(self) -> str:  # type: ignore[override]
         """Name of the values that densities refer to."""
-        return f"turns of joints ({self.form})"
+        return f"joint rotations ({self.form})"
 
     @property
     def turning(self) -> list[int]:

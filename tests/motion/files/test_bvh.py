@@ -159,7 +159,7 @@ def test_written_files_have_the_layout_that_animation_programs_import(tmp_path):
         ("0.0333333", "0", "not a recording"),
         ("OFFSET 3 0 0", "OFFSET 3 0", "expected three numbers"),
         ("OFFSET 3 0 0", "OFFSET 3 0 inf", "line 17: 'inf' is not a number"),
-        ("CHANNELS 2 ", "CHANNELS 3 ", "expected their number"),
+        ("CHANNELS 2 ", "CHANNELS 3 ", "expected the number of channels"),
         ("CHANNELS 2 Yrotation", "CHANNELS 2 Zrotation", "each once"),
         ("5 6 7 90", "5 6 90", "expected 2 frames"),
         ("JOINT arm", "JOINT hip", "another joint 'hip'"),

@@ -22,18 +22,18 @@ from dvae.motion.files.smpl import JOINTS
 
 
 @pytest.fixture(scope="module")
-def people():
+def walkers():
     return simulate(clips=3, frames=12, seed=2)
 
 
 @pytest.fixture(scope="module")
-def recordings(people, tmp_path_factory):
+def recordings(walkers, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
-    write_motion(folder, people, "bvh")
+    write_motion(folder, walkers, "bvh")
     return folder
 
 
-def test_formats_and_names_that_do_not_fit_are_errors(people, tmp_path):
+def test_formats_and_names_that_do_not_fit_are_errors(walkers, tmp_path):
     for path, format, message in (
         ("a.bvh", None, "stores one clip per file, but there are 3"),
         ("a", None, "which format.*--format"),
@@ -41,23 +41,23 @@ def test_formats_and_names_that_do_not_fit_are_errors(people, tmp_path):
         ("a", "npz", "end its name in .npz"),
     ):
         with pytest.raises(ValueError, match=message):
-            write_motion(tmp_path / path, people, format)
+            write_motion(tmp_path / path, walkers, format)
     for split, name in (("..", "a"), ("/etc", "a"), ("a", "../../b")):
-        outside = MotionSet([replace(people.clips[0], split=split, name=name)], WALKER)
+        outside = MotionSet([replace(walkers.clips[0], split=split, name=name)], WALKER)
         with pytest.raises(ValueError, match="leads out of the folder"):
             write_motion(tmp_path / "inner", outside, "csv")
     assert not list(tmp_path.rglob("*.csv"))
 
 
-def test_amass_files_have_the_members_that_readers_expect(people, tmp_path):
-    (path,) = write_motion(tmp_path / "a.npz", MotionSet(people.clips[:1], WALKER), "amass")
+def test_amass_files_have_the_members_that_readers_expect(walkers, tmp_path):
+    (path,) = write_motion(tmp_path / "a.npz", MotionSet(walkers.clips[:1], WALKER), "amass")
     arrays = read_arrays(path)
     assert arrays["poses"].shape == (12, 156)
     assert arrays["trans"].shape == (12, 3)
     assert arrays["mocap_framerate"] == 30
     assert not arrays["betas"].any()
     assert not arrays["poses"][:, 3 * len(JOINTS) :].any()
-    heights = people.clips[0].positions[:, 0, 1]
+    heights = walkers.clips[0].positions[:, 0, 1]
     np.testing.assert_allclose(arrays["trans"][:, 2], heights, atol=1e-6)  # z up
 
 
@@ -74,9 +74,9 @@ def test_a_converted_folder_equals_the_folder_as_read(jobs, recordings, tmp_path
 
 
 @pytest.mark.parametrize("format", ["npz", "bvh", "csv", "amass"])
-def test_labels_are_written_with_the_clips(format, people, tmp_path):
+def test_labels_are_written_with_the_clips(format, walkers, tmp_path):
     moods = [
-        replace(clip, labels={"mood": name}) for clip, name in zip(people, ("sad, or so", "glad", ""), strict=True)
+        replace(clip, labels={"mood": name}) for clip, name in zip(walkers, ("sad, or so", "glad", ""), strict=True)
     ]
     sad = MotionSet(moods, WALKER)
     moods_by_clip = {clip.key: clip.labels["mood"] for clip in sad}
@@ -101,21 +101,21 @@ def test_labels_are_written_with_the_clips(format, people, tmp_path):
 
 
 @pytest.mark.parametrize("older", [False, True], ids=["own files", "files of the folder"])
-def test_archives_of_one_folder_keep_their_skeletons_and_labels(older, people, tmp_path):
-    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={"mood": "glad"}) for clip in people], WALKER))
+def test_archives_of_one_folder_keep_their_skeletons_and_labels(older, walkers, tmp_path):
+    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={"mood": "glad"}) for clip in walkers], WALKER))
     if older:  # as earlier versions wrote them
         for name in ("skeleton.json", "labels.csv"):
             (tmp_path / f"a.npz.{name}").rename(tmp_path / name)
-    save(tmp_path / "c.npz", MotionSet([replace(people.clips[0], labels={})], replace(WALKER, fps=60.0)))
+    save(tmp_path / "c.npz", MotionSet([replace(walkers.clips[0], labels={})], replace(WALKER, fps=60.0)))
     first, other = (read_motion(tmp_path / name) for name in ("a.npz", "c.npz"))
     assert (first.skeleton, other.skeleton.fps) == (WALKER, 60)
     assert [each.clips[0].labels.get("mood") for each in (first, other)] == ["glad", None]
-    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={}) for clip in people], WALKER))
+    save(tmp_path / "a.npz", MotionSet([replace(clip, labels={}) for clip in walkers], WALKER))
     assert read_motion(tmp_path / "a.npz").clips[0].labels.get("mood") is None
 
 
-def test_an_archive_with_another_skeleton_is_an_error(people, tmp_path):
-    save(tmp_path / "a.npz", people)
+def test_an_archive_with_another_skeleton_is_an_error(walkers, tmp_path):
+    save(tmp_path / "a.npz", walkers)
     arm = Skeleton(("shoulder", "elbow"), (-1, 0))
     arm.to_json(tmp_path / "skeleton.json")
     assert read_motion(tmp_path / "a.npz").skeleton == WALKER
@@ -124,7 +124,7 @@ def test_an_archive_with_another_skeleton_is_an_error(people, tmp_path):
         read_motion(tmp_path / "a.npz")
 
 
-def test_an_error_leaves_no_files_and_skipped_clips_are_not_written(recordings, people, tmp_path, capsys):
+def test_an_error_leaves_no_files_and_skipped_clips_are_not_written(recordings, walkers, tmp_path, capsys):
     shutil.copytree(recordings, tmp_path / "in")
     stranger = tmp_path / "in" / "train" / "stranger.bvh"
     text = (tmp_path / "in" / "train" / "person_0000.bvh").read_text()
@@ -167,22 +167,22 @@ def test_forecasts_of_a_run_are_written_as_bvh(run, tmp_path, capsys):
     assert motion_set.clips[0].frames == 75
 
 
-def test_archives_of_clips_are_joined(people, tmp_path, capsys):
+def test_archives_of_clips_are_joined(walkers, tmp_path, capsys):
     folder, out = tmp_path / "in", str(tmp_path / "all.npz")
     folder.mkdir()
-    paths = [folder / f"{clip.name}.npz" for clip in people]
-    for path, clip in zip(paths, people, strict=True):
-        save(path, replace(people, clips=[clip]))
+    paths = [folder / f"{clip.name}.npz" for clip in walkers]
+    for path, clip in zip(paths, walkers, strict=True):
+        save(path, replace(walkers, clips=[clip]))
     assert main(["data", "info", str(folder)]) == 1
     assert f"dvae data convert {folder}/*.npz --out ALL.npz" in " ".join(capsys.readouterr().err.split())
     assert main(["data", "convert", *map(str, paths), "--out", out]) == 0
-    assert read_motion(out).fingerprint() == people.fingerprint()
-    write_motion(tmp_path / "a.bvh", replace(people, clips=[people.clips[0]]))
+    assert read_motion(out).fingerprint() == walkers.fingerprint()
+    write_motion(tmp_path / "a.bvh", replace(walkers, clips=[walkers.clips[0]]))
     for other, message in (
         (tmp_path / "a.bvh", "is an archive of clips and"),  # which was silently left out
         (paths[0], "occurs twice"),
         (folder / "z.npz", "z is up, and y in"),
     ):
-        save(folder / "z.npz", MotionSet([people.clips[0]], replace(WALKER, up="z")))
+        save(folder / "z.npz", MotionSet([walkers.clips[0]], replace(WALKER, up="z")))
         assert main(["data", "convert", str(paths[0]), str(other), "--out", out]) == 1
         assert message in " ".join(capsys.readouterr().err.split())
