@@ -57,7 +57,7 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
         training = dvae.Training(steps=steps, batch_size=32, learning_rate=RATES[name], decay=0.5)
         result = fitted(method, data, run, training)
-        print(f"best validation bound: {result.best_bound:.2f} nats a frame at step {result.best_step}")
+        print(result.best)
 
     models = {name: dvae.load(run).model for name, run in runs.items()}
     evaluation = dvae.evaluate(

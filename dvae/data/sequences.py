@@ -90,8 +90,8 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
 
         "title" lists phrases for titles. "columns" {name: unit} names the coordinates of x in their order, with units
         for tables, "" for none. In the same order, "means" are subtracted from the numbers and "scales" divide them to
-        remove units. "season" is a period of the data in frames, for a reference row. "called" gives the words for a
-        clip and a frame in tables, such as ["sequence", "step"].
+        remove units. "season" is a period of the data in steps, for a reference row. "called" gives the words for a
+        cluster of windows and for a step; by default ["sequence", "step"].
         """
 
 
@@ -100,10 +100,10 @@ def clusters(windows: Any) -> list[tuple[str, str, int]]:
     return list(getattr(windows, "clusters", None) or windows.keys)
 
 
-def axis_names(said: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the words for a clip and a frame in a description of windows."""
-    clip, frame = said.get("called", ("clip", "frame"))
-    return clip, frame
+def axis_names(metadata: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the words for a cluster of windows and for a step in a description of windows."""
+    cluster, step = metadata.get("called", ("sequence", "step"))
+    return cluster, step
 
 
 def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:
@@ -145,7 +145,7 @@ class Sequences:
     def _check(self, name: str, value: Tensor) -> None:
         if value.ndim not in (2, 3):
             raise ValueError(
-                f"{name} has shape {tuple(value.shape)}; a local variable is (sequences, frames, features), "
+                f"{name} has shape {tuple(value.shape)}; a local variable is (sequences, steps, features), "
                 "a static one (sequences, features)"
             )
         lengths, mask = self.batch.lengths, self.batch.mask(name)
@@ -369,7 +369,7 @@ def sequences(data: Any) -> Sequences:
         x, mask = unmasked(data)
         if x.ndim != 3:
             raise ValueError(
-                f"x has shape {tuple(x.shape)}, expected (sequences, frames, features); a single sequence is "
+                f"x has shape {tuple(x.shape)}, expected (sequences, steps, features); a single sequence is "
                 "x[None], and windows of a long one are dvae.tables.PanelData.of(x, cut=...).windows('train')"
             )
         return Sequences(Batch({"x": x} if mask is None else {"x": x, "mask": mask}).map(tensor_of))
@@ -455,26 +455,27 @@ class ArrayWindows:
 
     Args:
         x: `(N, T, D)`, tensor or numpy array, which may be mapped, or masked (`numpy.ma`).
-        observed: number of frames that the model sees; it predicts the other T - observed.
-        clips: name of the clip that each window was cut from; without names, windows count as independent.
+        observed: number of steps that the model sees; it predicts the other T - observed.
+        groups: name of the group of each window, such as the recording that it was cut from; errors are clustered by
+            group. Without names, windows count as independent sequences.
         mask: `(N, T, D)`, True where an entry was observed; None if all were.
         columns: {name: unit} of the D coordinates, "" for no unit; tables print them.
-        season: period of the data, in frames.
+        season: period of the data, in steps.
 
     Raises:
         TypeError: if `observed` is not an integer.
-        ValueError: if x is not `(N, T, D)`, no steps remain to predict, the shape of the mask or the number of clip
+        ValueError: if x is not `(N, T, D)`, no steps remain to predict, the shape of the mask or the number of group
             names or columns is wrong, or the season is below 1.
 
     Example:
-        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=5, clips=["a", "a", "a", "b", "b", "b"])
+        >>> windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=5, groups=["a", "a", "a", "b", "b", "b"])
         >>> windows.all()["x"].shape, windows.keys[0]
         (torch.Size([6, 8, 2]), ('array', 'a', 0))
     """
 
     x: Tensor | np.ndarray
     observed: int
-    clips: Sequence[str] | None = None
+    groups: Sequence[str] | None = None
     mask: Tensor | np.ndarray | None = None
     columns: Mapping[str, str] | None = None
     season: int | None = None
@@ -497,28 +498,32 @@ class ArrayWindows:
             raise ValueError(
                 f"the mask has shape {tuple(self.mask.shape)}, expected the shape of x, {tuple(self.x.shape)}"
             )
-        if self.clips is not None and len(self.clips) != len(self.x):
-            raise ValueError(f"{len(self.x)} windows need one clip name each, got {len(self.clips)}")
+        if self.groups is not None and len(self.groups) != len(self.x):
+            raise ValueError(f"{len(self.x)} windows need one group name each, got {len(self.groups)}")
         if self.columns is not None and len(self.columns) != self.x.shape[2]:
             raise ValueError(f"{self.x.shape[2]} coordinates need one column name each, got {', '.join(self.columns)}")
         if self.season is not None and self.season < 1:
-            raise ValueError(f"season must be at least 1 frame, got {self.season}")
+            raise ValueError(f"season must be at least 1 step, got {self.season}")
 
     @property
     def protocol(self) -> ArrayProtocol:
-        """Number of observed frames."""
+        """Number of observed steps."""
         return ArrayProtocol(self.observed)
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
-        """(split, clip, first frame) of every window; the first frame is unknown here and 0."""
-        clips = self.clips if self.clips is not None else range(len(self.x))
-        return [("array", str(clip), 0) for clip in clips]
+        """(split, group, first step) of every window; the first step is unknown here and 0."""
+        groups = self.groups if self.groups is not None else range(len(self.x))
+        return [("array", str(group), 0) for group in groups]
 
     @property
     def description(self) -> dict[str, Any]:
-        """Columns and season, if they were given."""
-        description = {"columns": None if self.columns is None else dict(self.columns), "season": self.season}
+        """Columns and season, and the word for a group, if they were given."""
+        description: dict[str, Any] = {
+            "columns": None if self.columns is None else dict(self.columns),
+            "season": self.season,
+            "called": None if self.groups is None else ["group", "step"],
+        }
         return {name: value for name, value in description.items() if value is not None}
 
     @property

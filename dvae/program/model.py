@@ -88,8 +88,8 @@ class DynamicalVAE(nn.Module):
     """Names of batch entries that are not variables, but that `penalties` reads."""
     forks: ClassVar[bool] = True
     """Whether a forecast continues each row once per draw; a subclass may use `draws` differently."""
-    per: str = "frame"
-    """Unit of one log-likelihood: "frame" or "window"."""
+    per: str = "step"
+    """Unit of one log-likelihood: "step", "frame" or "window"."""
 
     @serialized
     @torch.inference_mode(False)  # keeps parameters trainable if the model is built in inference mode

@@ -71,7 +71,7 @@ def predictive_bound(
         if particles < 1 or not first <= observed < length:
             context_frames = model.view.past
             raise ValueError(
-                f"expected at least 1 particle, and observed frames from {context_frames + first} to "
+                f"expected at least 1 particle, and observed steps from {context_frames + first} to "
                 f"{context_frames + length - 1}; got {particles} and {context_frames + observed}"
             )
         log_det = torch.zeros(size, length) if data.log_det is None else data.log_det

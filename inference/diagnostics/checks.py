@@ -91,7 +91,7 @@ STATISTICS = {
     "mean": Statistic(lambda x: mean_of_known(x, (-2, -1))),
     "scale": Statistic(_scale),
     "roughness": Statistic(_roughness),
-    "correlation length": Statistic(_correlation_length, "frames"),
+    "correlation length": Statistic(_correlation_length, "steps"),
     "lag-1 correlation": Statistic(_persistence),
     "zeros": Statistic(_zeros, "share"),
     "smallest": Statistic(_smallest),
@@ -100,7 +100,7 @@ STATISTICS = {
 """Statistics for any sequences, of observed numbers:
 
 "mean": mean of all numbers. "scale": standard deviation over time. "roughness": root mean square difference of
-successive frames. Both are root mean squares over coordinates. "correlation length": lag at which the autocorrelation,
+successive steps. Both are root mean squares over coordinates. "correlation length": lag at which the autocorrelation,
 pooled over coordinates, falls below 1/e, or T if it never does. "lag-1 correlation": autocorrelation at a lag of 1, and
 1 for a constant sequence. For counts or positive data, "zeros" is the share of zeros, and "smallest" and "largest" are
 the extremes.
@@ -378,7 +378,7 @@ def predictive_checks(
     for each in models.values():
         require_likelihood(each)
     truth = eval_windows.batch.mask_to_nan()
-    _, frame = axis_names(windows.description)
+    _, step = axis_names(windows.description)
     firsts = {"forecast": eval_windows.observed - min(_SEAM, eval_windows.observed), "posterior": 0}
     checks: dict[str, dict[str, dict[str, Check]]] = {label: {} for label in models}
     with progress_bar(progress) as bar:
@@ -403,7 +403,7 @@ def predictive_checks(
                 for name, statistic in statistics.items():
                     values, replicated = real[name], torch.cat([part[name] for part in parts], 1)
                     mask = defined[name]
-                    unit = statistic.unit.replace("frame", frame)
+                    unit = statistic.unit.replace("step", step)
                     checks[label].setdefault(program, {})[name] = Check(
                         values[mask].numpy(), replicated[:, mask].numpy(), unit
                     )
@@ -453,7 +453,7 @@ def _measure(
         undefined = values[name].isnan() & x.isnan().any(-1).any(-1) if defined is None else ~defined[name]
         if not (values[name].isfinite() | undefined).all() or (defined is None and undefined.all()):
             error = ValueError if defined is None else FloatingPointError
-            raise error(f"the statistic {name} is not finite on {source} of {x.shape[-2]} frames")
+            raise error(f"the statistic {name} is not finite on {source} of {x.shape[-2]} steps")
     return values
 
 

@@ -404,29 +404,30 @@ class Comparison(Result):
 
     @property
     def _words(self) -> tuple[str, str, str]:
-        """Words for a scored sequence, for a cluster, and for a frame."""
+        """Words for a scored sequence, for a cluster, and for a step."""
         clip, frame = axis_names(self.data)
         if self.protocol.get("observed", 0) is None:
             return "whole sequence", clip, frame
-        return "window" if "called" in self.data else "sequence", clip, frame
+        return "window" if "called" in self.data and clip != "clip" else "sequence", clip, frame
 
     def _title(self) -> str:
         unit, clip, _ = self._words
         parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {unit}s"]
-        parts[-1] += "" if unit == f"whole {clip}" else f" of {len(set(self._clips))} {clip}s"
+        parts[-1] += "" if unit.endswith(clip) else f" of {len(set(self._clips))} {clip}s"
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)
 
     def _bound_table(self) -> Table:
         unit, clip, frame = self._words
+        clustered = "" if unit.endswith(clip) else f" (clustered by {clip})"
         bounds = (f"IWAE bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
         filters = [f"FIVO bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
         table = _table(
             f"{self._title()}\nteacher-forced, nats a {frame}",
             "\n".join(
                 [
-                    f"mean ± standard error over {unit}s (clustered by {clip}) ± over seeds",
+                    f"mean ± standard error over {unit}s{clustered} ± over seeds",
                     "95 %: from both, by Student's t, in brackets its degrees of freedom",
                     *([] if self.samples else self.notes),
                     *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),

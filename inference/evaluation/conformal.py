@@ -5,8 +5,8 @@ calibration windows. A band m ± q v, with q a quantile of these distances, cont
 given level, if both are exchangeable (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, arXiv 1604.04173). A band
 simultaneously contains
 
-    a single number         s = |y_td - m_td| / v_td         a factor for each frame t and coordinate d
-    a frame                 s = max over d                   a factor for each frame
+    a single number         s = |y_td - m_td| / v_td         a factor for each step t and coordinate d
+    a step                  s = max over d                   a factor for each step
     the whole future        s = max over t and d             one factor
 
 Windows of a clip depend on each other; clips are exchangeable. The quantile is from hierarchical conformal prediction
@@ -43,7 +43,7 @@ from .scores import Measure, clip_means
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-REGIONS: Mapping[str, tuple[int, ...]] = {"number": (), "frame": (-1,), "future": (-2, -1)}
+REGIONS: Mapping[str, tuple[int, ...]] = {"number": (), "step": (-1,), "future": (-2, -1)}
 """Regions that a band contains simultaneously, with the dimensions of (..., H, D) that are maximised over."""
 
 
@@ -53,7 +53,7 @@ class PredictionBands(Result):
 
     Attributes:
         level: share of windows whose future the bands contain.
-        factors: half the width of the band over the spread, by region: "number" (H, D), "frame" (H, 1) or "future" (1,
+        factors: half the width of the band over the spread, by region: "number" (H, D), "step" (H, 1) or "future" (1,
             1).
         spread: spread (H, D), in the unit of the data; None for the standard deviation of a window's forecasts.
         samples: K, number of forecasts of a window.
@@ -85,8 +85,8 @@ class PredictionBands(Result):
 
         Args:
             forecasts: forecasts `(K, B, H, D)` of a model or reference.
-            region: region that a band contains with probability `level`: "number" for each number separately, "frame"
-                for all numbers of a frame, or "future" for the whole future.
+            region: region that a band contains with probability `level`: "number" for each number separately, "step"
+                for all numbers of a step, or "future" for the whole future.
 
         Returns:
             Lower and upper end, `(B, H, D)` each.
@@ -186,7 +186,7 @@ class PredictionBands(Result):
         )
 
     def table(self) -> Table:
-        """Return a table of factors: mean over frames and coordinates, smallest and largest."""
+        """Return a table of factors: mean over steps and coordinates, smallest and largest."""
         clip, frame = axis_names(self.data)
         title = f"bands of {100 * self.level:g} % · {self.data['windows']} windows of {self.clips} {clip}s"
         table = Table(
@@ -195,7 +195,7 @@ class PredictionBands(Result):
         )
         for column in ("region", "factor", "smallest", "largest"):
             table.add_column(column, justify="left" if column == "region" else "right")
-        region_labels = {"number": "each number", "frame": f"each {frame}", "future": "the whole future"}
+        region_labels = {"number": "each number", "step": f"each {frame}", "future": "the whole future"}
         for region, factor in self.factors.items():
             table.add_row(
                 region_labels[region], *(f"{value:.2f}" for value in (factor.mean(), factor.min(), factor.max()))
@@ -281,7 +281,7 @@ def conformal_bands(
         >>> windows = dvae.ArrayWindows(torch.randn(40, 8, 2), observed=4)
         >>> bands = dvae.conformal_bands(model, windows, level=0.9, samples=20, progress=False)
         >>> {region: factor.shape for region, factor in bands.factors.items()}
-        {'number': (4, 2), 'frame': (4, 1), 'future': (1, 1)}
+        {'number': (4, 2), 'step': (4, 1), 'future': (1, 1)}
     """
     eval_windows = prepare_windows(windows)
     windows, (clip, _) = eval_windows.windows, axis_names(eval_windows.windows.description)

@@ -277,7 +277,7 @@ class _Evaluator:
         bounds = {"log score": LOG_SCORE, **TEACHER_FORCED, **dict.fromkeys(latents, KL)}
         order = {measure.name: measure.metric for measure in self.measures}
         order |= {
-            name: dataclasses.replace(each, unit=each.unit.replace("frame", frame)) for name, each in bounds.items()
+            name: dataclasses.replace(each, unit=each.unit.replace("step", frame)) for name, each in bounds.items()
         }
         return {name: metric for name, metric in order.items() if name in names}
 

@@ -165,7 +165,9 @@ def confidence_set(
         )
     clips = _check(contenders)
     if clips < 2:
-        raise ValueError("all windows are of one clip, so no error over clips exists; pass more clips")
+        raise ValueError(
+            "all windows belong to one cluster, so no error over clusters exists; evaluate on more sequences"
+        )
     means = np.array([row.mean for row in rows]) * (1 if better == "lower" else -1)
     deviations = np.stack([row.deviations for row in rows]) * math.sqrt(clips / (clips - 1))
     between, rest = (
@@ -204,7 +206,7 @@ def _check(rows: Mapping[str, TwoWayErrors]) -> int:
     """
     counts = {name: len(row.deviations) for name, row in rows.items()}
     if len(set(counts.values())) > 1:
-        raise ValueError(f"scores to compare must be on the same clips, but their numbers of clips are {counts}")
+        raise ValueError(f"scores to compare must be on the same windows, but their numbers of clusters are {counts}")
     for name, row in rows.items():
         if not (math.isfinite(row.mean) and np.isfinite(row.deviations).all()):
             raise ValueError(f"the score of {name} is not finite: its mean is {row.mean}")
@@ -213,14 +215,15 @@ def _check(rows: Mapping[str, TwoWayErrors]) -> int:
 
 @dataclass(frozen=True, repr=False)
 class Requirement(Displayed):
-    """Numbers of seeds and clips needed to distinguish two models.
+    """Numbers of seeds and clusters needed to distinguish two models.
 
     Attributes:
         difference: difference to detect.
         power: probability of detecting it.
         level: level of the two-sided interval that must exclude 0.
-        clips: number of clips for each number of training seeds per model; infinite if no number is enough.
-        now: present numbers of clips and of each model's seeds.
+        clusters: number of clusters of windows (clips, groups or sequences) for each number of training seeds per
+            model; infinite if no number is enough.
+        now: present numbers of clusters and of each model's seeds.
         achieved: power with the present numbers. For the measured difference it follows from the p-value and adds no
             information.
     """
@@ -228,22 +231,22 @@ class Requirement(Displayed):
     difference: float
     power: float
     level: float
-    clips: dict[int, float]
+    clusters: dict[int, float]
     now: tuple[int, int, int]
     achieved: float
 
     def table(self) -> Table:
         """Return a table with a row for each number of seeds."""
-        clips, *seeds = self.now
+        clusters, *seeds = self.now
         table = Table(
             title=f"to detect a difference of {number(self.difference, 4)} with a power of {100 * self.power:g} %",
-            caption=f"power with {clips} clips and {' and '.join(map(_seeds, seeds))}: {100 * self.achieved:.0f} %, at "
-            f"a level of {100 * self.level:g} %",
+            caption=f"power with {clusters} clusters and {' and '.join(map(_seeds, seeds))}: "
+            f"{100 * self.achieved:.0f} %, at a level of {100 * self.level:g} %",
         )
-        for name in ("seeds per model", "clips"):
+        for name in ("seeds per model", "clusters"):
             table.add_column(name, justify="right")
-        for count, n_clips in self.clips.items():
-            table.add_row(str(count), f"{n_clips:.0f}" if math.isfinite(n_clips) else "no number is enough")
+        for count, n_clusters in self.clusters.items():
+            table.add_row(str(count), f"{n_clusters:.0f}" if math.isfinite(n_clusters) else "no number is enough")
         return table
 
 
@@ -286,7 +289,7 @@ def required(
     sought = abs(measured.mean if difference is None else difference)
     if math.isnan(measured.total) or not 0 < sought < math.inf:
         raise ValueError(
-            "both models need at least two seeds and two clips, and a finite difference that is not 0; got "
+            "both models need at least two seeds and two clusters, and a finite difference that is not 0; got "
             f"{sought}, with a standard error of {measured.total}"
         )
     rows = (first, second)

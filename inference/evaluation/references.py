@@ -104,7 +104,7 @@ def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = 
     """
     frames = observed.shape[1]
     if not 1 <= season <= frames:
-        raise ValueError(f"season must be between 1 and the {frames} observed frames, got {season}")
+        raise ValueError(f"season must be between 1 and the {frames} observed steps, got {season}")
     last = interpolate_missing(observed, mask)[:, -season:]
     if mask is not None:
         periods = frames // season * season
@@ -154,7 +154,7 @@ def nearest_neighbours(
     frames, size = observed.shape[1:]
     if training.ndim != 3 or training.shape[2] != size or training.shape[1] <= frames:
         raise ValueError(
-            f"training windows must be (N, T, {size}) with T above the {frames} observed frames, got shape "
+            f"training windows must be (N, T, {size}) with T above the {frames} observed steps, got shape "
             f"{tuple(training.shape)}"
         )
     if len(training) < samples:
@@ -171,7 +171,7 @@ class References:
 
     | name | forecasts | needs |
     |---|---|---|
-    | last value | the last frame repeated | |
+    | last value | the last observed values repeated | |
     | seasonal | the last period repeated | a season that was observed |
     | mean | the mean of every column in the training windows, at all frames | training windows |
     | climatology | K futures of training windows, drawn at random for each window | training windows |
@@ -215,7 +215,7 @@ class References:
             return "" if self.training is not None else "training windows"
         if name == "seasonal" and not 1 <= (self._period or 0) <= self.held.observed:
             got = f", got {self._period}" if self._period else ""
-            return f"a season between 1 and the {self.held.observed} observed frames{got}"
+            return f"a season between 1 and the {self.held.observed} observed steps{got}"
         return ""
 
     def __getitem__(self, name: str) -> tuple[int, Forecaster]:

@@ -7,8 +7,8 @@ is a function of the evaluated windows:
     dvae.evaluate(model, windows, scores=lambda windows: [*proper(windows), speed])
 
 `proper` returns proper scoring rules, and `calibrated` adds coverage, sharpness, PIT and TARP, for data of any kind.
-`by_column` scores each column separately, in its own unit, `by_frame` scores single frames, and `over_horizon` assesses
-calibration at single frames. Bounds, k-hat, KL and the log score need the model instead of forecasts; `dvae.evaluate`
+`by_column` scores each column separately, in its own unit, `by_step` scores single steps, and `over_horizon` assesses
+calibration at single steps. Bounds, k-hat, KL and the log score need the model instead of forecasts; `dvae.evaluate`
 has options for them.
 """
 
@@ -44,13 +44,13 @@ class Metric:
     partial: bool = False
 
 
-LOG_SCORE = Metric("nats/frame", "free-running", "higher")
+LOG_SCORE = Metric("nats/step", "free-running", "higher")
 TEACHER_FORCED = {
-    "ELBO": Metric("nats/frame", "teacher-forced", "higher"),
-    "IWAE bound": Metric("nats/frame", "teacher-forced", "higher"),
+    "ELBO": Metric("nats/step", "teacher-forced", "higher"),
+    "IWAE bound": Metric("nats/step", "teacher-forced", "higher"),
     "k-hat": Metric("", "teacher-forced"),
 }
-KL = Metric("nats/frame", "teacher-forced", "")
+KL = Metric("nats/step", "teacher-forced", "")
 
 
 def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
@@ -237,9 +237,9 @@ def calibrated(windows: HeldOutWindows) -> list[Measure]:
 def tarp(windows: HeldOutWindows, seed: int = 0) -> Measure:
     """Return TARP of whole futures (`metrics.tarp_histogram`), one number per window, as a histogram.
 
-    The reference point of a window repeats its last observed frame (or last observed values), with a normal step added
-    at every frame and number, drawn from `seed`. It depends on the past and on no forecast, so the score also detects
-    forecasts that ignore the past. Steps and distances are in standard deviations of each column's observed frames.
+    The reference point of a window repeats its last observed step (or last observed values), with a normal step added
+    at every step and number, drawn from `seed`. It depends on the past and on no forecast, so the score also detects
+    forecasts that ignore the past. Steps and distances are in standard deviations of each column's observed steps.
     """
     batch, observed = Batch(windows.all()), windows.protocol.observed
     past = batch.mask_to_nan()[:, :observed].double()
@@ -296,33 +296,33 @@ def by_column(measure: Measure, columns: Mapping[str, str]) -> list[Measure]:
     ]
 
 
-def by_frame(measure: Measure, frames: Sequence[int], frame: str = "frame") -> list[Measure]:
-    """Return a score for single frames of the future, named like "PIT, frame 30", for `Evaluation.plot_horizon`.
+def by_step(measure: Measure, steps: Sequence[int], step: str = "step") -> list[Measure]:
+    """Return a score for single steps of the future, named like "PIT, step 30", for `Evaluation.plot_horizon`.
 
     Args:
-        measure: score for any number of frames.
-        frames: frames to score; the first of the future is 1.
-        frame: word for a frame.
+        measure: score for any number of steps.
+        steps: steps to score; the first of the future is 1.
+        step: word for a step.
 
     Raises:
-        ValueError: when a frame is beyond the future.
+        ValueError: when a step is beyond the future.
 
     Example:
-        >>> [each.name for each in by_frame(CRPS, (1, 30))]
-        ['CRPS, frame 1', 'CRPS, frame 30']
+        >>> [each.name for each in by_step(CRPS, (1, 30))]
+        ['CRPS, step 1', 'CRPS, step 30']
     """
 
-    def frame_measure(place: int) -> Measure:
+    def step_measure(place: int) -> Measure:
         def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
             if not 1 <= place <= truth.shape[-2]:
                 raise ValueError(
-                    f"{frame}s must be between 1 and {truth.shape[-2]}, the length of the future; got {place}"
+                    f"{step}s must be between 1 and {truth.shape[-2]}, the length of the future; got {place}"
                 )
             return measure.function(forecasts[..., place - 1 : place, :], truth[..., place - 1 : place, :], past, index)
 
         return _part(measure, function, lambda truth: truth[..., place - 1 : place, :])
 
-    return [replace(frame_measure(place), name=f"{measure.name}, {frame} {place}") for place in frames]
+    return [replace(step_measure(place), name=f"{measure.name}, {step} {place}") for place in steps]
 
 
 def _part(
@@ -339,18 +339,18 @@ def _part(
     return replace(measure, function=part_score, pool=pool)
 
 
-def over_horizon(windows: HeldOutWindows, frames: Sequence[int] | None = None) -> list[Measure]:
-    """Return scores of calibration of the whole future and of single frames, as in `calibrated`.
+def over_horizon(windows: HeldOutWindows, steps: Sequence[int] | None = None) -> list[Measure]:
+    """Return scores of calibration of the whole future and of single steps, as in `calibrated`.
 
     Args:
         windows: evaluated windows.
-        frames: frames of the future, from 1; by default six, evenly spread from the first to the last.
+        steps: steps of the future, from 1; by default six, evenly spread from the first to the last.
     """
     horizon = windows.all()["x"].shape[1] - windows.protocol.observed
-    frames = frames or sorted({round(place) for place in np.linspace(1, horizon, 6)})
-    _, frame = axis_names(windows.description)
+    steps = steps or sorted({round(place) for place in np.linspace(1, horizon, 6)})
+    _, step = axis_names(windows.description)
     measures = [*map(coverage_at, (0.5, 0.8, 0.9)), PIT]
-    return [*calibrated(windows), *(each for measure in measures for each in by_frame(measure, frames, frame))]
+    return [*calibrated(windows), *(each for measure in measures for each in by_step(measure, steps, step))]
 
 
 Scores = Callable[[HeldOutWindows], Sequence[Measure]]

@@ -377,9 +377,7 @@ def test_a_method_with_a_custom_objective_resumes(people, tmp_path, monkeypatch)
 
 
 def test_scheduled_sampling_is_an_option_of_the_method(people, tmp_path):
-    with pytest.raises(
-        ValueError, match=r"pass it to the method: dvae\.method\(…, scheduled_sampling=…\)"
-    ):
+    with pytest.raises(ValueError, match=r"pass it to the method: dvae\.method\(…, scheduled_sampling=…\)"):
         dvae.fit(
             dvae.method("vrnn"),
             MotionData.open(people),

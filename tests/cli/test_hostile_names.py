@@ -38,7 +38,7 @@ def models():
 @pytest.fixture(scope="module")
 def windows():
     clips = [f"[/{n}]" for n in range(6)]
-    return ArrayWindows(torch.randn(6, 5, 3, generator=torch.Generator().manual_seed(0)), 2, clips=clips)
+    return ArrayWindows(torch.randn(6, 5, 3, generator=torch.Generator().manual_seed(0)), 2, groups=clips)
 
 
 def console_output(renderable):

@@ -214,7 +214,7 @@ def test_a_report_of_whole_sequences_has_no_futures(table, tmp_path, capsys):
     data = PanelData.open(str(table), cut=Cut())
     training = dvae.Training(steps=2, batch_size=4, validate_every=2)
     fit = dvae.fit(dvae.method("vae", latent=2, warm_up=1), data, out=run, **vars(training))
-    assert re.fullmatch(r"best bound -\d+\.\d+ nats a step at step 2", fit.best)
+    assert re.fullmatch(r"best bound -\d+\.\d+ nats a step at training step 2", fit.best)
     assert main(["report", run, "--out", str(page), "--particles", "2", "--bound-windows", "2"]) == 0
     text = page.read_text()
     assert "cannot be shown" not in text

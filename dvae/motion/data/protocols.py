@@ -159,6 +159,7 @@ class Poses(Schema):
     """
 
     kind: ClassVar[str] = "poses"
+    per: ClassVar[str] = "frame"
 
     skeleton: Skeleton = field(kw_only=True)
     protocol: Protocol = field(kw_only=True)
@@ -578,7 +579,7 @@ class Windows:
     @property
     def description(self) -> dict[str, Any]:
         """Entries for a record: the joints, and those whose paths are given."""
-        description = {"joints": list(self.skeleton.names), "title": []}
+        description: dict[str, Any] = {"joints": list(self.skeleton.names), "title": [], "called": ["clip", "frame"]}
         if (given := self.given_joints) is not None:
             description |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
         return description

@@ -28,7 +28,7 @@ def bracketed():
     for parameter in model.encoder.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)
     x = model.sample(N, T)["x"]
-    windows = ArrayWindows(x, 1, clips=[f"clip {n // 3}" for n in range(N)])
+    windows = ArrayWindows(x, 1, groups=[f"clip {n // 3}" for n in range(N)])
     many = {"particles": 1000, "temperatures": 20, "chains": 4, "fitting": 100, "batch_size": N, "progress": False}
     result = bracket(model, windows, **many)
     order = torch.randperm(N, generator=torch.Generator().manual_seed(0))

@@ -67,7 +67,7 @@ def test_the_bounds_lie_in_order_below_the_evidence():
 
 def test_scores_are_those_of_an_evaluation_on_the_same_windows():
     model = build()
-    windows = ArrayWindows(draws(model, 12), 3, clips=[f"clip {i // 3}" for i in range(12)])
+    windows = ArrayWindows(draws(model, 12), 3, groups=[f"clip {i // 3}" for i in range(12)])
     result = run({"a": model}, windows, samples=4, seed=3, particles=32)
     same = {"samples": 4, "seed": 3, "bound_particles": 32, "references": False, "progress": False}
     expected = evaluate({"a": model}, windows, scores=motion.displacements, **same)["a"]
@@ -206,7 +206,7 @@ def test_a_bound_that_is_not_finite_names_model_and_sequence():
 
 def test_a_comparison_is_read_back_from_json_unchanged(fitted, tmp_path):
     models, x = fitted
-    windows = ArrayWindows(x, 3, clips=["a"] * 12 + ["b"] * 12)
+    windows = ArrayWindows(x, 3, groups=["a"] * 12 + ["b"] * 12)
     result = run(models, windows, samples=2, particles=4, configs={"dkf": {"latent": 1}})
     result.save(tmp_path / "comparison.json")
     again = Comparison.load(tmp_path / "comparison.json")

@@ -12,7 +12,7 @@ from dvae import ArrayWindows
 from dvae.inference.evaluation.conformal import PredictionBands, conformal_bands, quantile
 from dvae.inference.evaluation.evaluate import evaluate
 from dvae.inference.evaluation.metrics import pit_histogram, tarp_histogram
-from dvae.inference.evaluation.scores import PIT, by_frame, calibrated, over_horizon, tarp
+from dvae.inference.evaluation.scores import PIT, by_step, calibrated, over_horizon, tarp
 
 
 def draw(*shape, seed=0):
@@ -76,7 +76,7 @@ def fitted():
     mask = torch.rand(x.shape, generator=torch.Generator().manual_seed(1)) < 0.8
     mask[:, :2], mask[:, 5, 0] = True, True
     clips = [str(n // 2) for n in range(500)]
-    return model, *(ArrayWindows(x[start::2], 2, mask=mask[start::2], clips=clips) for start in (0, 1))
+    return model, *(ArrayWindows(x[start::2], 2, mask=mask[start::2], groups=clips) for start in (0, 1))
 
 
 class Narrow(torch.nn.Module):
@@ -100,12 +100,12 @@ def test_bands_of_exact_forecasts_have_their_coverage_and_narrow_ones_less(fitte
     for each, right in ((model, True), (Narrow(model), False)):
         bands = conformal_bands(each, calibration, samples=30, progress=False)
         coverage = bands.coverage(each, new, progress=False)["model"]
-        for region in ("number", "frame", "future"):
+        for region in ("number", "step", "future"):
             held_share, expected_share = (coverage[f"{word} 90 %, {region}"] for word in ("held", "said"))
             # calibration and evaluation have equally many clips, and so equally large errors
             assert abs(held_share.mean - 0.9) < 4 * math.sqrt(2) * held_share.standard_error, region
             assert (abs(expected_share.mean - 0.9) < 5 * expected_share.standard_error) == right, region
-        widths = [coverage[f"width held 90 %, {region}"].mean for region in ("number", "frame", "future")]
+        widths = [coverage[f"width held 90 %, {region}"].mean for region in ("number", "step", "future")]
         assert widths == sorted(widths)
 
 
@@ -121,7 +121,7 @@ def test_stored_bands_are_put_around_forecasts(fitted, tmp_path):
         lower, upper = again.apply(forecasts, region)
         torch.testing.assert_close((upper - lower) / 2, torch.from_numpy(factor) * forecasts.std(0))
         torch.testing.assert_close((upper + lower) / 2, forecasts.mean(0))
-    assert "bands of 80 % · 500 windows of 250 clips" in str(again)
+    assert "bands of 80 % · 500 windows of 250 groups" in str(again)
     assert again.plot()._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(ValueError, match="bands"):
         bands.apply(forecasts, "futures")
@@ -129,7 +129,7 @@ def test_stored_bands_are_put_around_forecasts(fitted, tmp_path):
         bands.apply(forecasts[:19])
     document = bands.document()
     shapes = document["attributes"]
-    for change in ({"level": 2}, {"factors": {**shapes["factors"], "frame": [1, 1]}}):
+    for change in ({"level": 2}, {"factors": {**shapes["factors"], "step": [1, 1]}}):
         with pytest.raises(ValueError, match="written"):
             PredictionBands.of({**document, "attributes": shapes | change})
 
@@ -187,7 +187,7 @@ def test_calibration_is_computed_and_drawn_for_every_frame_of_the_horizon(fitted
     assert outside == [False, False, False, True]
     figure = result.plot_horizon()
     assert [axes.get_title() for axes in figure.axes][:4] == ["frame 1", "frame 2", "frame 3", "frame 4"]
-    with pytest.raises(ValueError, match="frames must be between 1 and 4"):
-        by_frame(PIT, [6], "frame")[0].function(draw(8, 19, 4, 2), draw(8, 4, 2), {}, torch.arange(8))
+    with pytest.raises(ValueError, match="steps must be between 1 and 4"):
+        by_step(PIT, [6])[0].function(draw(8, 19, 4, 2), draw(8, 4, 2), {}, torch.arange(8))
     with pytest.raises(KeyError, match="evaluate with"):
         replace(result, rows={}).plot_horizon()

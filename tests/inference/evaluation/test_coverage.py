@@ -90,7 +90,7 @@ def truth():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         x = model.sample(300, 6)["x"]
-    return model, ArrayWindows(x, 1, clips=[str(n // 3) for n in range(300)], columns={"speed": "m/s", "load": "m/s"})
+    return model, ArrayWindows(x, 1, groups=[str(n // 3) for n in range(300)], columns={"speed": "m/s", "load": "m/s"})
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ def draw(*shape, seed=0):
 
 def array_windows(count=12, clips=None, **options):
     clips = [f"clip_{i // 3}" for i in range(count)] if clips is None else clips
-    return ArrayWindows(draw(count, FRAMES, SIZE).cumsum(1), OBSERVED, clips=clips, **options)
+    return ArrayWindows(draw(count, FRAMES, SIZE).cumsum(1), OBSERVED, groups=clips, **options)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,7 @@ def evaluation(values, clips):
     """Evaluate zero velocity on windows whose final errors are `values`, of the given clips."""
     x = torch.zeros(len(values), 2, 1, dtype=torch.float64)
     x[:, 1, 0] = torch.as_tensor(values)
-    return run({}, ArrayWindows(x, 1, clips=clips))
+    return run({}, ArrayWindows(x, 1, groups=clips))
 
 
 def test_independent_windows_have_the_standard_error_of_a_mean():
@@ -192,7 +192,7 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
     assert f"{single_truths} of 12 have no other" in str(result)
     assert again.rows["dkf"].config == {"width": 8}
     assert again.rows["dkf"].equations["generative"] == model.generative.text
-    assert (again.metrics["ELBO"].program, again.metrics["ELBO"].unit) == ("teacher-forced", "nats/frame")
+    assert (again.metrics["ELBO"].program, again.metrics["ELBO"].unit) == ("teacher-forced", "nats/step")
     scores = json.loads(result.to_json())["summary"]["dkf"]
     assert scores["ELBO"]["mean"] == result["dkf"]["ELBO"].mean
     assert scores["k-hat"]["mean"] is None  # three particles have no tail
@@ -206,7 +206,7 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
 def test_table_and_plot_show_every_method_and_metric(model):
     result = run({"dkf": model}, array_windows())
     text = str(result)
-    for part in ("last value", "dkf", "K = 5", "K = 1", "teacher-forced", "KL z", "±", "12 windows of 4 clips"):
+    for part in ("last value", "dkf", "K = 5", "K = 1", "teacher-forced", "KL z", "±", "12 windows of 4 groups"):
         assert part in text
     assert str(result["dkf"]["ADE"]) in text
     panels = [axes.get_title() for axes in result.plot().axes if axes.axison]
@@ -261,7 +261,7 @@ def still(windows, *measures, **options):
 
 def test_a_score_gets_forecasts_truth_past_and_indices():
     x = draw(9, 6, 2)
-    windows = ArrayWindows(x, 4, clips=list("aaabbbccc"))
+    windows = ArrayWindows(x, 4, groups=list("aaabbbccc"))
     calls = []
 
     def function(forecasts, truth, past, index):
@@ -280,7 +280,7 @@ def test_a_score_gets_forecasts_truth_past_and_indices():
 
 
 def test_a_score_of_the_whole_set_may_skip_clips():
-    windows = ArrayWindows(draw(6, 3, 1), 2, clips=list("aabbcc"))
+    windows = ArrayWindows(draw(6, 3, 1), 2, groups=list("aabbcc"))
 
     def most(values, clips):
         assert values.shape == (6, 2)

@@ -57,8 +57,8 @@ def test_the_set_includes_the_best_models_at_its_level_and_excludes_worse_ones(o
 def test_more_clips_do_not_replace_seeds():
     rows = draw_scores(np.random.default_rng(7), [0.0, 0.1], of_seeds=2.0, rest=0.1)
     required_sizes = required(rows["m0"], rows["m1"], seeds=(2, 10_000))
-    assert math.isinf(required_sizes.clips[2])
-    assert math.isfinite(required_sizes.clips[10_000])
+    assert math.isinf(required_sizes.clusters[2])
+    assert math.isfinite(required_sizes.clusters[10_000])
     assert "no number is enough" in rendered(required_sizes.table())
     assert required_sizes.achieved < 0.5
 
@@ -70,7 +70,7 @@ def test_power_with_one_source_of_error_equals_the_textbook_formula():
     first, second = (replace(row, seeds=0.0, rest=0.0, count=sys.maxsize) for row in (first, second))
     sought, scale = 0.5, first.estimate(second).sequences * math.sqrt(30)
     required_sizes = required(first, second, difference=sought)
-    clips = int(required_sizes.clips[2])
+    clips = int(required_sizes.clusters[2])
 
     def power(n):
         beyond, shift = stats.t.ppf(0.975, n - 1), sought / scale * math.sqrt(n)
@@ -84,7 +84,7 @@ def test_tables_name_the_result():
     text = rendered(pairs(rows).table())
     assert all(word in text for word in ("m0", "m1", "Holm"))
     assert "no" in rendered(confidence_set(rows, draws=100).table())
-    assert "25 clips and 3 seeds and 3 seeds" in " ".join(rendered(required(rows["m0"], rows["m1"]).table()).split())
+    assert "25 clusters and 3 seeds and 3 seeds" in " ".join(rendered(required(rows["m0"], rows["m1"]).table()).split())
 
 
 def rendered(table):

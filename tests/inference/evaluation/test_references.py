@@ -105,8 +105,8 @@ def test_references_are_selected_by_name_or_are_errors():
     assert list(run(test, references=names, training_windows=train, season=3).rows) == names
     for options, message in (
         ({"references": ["season"]}, r"no reference row 'season' \(did you mean 'seasonal'\?\); there are last"),
-        ({"references": ["seasonal"]}, "'seasonal' needs a season between 1 and the 7 observed frames$"),
-        ({"references": ["seasonal"], "season": 9}, "between 1 and the 7 observed frames, got 9"),
+        ({"references": ["seasonal"]}, "'seasonal' needs a season between 1 and the 7 observed steps$"),
+        ({"references": ["seasonal"], "season": 9}, "between 1 and the 7 observed steps, got 9"),
         ({"references": ["mean"]}, "'mean' needs training windows"),
     ):
         with pytest.raises(ValueError, match=message):

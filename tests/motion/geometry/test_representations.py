@@ -167,9 +167,7 @@ def test_data_without_rotations_are_errors(people_of_two_sizes):
 def test_bounds_of_rotations_and_positions_are_not_compared(people_of_two_sizes):
     in_rotations, positions = windows(people_of_two_sizes, representation="6d"), windows(people_of_two_sizes)
     models = {"turns": small(in_rotations), "positions": small(positions)}
-    with pytest.raises(
-        ValueError, match=r"these are of joint rotations \(6d\) for turns, of the data for positions"
-    ):
+    with pytest.raises(ValueError, match=r"these are of joint rotations \(6d\) for turns, of the data for positions"):
         dvae.compare(models, positions, particles=2, samples=0, progress=False)
     table = dvae.evaluate(models, positions, samples=2, references=False, progress=False)
     assert any("bounds of turns: densities of joint rotations (6d)" in note for note in table.notes)
