@@ -183,10 +183,10 @@ def test_calibration_is_computed_and_drawn_for_every_frame_of_the_horizon(fitted
     for frame in (1, 2, 3, 4):
         covered = row[f"coverage 90 %, frame {frame}"]
         assert (abs(covered.mean - 0.9) < 4 * covered.standard_error) == (frame < 4)
-        outside.append(leaves(result, "late", f"PIT, frame {frame}"))
+        outside.append(leaves(result, "late", f"PIT, step {frame}"))
     assert outside == [False, False, False, True]
     figure = result.plot_horizon()
-    assert [axes.get_title() for axes in figure.axes][:4] == ["frame 1", "frame 2", "frame 3", "frame 4"]
+    assert [axes.get_title() for axes in figure.axes][:4] == ["step 1", "step 2", "step 3", "step 4"]
     with pytest.raises(ValueError, match="steps must be between 1 and 4"):
         by_step(PIT, [6])[0].function(draw(8, 19, 4, 2), draw(8, 4, 2), {}, torch.arange(8))
     with pytest.raises(KeyError, match="evaluate with"):
