@@ -181,7 +181,7 @@ def test_calibration_is_computed_and_drawn_for_every_frame_of_the_horizon(fitted
     assert {*row} >= {measure.name for measure in calibrated(windows) if not measure.bins}
     outside = []
     for frame in (1, 2, 3, 4):
-        covered = row[f"coverage 90 %, frame {frame}"]
+        covered = row[f"coverage 90 %, step {frame}"]
         assert (abs(covered.mean - 0.9) < 4 * covered.standard_error) == (frame < 4)
         outside.append(leaves(result, "late", f"PIT, step {frame}"))
     assert outside == [False, False, False, True]
