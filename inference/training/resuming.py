@@ -63,8 +63,8 @@ def restore(svi: SVI, run: Run) -> None:
     stored, state, model, training = run.state, svi.state, svi.model, svi.training
     if stored["step"] > training.steps:
         raise ValueError(
-            f"steps is {training.steps}, but {run.path} has taken {stored['step']} steps already; pass the total "
-            "number of steps of the run"
+            f"steps is {training.steps}, but {run.path} has taken {stored['step']} steps already; pass the "
+            f"total number of steps of the run, at least {stored['step']}"
         )
     parts = _parts(run, run.optimiser_state(state_bytes(model, 4) + 2**20))
     last = run.read(LAST, state_bytes(model))
