@@ -86,7 +86,7 @@ notebooks: venv
 
 docs: venv
 	$(BIN)/python -c 'import furo, myst_nb' 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
-	rm -rf docs/_reference
+	rm -rf docs/reference/_generated
 	$(BIN)/sphinx-build -W --keep-going -q docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
@@ -102,4 +102,4 @@ dist: venv
 	cd build && clean/bin/python -c 'import dvae, dvae.models.family.srnn, dvae.inference.training.fit; print(dvae.__version__, dvae.__file__)'
 
 clean:
-	rm -rf .venv build dist *.egg-info demo runs docs/_build docs/_reference docs/notebooks .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist *.egg-info demo runs docs/_build docs/reference/_generated docs/notebooks .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,19 +1,22 @@
-"""How the site is made: `make docs`. The pages are those that stand here, the start page is the README."""
+"""Configuration of the site, which `make docs` builds from the pages of this folder."""
 
-import inspect
 import os
-import pkgutil
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from docutils import nodes  # noqa: E402
+from sphinx.addnodes import pending_xref  # noqa: E402
 from sphinx.application import Sphinx  # noqa: E402
+from sphinx.transforms import SphinxTransform  # noqa: E402
 
 import dvae  # noqa: E402
+from dvae.cli.app import COMMANDS  # noqa: E402
 
 project, author = "dvae", "The dvae authors"
 project_copyright = "The dvae authors, Apache License 2.0"
@@ -30,9 +33,23 @@ templates_path = ["_templates"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 
-shutil.copytree(ROOT / "notebooks", ROOT / "docs" / "notebooks", dirs_exist_ok=True)  # a site is of one folder
+# A site has one root folder, so it builds from copies of the notebooks and of two files of the repository.
+shutil.copytree(ROOT / "notebooks", ROOT / "docs" / "notebooks", dirs_exist_ok=True)
+for name in ("CONTRIBUTING", "CHANGELOG"):
+    text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+    text = text.replace("](docs/", "](../").replace("](CHANGELOG.md)", "](changelog.md)")
+    (ROOT / "docs" / "project" / f"{name.lower()}.md").write_text(text, encoding="utf-8")
 
-# Notebooks are run where they leave nothing behind, with this tree's code, and once until they change.
+# The page of the command line is the help of its commands.
+help_of = {"COLUMNS": "110", "NO_COLOR": "1", "PYTHONPATH": str(ROOT)}
+parts = ["# Command line\n\nLook up the arguments of each command; `--help-all` lists all options of `fit` and `sweep`.\n"]
+for name in COMMANDS:
+    program = [sys.executable, "-c", "import dvae.cli as c; c.main()", *name.split(), "--help"]
+    printed = subprocess.run(program, env=os.environ | help_of, capture_output=True, text=True, check=True).stdout
+    parts.append(f"\n## dvae {name}\n\n```text\n{printed.strip()}\n```\n")
+(ROOT / "docs" / "reference" / "command_line.md").write_text("".join(parts), encoding="utf-8")
+
+# Notebooks run in a temporary folder with this tree's code, and again only after a change.
 os.environ.update(PYTHONPATH=str(ROOT), OMP_NUM_THREADS="1", PYTHONWARNINGS="ignore:IProgress not found")
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "docs" / "_build" / "notebooks")
@@ -41,10 +58,6 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 1200
 nb_output_stderr = "remove"
 
-autosummary_context = {  # of the page of dvae itself
-    "names": [name for name in dvae.__all__ if not inspect.ismodule(getattr(dvae, name))],
-    "packages": [found.name for found in pkgutil.iter_modules(dvae.__path__) if found.name not in {"command", "cli"}],
-}
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"
@@ -53,49 +66,53 @@ napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 suppress_warnings = ["ref.python"]  # names of two classes
 
-# Docstrings are text, not reStructuredText: `code`, *emphasis*, examples, and indented blocks as they stand.
+# Docstrings are plain text with `code`, *emphasis*, examples and indented blocks; this converts them to reStructuredText.
 _MARKS = re.compile(
     r"`([^`]+)`(?=(\w)?)|(^ *\* |(?<![\w*])\*(?! )[^*]+(?<! )\*(?!\w))|([*|\\])|(_)(?!\w)", re.MULTILINE
 )
 
 
-def _mark(found: re.Match[str]) -> str:
-    code, letter, kept, *signs = found.groups()
+def _mark(match: re.Match[str]) -> str:
+    code, letter, unchanged, *signs = match.groups()
     if code:
         return f"``{code}``" + ("\\ " if letter else "")
-    return kept or "\\" + "".join(sign or "" for sign in signs)
+    return unchanged or "\\" + "".join(sign or "" for sign in signs)
 
 
 def _as_text(_app: object, _what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
     parts = re.split(r"(^ *>>>(?:.+\n?)+|(?<=\S\n\n)(?:    .*\n+)+)", "\n".join(lines) + "\n", flags=re.MULTILINE)
-    for place, part in enumerate(parts):
-        before, example = parts[place - 1] if place else "", part.lstrip().startswith(">>>")
-        if place % 2 == 0 or (re.search(r"(?:^|\n)(?:[A-Z]\w+:|    .*)\n*\Z", before) and not example):
-            parts[place] = _MARKS.sub(_mark, part)  # text, and what a section such as Args holds
+    for index, part in enumerate(parts):
+        before, example = parts[index - 1] if index else "", part.lstrip().startswith(">>>")
+        if index % 2 == 0 or (re.search(r"(?:^|\n)(?:[A-Z]\w+:|    .*)\n*\Z", before) and not example):
+            parts[index] = _MARKS.sub(_mark, part)  # text, and sections such as Args
         elif not example and not before.rstrip().endswith("::"):
-            parts[place] = f"::\n\n{part}\n"
+            parts[index] = f"::\n\n{part}\n"
     lines[:] = "".join(parts).split("\n")
 
 
-def _with_files(_app: object, page: str, source: list[str]) -> None:
-    """{{FILE}}, or {{FILE: SECTION}}, is what stands in a file beside this folder, with its links as seen from here.
-
-    Links of notebooks are as seen from the copies.
-    """
+def _adapt_links(_app: object, page: str, source: list[str]) -> None:
+    """Adapt the links of notebooks to their copies."""
     if page.startswith("notebooks/"):
         source[0] = source[0].replace("](../docs/", "](../")
 
-    def text(found: re.Match[str]) -> str:
-        file, _, section = found[1].partition(": ")
-        whole = (ROOT / file).read_text(encoding="utf-8")
-        if section:
-            whole = whole.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
-        return whole.replace("](docs/", "](").replace("](CHANGELOG.md)", "](changelog.md)")
 
-    source[0] = re.sub(r"^\{\{(.+)\}\}$", text, source[0], flags=re.MULTILINE)
+class LinkNames(SphinxTransform):
+    """Link names of public objects in the text of pages, such as `dvae.evaluate`, to the reference."""
+
+    default_priority = 5
+
+    def apply(self, **_: object) -> None:
+        for literal in list(self.document.findall(nodes.literal)):
+            name = literal.astext().partition("(")[0]
+            if not re.fullmatch(r"dvae(\.\w+)+", name) or isinstance(literal.parent, nodes.reference | nodes.title):
+                continue
+            link = pending_xref("", refdomain="py", reftype="obj", reftarget=name, refexplicit=True, refwarn=False)
+            literal.replace_self(link)
+            link += literal
 
 
 def setup(app: Sphinx) -> None:
-    """Connect them; docstrings before napoleon, which makes fields of Args, Returns and Raises."""
+    """Connect the conversions; docstrings before napoleon, which parses their sections."""
     app.connect("autodoc-process-docstring", _as_text, priority=400)
-    app.connect("source-read", _with_files)
+    app.connect("source-read", _adapt_links)
+    app.add_transform(LinkNames)

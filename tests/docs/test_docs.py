@@ -1,5 +1,6 @@
-"""Pages of the documentation: their examples run from first to last, and their links and names exist."""
+"""Pages: their examples run, their commands parse, and their links and names exist."""
 
+import functools
 import pkgutil
 import re
 import shlex
@@ -7,30 +8,60 @@ from pathlib import Path
 
 import pytest
 
-import dvae  # noqa: F401  importing it changes settings of Pyro, which must not happen in an example
+import dvae  # noqa: F401  sets up Pyro before an example does
+from dvae.cli import app
 from dvae.cli import main as command
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
-EXAMPLES = ("bodies", "families", "latent_space", "new_method", "own_data", "rotations", "tables", "walk")
+BLOCK = re.compile(r"(<!-- not run: [^\n]+ -->\n+)?^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_the_examples_of_a_page_run(name):
-    page = ROOT / "docs" / f"{name}.md"
-    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    assert blocks
+def blocks(page):
+    """Return the line and text of every Python block of a page that is not marked as not run."""
+    text = page.read_text(encoding="utf-8")
+    return [(text.count("\n", 0, match.start(2)), match[2]) for match in BLOCK.finditer(text) if not match[1]]
+
+
+WITH_EXAMPLES = [page for page in PAGES if blocks(page)]
+
+
+@pytest.mark.parametrize("page", WITH_EXAMPLES, ids=lambda page: page.stem)
+def test_examples_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     variables = {}
-    for block in blocks:
-        exec(compile(block, page.name, "exec", dont_inherit=True), variables)
+    for line, block in blocks(page):
+        exec(compile("\n" * line + block, str(page), "exec", dont_inherit=True), variables)
 
 
-def test_the_outputs_in_comments_of_the_notation_page_are_printed(capsys):
-    page = (ROOT / "docs" / "notation.md").read_text(encoding="utf-8")
-    test_the_examples_of_a_page_run("notation")
-    comments = re.findall(r"^print\(.*\)  # (.*[)}])$", page, re.MULTILINE)
-    assert comments
-    assert not set(comments) - set(capsys.readouterr().out.splitlines())
+def test_printed_results_are_those_in_comments(capsys, tmp_path, monkeypatch):
+    page = ROOT / "docs" / "reference" / "notation.md"
+    test_examples_run(page, tmp_path, monkeypatch)
+    results = re.findall(r"^print\(.*\)  # (.*[)}])$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert results
+    assert not set(results) - set(capsys.readouterr().out.splitlines())
+
+
+COMMANDS = {
+    f"{path.stem}: {line}": line
+    for path in [*PAGES, ROOT / "README.md"]
+    for block in re.findall(r"^```console\n(.*?)^```|((?:^    dvae .*\n)+)", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    for line in "".join(block).replace("\\\n", " ").splitlines()
+    if line.strip().startswith("dvae ") and "…" not in line
+}
+
+
+@pytest.mark.parametrize("line", COMMANDS.values(), ids=COMMANDS)
+def test_commands_parse(line, monkeypatch, tmp_path):
+    """The command exists, and so do its options; it is not run."""
+
+    def parser(given, import_command=app.command):
+        function = import_command(given)
+        return function and functools.wraps(function)(lambda *_, **__: None)
+
+    monkeypatch.setattr(app, "command", parser)
+    monkeypatch.chdir(tmp_path)
+    assert command(shlex.split(line, comments=True)[1:]) == 0
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -58,7 +89,7 @@ def test_names_of_the_library_on_a_page_exist(page):
 
 PUBLISHED = re.findall(
     r"^    dvae (fit .+)$",
-    (ROOT / "docs" / "methods.md").read_text(encoding="utf-8").partition("## The papers' own runs")[2],
+    (ROOT / "docs" / "reference" / "methods.md").read_text(encoding="utf-8").partition("## The papers' own runs")[2],
     re.MULTILINE,
 )
 
