@@ -89,7 +89,7 @@ class LikelihoodMethod(Method):
             drift.
         scheduled_sampling: final probability that a frame of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
-            ignore it. By default 1 for data with a horizon and 0 for others (docs/results/tuning.md).
+            ignore it. None: 1 for data with a horizon and 0 for others.
     """
 
     without_covariates: ClassVar[tuple[str, ...]] = ()

@@ -321,6 +321,8 @@ def _resume_hint() -> Iterator[None]:
     try:
         yield
     except Interrupted as stop:
+        if stop.fit.run is None:  # a fit of a part, such as a pose prior, stores no run
+            raise
         stop.args = (f"interrupted after step {stop.fit.step}; resume with: dvae resume {stop.fit.run}",)
         raise
 
