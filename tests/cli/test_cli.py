@@ -579,7 +579,7 @@ def test_scores_are_equal_for_every_format_and_representation(people, tmp_path, 
         return dvae.Evaluation.load(out)
 
     forms = table(*runs, "--data", str(npz))
-    assert any("bounds of 6d: densities of turns" in note for note in forms.notes)
+    assert any("bounds of 6d: densities of joint rotations" in note for note in forms.notes)
     for run in runs:
         name = Path(run).name
         for other in (table(run, "--data", str(npz)), table(run, "--data", str(folder))):
