@@ -34,7 +34,7 @@ class Schema:
     """
 
     kind: ClassVar[str] = "sequences"
-    per: ClassVar[str] = "frame"
+    per: ClassVar[str] = "step"
     """Unit of bounds."""
 
     sizes: Mapping[str, Size]

@@ -145,7 +145,7 @@ class Sequences:
     def _check(self, name: str, value: Tensor) -> None:
         if value.ndim not in (2, 3):
             raise ValueError(
-                f"{name} has shape {tuple(value.shape)}; a local variable is (sequences, frames, features), "
+                f"{name} has shape {tuple(value.shape)}; a local variable is (sequences, steps, features), "
                 "a static one (sequences, features)"
             )
         lengths, mask = self.batch.lengths, self.batch.mask(name)
@@ -163,7 +163,7 @@ class Sequences:
             count += int(bad.sum())
         if count:
             raise ValueError(
-                f"{name} has {count} entries that are NaN or infinite, the first in sequence {first}; remove them, or "
+                f"{name} is NaN or infinite in {count} entries, the first in sequence {first}; remove them, or "
                 'give a boolean "mask" that is False there'
             )
 
@@ -342,8 +342,8 @@ def held_out_windows(data: Any) -> HeldOutWindows:
     windows = take_split(data, "test")
     if not isinstance(windows, HeldOutWindows):
         raise TypeError(
-            f"expected windows with observed steps and a future, got {type(windows).__name__}; of an array x (N, T, D) "
-            "they are `dvae.ArrayWindows(x, observed=...)`"
+            f"expected windows with observed steps and a future, got {type(windows).__name__}; pass an array x "
+            "(N, T, D) as `dvae.ArrayWindows(x, observed=...)`"
         )
     return windows
 
@@ -369,7 +369,7 @@ def sequences(data: Any) -> Sequences:
         x, mask = unmasked(data)
         if x.ndim != 3:
             raise ValueError(
-                f"x has shape {tuple(x.shape)}, expected (sequences, frames, features); a single sequence is "
+                f"x has shape {tuple(x.shape)}, expected (sequences, steps, features); a single sequence is "
                 "x[None], and windows of a long one are dvae.tables.PanelData.of(x, cut=...).windows('train')"
             )
         return Sequences(Batch({"x": x} if mask is None else {"x": x, "mask": mask}).map(tensor_of))
@@ -444,7 +444,7 @@ def tensor_of(values: Any) -> Tensor:
 
 @dataclass(frozen=True)
 class ArrayProtocol:
-    """The split of plain arrays into observed and predicted frames."""
+    """The split of plain arrays into observed and predicted steps."""
 
     observed: int
 
@@ -498,15 +498,15 @@ class ArrayWindows:
                 f"the mask has shape {tuple(self.mask.shape)}, expected the shape of x, {tuple(self.x.shape)}"
             )
         if self.clips is not None and len(self.clips) != len(self.x):
-            raise ValueError(f"{len(self.x)} windows need one clip name each, got {len(self.clips)}")
+            raise ValueError(f"{len(self.x)} windows need one name in `clips` each, got {len(self.clips)}")
         if self.columns is not None and len(self.columns) != self.x.shape[2]:
             raise ValueError(f"{self.x.shape[2]} coordinates need one column name each, got {', '.join(self.columns)}")
         if self.season is not None and self.season < 1:
-            raise ValueError(f"season must be at least 1 frame, got {self.season}")
+            raise ValueError(f"season must be at least 1 step, got {self.season}")
 
     @property
     def protocol(self) -> ArrayProtocol:
-        """Number of observed frames."""
+        """Number of observed steps."""
         return ArrayProtocol(self.observed)
 
     @property
@@ -517,9 +517,10 @@ class ArrayWindows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Columns and season, if they were given."""
+        """The words for tables; columns and season, if they were given."""
         description = {"columns": None if self.columns is None else dict(self.columns), "season": self.season}
-        return {name: value for name, value in description.items() if value is not None}
+        given = {name: value for name, value in description.items() if value is not None}
+        return {"called": ["sequence", "step"], **given}
 
     @property
     def fingerprint(self) -> str:

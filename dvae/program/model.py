@@ -88,8 +88,8 @@ class DynamicalVAE(nn.Module):
     """Names of batch entries that are not variables, but that `penalties` reads."""
     forks: ClassVar[bool] = True
     """Whether a forecast continues each row once per draw; a subclass may use `draws` differently."""
-    per: str = "frame"
-    """Unit of one log-likelihood: "frame" or "window"."""
+    per: str = "step"
+    """Unit of one log-likelihood: "step", "frame" or "window"."""
 
     @serialized
     @torch.inference_mode(False)  # keeps parameters trainable if the model is built in inference mode
@@ -250,6 +250,10 @@ class DynamicalVAE(nn.Module):
         for conditional in (*self.generator.values(), *self.encoder.values()):
             conditional.units[name] = self.units[name]
         return self.units[name]
+
+    def extra_repr(self) -> str:
+        """Return the two equations, for the text of the model."""
+        return "\n".join(str(equation) for equation in (self.generative, self.inference) if equation.factors)
 
     @property
     def wide(self) -> frozenset[str]:

@@ -63,7 +63,6 @@ class PanelSchema(Schema):
     """
 
     kind: ClassVar[str] = "panel"
-    per: ClassVar[str] = "step"
 
     sizes: Mapping[str, int] = field(default_factory=dict)
     columns: Columns = field(default_factory=lambda: Columns((Column("x"),)))

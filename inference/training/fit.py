@@ -62,14 +62,14 @@ class Fit:
     """Result of a run.
 
     Args:
-        history: rows of the log, in nats per frame (see `trackers`).
+        history: rows of the log, in nats per step (see `trackers`).
         step: last step.
         best_step: step of the best unweighted validation bound; None without validation data.
-        best_bound: best validation bound, in nats per frame; with scheduled sampling, of the program that reads its own
+        best_bound: best validation bound, in nats per step; with scheduled sampling, of the program that reads its own
             output; for a model without a likelihood, minus its objective.
         status: "finished", "stopped early" or "interrupted".
         run: run directory, or None.
-        per: unit that bounds are divided by: a frame, unless the model's `per` names another.
+        per: unit that bounds are divided by: a step, unless the model's `per` names another.
         model: fitted model with the best weights; None if only the log of a run was read.
         processor_seconds: processor time of all threads of the first process, with validation and checkpoints; of a
             resumed run, the total.
@@ -84,13 +84,13 @@ class Fit:
         ('finished', [1, 2, 3])
     """
 
-    history: list[dict[str, Any]]
+    history: list[dict[str, Any]] = field(repr=False)
     step: int
     best_step: int | None
     best_bound: float | None
     status: str
     run: Path | None
-    per: str = "frame"
+    per: str = "step"
     model: Any = field(default=None, repr=False)
     processor_seconds: float = 0.0
     last_value: float | None = None
@@ -120,9 +120,9 @@ class Fit:
         return [row["step"] for row in rows], [row[name] for row in rows]
 
     def plot(self) -> "Figure":
-        """Draw the learning curves: the bound, and the KL of each latent, in nats per frame.
+        """Draw the learning curves: the bound, and the KL of each latent, in nats per step.
 
-        For a model without a likelihood, draw the loss and its energies, per frame.
+        For a model without a likelihood, draw the loss and its energies, per step.
         """
         from matplotlib import pyplot as plt
 

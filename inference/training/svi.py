@@ -62,8 +62,8 @@ class State:
 
     @property
     def per(self) -> str:
-        """Unit that bounds are divided by: a frame, unless the model names another."""
-        return self.model.per if isinstance(self.model, Program) else "frame"
+        """Unit that bounds are divided by: a step, unless the model names another."""
+        return self.model.per if isinstance(self.model, Program) else "step"
 
 
 class SVI:

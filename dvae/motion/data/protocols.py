@@ -159,6 +159,7 @@ class Poses(Schema):
     """
 
     kind: ClassVar[str] = "poses"
+    per: ClassVar[str] = "frame"
 
     skeleton: Skeleton = field(kw_only=True)
     protocol: Protocol = field(kw_only=True)

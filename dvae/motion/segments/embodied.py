@@ -41,6 +41,7 @@ class SegmentSchema(Schema):
     """
 
     kind: ClassVar[str] = "segments"
+    per: ClassVar[str] = "frame"
 
     timed: TimedFrames = field(kw_only=True)
 

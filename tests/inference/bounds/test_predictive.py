@@ -115,7 +115,7 @@ def test_an_evaluation_reports_the_log_score_in_nats_per_predicted_frame():
         expected = predictive_bound(model, x, SEEN, 7).bound.mean() / (T - SEEN)
     assert result["dkf"]["log score"].mean == pytest.approx(expected.item())
     assert list(result.metrics) == ["energy score", "variogram score", "CRPS", "log score", "ELBO", "KL z"]
-    assert (result.metrics["log score"].unit, result.metrics["log score"].better) == ("nats/frame", "higher")
+    assert (result.metrics["log score"].unit, result.metrics["log score"].better) == ("nats/step", "higher")
     assert result.log_score_particles == 7
     assert "log score" not in result["last value"]
     assert "log score" not in evaluate({"dkf": model}, windows, **options).metrics

@@ -121,7 +121,7 @@ def test_stored_bands_are_put_around_forecasts(fitted, tmp_path):
         lower, upper = again.apply(forecasts, region)
         torch.testing.assert_close((upper - lower) / 2, torch.from_numpy(factor) * forecasts.std(0))
         torch.testing.assert_close((upper + lower) / 2, forecasts.mean(0))
-    assert "bands of 80 % · 500 windows of 250 clips" in str(again)
+    assert "bands of 80 % · 500 windows of 250 sequences" in str(again)
     assert again.plot()._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(ValueError, match="bands"):
         bands.apply(forecasts, "futures")
@@ -181,12 +181,12 @@ def test_calibration_is_computed_and_drawn_for_every_frame_of_the_horizon(fitted
     assert {*row} >= {measure.name for measure in calibrated(windows) if not measure.bins}
     outside = []
     for frame in (1, 2, 3, 4):
-        covered = row[f"coverage 90 %, frame {frame}"]
+        covered = row[f"coverage 90 %, step {frame}"]
         assert (abs(covered.mean - 0.9) < 4 * covered.standard_error) == (frame < 4)
-        outside.append(leaves(result, "late", f"PIT, frame {frame}"))
+        outside.append(leaves(result, "late", f"PIT, step {frame}"))
     assert outside == [False, False, False, True]
     figure = result.plot_horizon()
-    assert [axes.get_title() for axes in figure.axes][:4] == ["frame 1", "frame 2", "frame 3", "frame 4"]
+    assert [axes.get_title() for axes in figure.axes][:4] == ["step 1", "step 2", "step 3", "step 4"]
     with pytest.raises(ValueError, match="frames must be between 1 and 4"):
         by_frame(PIT, [6], "frame")[0].function(draw(8, 19, 4, 2), draw(8, 4, 2), {}, torch.arange(8))
     with pytest.raises(KeyError, match="evaluate with"):

@@ -183,7 +183,7 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
     result.save(tmp_path / "evaluation.json")
     again = Evaluation.load(tmp_path / "evaluation.json")
     sizes = {"windows": 12, "frames": FRAMES, "coordinates": SIZE}
-    assert again.data == {"fingerprint": windows.fingerprint, **sizes}
+    assert again.data == {"fingerprint": windows.fingerprint, "called": ["sequence", "step"], **sizes}
     assert again.to_json() == result.to_json()
     assert (again.samples, again.seed, again.bound_particles) == (5, 5, 3)
     assert again.protocol == {"observed": OBSERVED}
@@ -192,7 +192,7 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
     assert f"{single_truths} of 12 have no other" in str(result)
     assert again.rows["dkf"].config == {"width": 8}
     assert again.rows["dkf"].equations["generative"] == model.generative.text
-    assert (again.metrics["ELBO"].program, again.metrics["ELBO"].unit) == ("teacher-forced", "nats/frame")
+    assert (again.metrics["ELBO"].program, again.metrics["ELBO"].unit) == ("teacher-forced", "nats/step")
     scores = json.loads(result.to_json())["summary"]["dkf"]
     assert scores["ELBO"]["mean"] == result["dkf"]["ELBO"].mean
     assert scores["k-hat"]["mean"] is None  # three particles have no tail
@@ -206,7 +206,7 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
 def test_table_and_plot_show_every_method_and_metric(model):
     result = run({"dkf": model}, array_windows())
     text = str(result)
-    for part in ("last value", "dkf", "K = 5", "K = 1", "teacher-forced", "KL z", "±", "12 windows of 4 clips"):
+    for part in ("last value", "dkf", "K = 5", "K = 1", "teacher-forced", "KL z", "±", "12 windows of 4 sequences"):
         assert part in text
     assert str(result["dkf"]["ADE"]) in text
     panels = [axes.get_title() for axes in result.plot().axes if axes.axison]

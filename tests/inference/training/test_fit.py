@@ -485,7 +485,7 @@ def test_json_lines_ignore_a_truncated_last_line(tmp_path):
 def test_learning_curves_are_drawn():
     figure = run(validation=HELD_OUT, steps=20).plot()
     bound, divergence = figure.axes
-    assert bound.get_ylabel() == "bound (nats per frame)"
+    assert bound.get_ylabel() == "bound (nats per step)"
     assert [line.get_label() for line in divergence.lines] == ["z"]
     matplotlib.pyplot.close(figure)
 
