@@ -408,26 +408,28 @@ class Comparison(Result):
         clip, frame = axis_names(self.data)
         if self.protocol.get("observed", 0) is None:
             return "whole sequence", clip, frame
-        return "window" if "called" in self.data else "sequence", clip, frame
+        return "window" if self.protocol else "sequence", clip, frame
 
     def _title(self) -> str:
         unit, clip, _ = self._words
         parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {unit}s"]
-        parts[-1] += "" if unit == f"whole {clip}" else f" of {len(set(self._clips))} {clip}s"
+        parts[-1] += "" if unit.endswith(clip) else f" of {len(set(self._clips))} {clip}s"
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)
 
     def _bound_table(self) -> Table:
         unit, clip, frame = self._words
+        clustered = "" if unit.endswith(clip) else f" (clustered by {clip})"
         bounds = (f"IWAE bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
         filters = [f"FIVO bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
         table = _table(
             f"{self._title()}\nteacher-forced, nats a {frame}",
             "\n".join(
                 [
-                    f"mean ± standard error over {unit}s (clustered by {clip}) ± over seeds",
-                    "95 %: from both, by Student's t, in brackets its degrees of freedom",
+                    f"mean ± standard error over {unit}s{clustered} ± over seeds",
+                    "95 %: confidence interval from both errors (df: degrees of freedom of Student's t)",
+                    f"k-hat > {KHAT}: share of {unit}s whose IWAE bound is unreliable",
                     *([] if self.samples else self.notes),
                     *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),
                 ]
@@ -449,7 +451,7 @@ class Comparison(Result):
         limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "not computed"
         table = _table(
             "latents under the guide, teacher-forced",
-            f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
+            f"active units: variance of the posterior mean over the data above {ACTIVE}\ninformation: {limit}",
             ("latent", f"KL\nnats a {self._words[2]}", "active\nunits", "information\nnats"),
         )
         for name in self.ranking:
