@@ -96,7 +96,7 @@ def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) ->
     """Return the explanation of multimodal errors for the caption of a table."""
     own = "; they include the window itself" if itself else ""
     closer = f"windows whose last observed pose is closer than {threshold:g} m{own}"
-    return f"MM (multimodal): true futures are those of all {closer}; {alone} of {windows} windows have no other"
+    return f"MM (multimodal): true futures are those of all {closer}; {alone} of {windows} have no other"
 
 
 def multimodal_errors(samples: Array, truths: Array) -> Tensor:
