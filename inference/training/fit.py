@@ -86,7 +86,7 @@ class Fit:
         ('finished', [1, 2, 3])
     """
 
-    history: list[dict[str, Any]]
+    history: list[dict[str, Any]] = field(repr=False)
     step: int
     best_step: int | None
     best_bound: float | None
