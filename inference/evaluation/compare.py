@@ -167,7 +167,9 @@ def compare(
             "sequences": len(keys),
             "frames": x.shape[1],
             "coordinates": x.shape[2],
-            **_axis_words(windows),
+            **(
+                {"called": list(axis_names(windows.description))} if windows and "called" in windows.description else {}
+            ),
         },
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
@@ -261,13 +263,6 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
                     f"{other_spec}; give them different names"
                 )
     return contenders
-
-
-def _axis_words(windows: HeldOutWindows | None) -> dict[str, Any]:
-    """Return the words for a cluster and a step, unless they are those of motion."""
-    if windows is None:
-        return {"called": ["sequence", "step"]}
-    return {"called": list(axis_names(windows.description))} if "called" in windows.description else {}
 
 
 def _each(contenders: Mapping[str, list[Any]]) -> Iterator[tuple[str, str, Any]]:
