@@ -87,9 +87,9 @@ class LikelihoodMethod(Method):
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
             an offset: one-step forecasts are sharp, but free runs can drift without limit. A smaller share limits the
             drift.
-        scheduled_sampling: final probability that a frame of x's history is the model's own mean. It rises from 0 over
+        scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
-            ignore it. By default 1 for data with a horizon and 0 for others (docs/results/tuning.md).
+            ignore it. None: 1 for data with a horizon and 0 for others.
     """
 
     without_covariates: ClassVar[tuple[str, ...]] = ()
@@ -194,7 +194,7 @@ class LatentMethod(LikelihoodMethod):
         prior_steps: length of the pseudo-sequences of "vamp"; at most the length of the training windows.
         warm_up: steps over which the KL weight rises from 0 to 1.
         warm_up_shape: shape of the rise.
-        free_bits: nats per frame below which the KL of a latent, averaged over the batch, is not penalised.
+        free_bits: nats per step below which the KL of a latent, averaged over the batch, is not penalised.
         hide: share of the entries of training windows to hide from the guide and the likelihood, drawn anew for every
             batch. The guide learns to handle missing entries, and reads indicators of the observed ones.
     """

@@ -205,7 +205,7 @@ def _suggestions(arguments: Sequence[str]) -> Iterator[str]:
     options = {f"--{option.replace('_', '-')}" for option in [*hints, "from", "help", "help-all"]}
     for word in (word.partition("=")[0].replace("--no-", "--") for word in remaining if word.startswith("--")):
         if word not in options and (suggestion := nearest(word, options)):
-            yield f"{word} is no option of dvae {name}{suggestion}"
+            yield f"{word} is not an option of dvae {name}{suggestion}"
     choices = {option: _choices(hint) for option, hint in hints.items()}
     names = {"fit": [*methods(), *metric_models()], "sweep": choices.get("method")}.get(name)
     for previous, word in pairwise(["", *remaining]):

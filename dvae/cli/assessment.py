@@ -92,7 +92,7 @@ def evaluate(
     Args:
         run: run directories, fitted on the same data under the same protocol.
         control: paths given to methods that take trajectories.
-        data: where the data are now, if the path in the runs is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
         samples: number K of forecasts of each window.
         bound_particles: number of particles of the IWAE bound; 0 omits it.
         log_score_particles: number of particles of the log density of the future under the forecasts; 0 omits it.
@@ -236,7 +236,7 @@ def compare(
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
-        data: where the data are now, if the path in the runs is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
         particles: number K of particles of the IWAE bound.
         estimates: number of independent estimates of the IWAE bound; 25 or more for arviz, 1 otherwise.
         filter_particles: number of particles of the FIVO bound; 0 omits it.

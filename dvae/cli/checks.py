@@ -68,7 +68,7 @@ def calibration(
 
     Args:
         run: the run directory.
-        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         simulations: number of sequences drawn from the model, as long as its windows.
         draws: number of draws from the guide for each simulation.
         ranked_steps: number of time steps, evenly spaced, at which local latents are ranked.
@@ -126,14 +126,14 @@ def posterior(
     """Compare a run's guide with the posterior of the latents of some test windows.
 
     Computes the kernel Stein discrepancy of the guide in moments, and then means, deviations and correlations of the
-    guide and of NUTS, which takes minutes for each window: begin with a few frames. Prints both tables, and writes each
+    guide and of NUTS, which takes minutes for each window: begin with few --frames. Prints both tables, and writes each
     to posterior.json in the run, or to --out, as soon as it is computed.
 
     Args:
         run: the run directory.
-        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         windows: number of test windows, evenly spaced.
-        frames: number of frames of a window, from its first one, whose latents are inferred; all by default.
+        frames: number of steps of a window, from its first one, whose latents are inferred; all by default.
         draws: number of draws of each NUTS chain.
         chains: number of chains for each window.
         warmup: number of warm-up draws of each chain.
@@ -192,7 +192,7 @@ def gap(
 
     Args:
         run: the run directory.
-        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         count: number of test windows, drawn at random; the time is proportional to it.
         particles: number of particles of IWAE and FIVO, and of draws over which ELBOs are averaged.
         temperatures: number of temperatures of annealed importance sampling; more give closer bounds.
@@ -246,7 +246,7 @@ def coverage(
 
     Args:
         run: the run directory.
-        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         level: share of futures that bands contain.
         label: label of test clips that divides them into those for calibration and those for the test.
         values: values of the label of the clips for calibration.

@@ -321,6 +321,8 @@ def _resume_hint() -> Iterator[None]:
     try:
         yield
     except Interrupted as stop:
+        if stop.fit.run is None:  # a fit of a part, such as a pose prior, stores no run
+            raise
         stop.args = (f"interrupted after step {stop.fit.step}; resume with: dvae resume {stop.fit.run}",)
         raise
 
@@ -338,7 +340,7 @@ def _cluster(scheduler: str) -> Iterator[None]:
 
 def _report(result: Fit) -> None:
     duration = f"{result.processor_seconds:.0f} s of processor time"
-    summary = ", ".join(filter(None, [f"{result.status} at step {result.step}", result.best, duration]))
+    summary = ", ".join(filter(None, [f"{result.status} at step {result.step}", duration, result.best]))
     OUT.print(summary, highlight=False, soft_wrap=True)
     assert result.run is not None
     OUT.print(_use(Run(result.run).config["method"]["method"], result.run), highlight=False, soft_wrap=True)
@@ -352,9 +354,9 @@ def _use(name: str, run: Path) -> str:
         return f"score {target} with: dvae evaluate RUN {option} {run}"
     advice = f"score it with: dvae evaluate {run}"
     if Run(run).config["data"].get("kind") == "panel":
-        return f"{advice}, forecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
+        return f"{advice}\nforecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
     if methods()[name].fitted_on == "segments":
-        return f"{advice}, recover a segment from a part of it with: dvae impute {run} --from CLIP --seen markers"
+        return f"{advice}\nrecover a segment from a part of it with: dvae impute {run} --from CLIP --seen markers"
     if issubclass(methods()[name], TrajectoryMethod):
-        return f"{advice} --joints JOINT …, move it with: dvae forecast {run} --joints JOINT … --out FILE.npz"
+        return f"{advice} --joints JOINT …\nmove it with: dvae forecast {run} --joints JOINT … --out FILE.npz"
     return advice

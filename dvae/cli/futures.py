@@ -95,7 +95,7 @@ def forecast(
         draw_emission: for motion: include the noise of the emission, or return its means given draws of the latents.
             By default an npz has draws and BVH has means, unless the model has no latents.
         seed: seed of the draws.
-        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         figure: save a figure of the first window's futures.
         beyond: for a table: forecast the steps after its last row with a target, using covariates of later rows.
     """
@@ -216,7 +216,7 @@ def impute(
         draw_emission: for motion: include the noise of the emission, or fill with its means given draws of the latents.
             By default --out has draws and --filled has means, unless the model has no latents.
         seed: seed of the draws.
-        data: where the data are now, if the path in the run is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
     """
     kind = kind_of([run], data)
     at_least(1, particles=particles)
@@ -324,7 +324,7 @@ def animate(
         samples: number of futures side by side; by default 5, or all in the file if fewer.
         fix: parts of the body, such as lower, or static latents, that all futures of a run share.
         seed: seed of the draws of a run.
-        data: where the data of a run are now, if its path is no longer valid; or other data of the same joints.
+        data: where the data of a run are now, if its path is no longer valid; or other data with the same variables.
         every: show every n-th frame; by default about 25 frames per second are shown.
         figure: also save a figure of the futures.
     """

@@ -121,10 +121,10 @@ def _describe_trainings(trainings: Mapping[str, Training]) -> list[str]:
     lines = []
     for skeleton, training in trainings.items():
         rate = training.rate
-        ends = "" if rate(0) == rate(training.steps) else f", at the end {rate(training.steps):g}"
-        on = f"to {skeleton}" if skeleton else "to other data" if len(trainings) > 1 else "to data"
+        ends = "" if rate(0) == rate(training.steps) else f" that falls to {rate(training.steps):g}"
+        on = f" for {skeleton}" if skeleton else " for other data" if len(trainings) > 1 else ""
         lines.append(
-            f"fitted {on} in {training.steps} steps of {training.batch_size}, {training.optimizer}, "
+            f"training defaults{on}: {training.steps} steps, batches of {training.batch_size}, {training.optimizer}, "
             f"learning rate {rate(0):g}{ends}"
         )
     return lines

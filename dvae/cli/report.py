@@ -72,7 +72,7 @@ def report(
         particles: number of particles of the IWAE bound.
         seed: seed of the draws.
         edges: file written by `dvae check edges`, whose table and drawing are shown too.
-        data: where the data are now, if the path in the runs is no longer valid; or other data of the same joints.
+        data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
     """
     at_least(0, windows=windows)
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)

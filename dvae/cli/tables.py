@@ -157,7 +157,9 @@ def _note_omitted(samples: int, out: Path, figure: Path | None = None) -> None:
         {} if figure is None else {f"the interval of {100 * level:g} %": samples_needed(level) for level in BANDS}
     )
     if omitted := [f"{name} ({draws})" for name, draws in n_needed.items() if draws > samples]:
-        note(f"left out, because they need more than {samples} draws (--samples): {', '.join(omitted)}")
+        note(
+            f"left out, with the number of draws (--samples) that they need, more than {samples}: {', '.join(omitted)}"
+        )
 
 
 def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:

@@ -108,7 +108,7 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
                 raise NpyError(f"has shape {shape}, so it contains no numbers; expected at least one")
             if order == "F" and len(shape) > 1:
                 raise NpyError(
-                    "is in Fortran order, which stores the numbers of a frame far apart; write it with "
+                    "is in Fortran order, which stores the numbers of a step far apart; write it with "
                     "numpy.ascontiguousarray"
                 )
             array = np.memmap(file, dtype, "r", file.tell(), shape)

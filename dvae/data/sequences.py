@@ -163,7 +163,7 @@ class Sequences:
             count += int(bad.sum())
         if count:
             raise ValueError(
-                f"{name} has {count} entries that are NaN or infinite, the first in sequence {first}; remove them, or "
+                f"{name} is NaN or infinite in {count} entries, the first in sequence {first}; remove them, or "
                 'give a boolean "mask" that is False there'
             )
 
@@ -342,8 +342,8 @@ def held_out_windows(data: Any) -> HeldOutWindows:
     windows = take_split(data, "test")
     if not isinstance(windows, HeldOutWindows):
         raise TypeError(
-            f"expected windows with observed steps and a future, got {type(windows).__name__}; of an array x (N, T, D) "
-            "they are `dvae.ArrayWindows(x, observed=...)`"
+            f"expected windows with observed steps and a future, got {type(windows).__name__}; pass an array x "
+            "(N, T, D) as `dvae.ArrayWindows(x, observed=...)`"
         )
     return windows
 
@@ -444,7 +444,7 @@ def tensor_of(values: Any) -> Tensor:
 
 @dataclass(frozen=True)
 class ArrayProtocol:
-    """The split of plain arrays into observed and predicted frames."""
+    """The split of plain arrays into observed and predicted steps."""
 
     observed: int
 

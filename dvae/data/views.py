@@ -141,7 +141,7 @@ class Views(View):
         self.measured = ", ".join(view.measured for view in views if view.measured)
         pasts = [index for index, view in enumerate(views) if isinstance(view, Past)]
         if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
-            raise ValueError(f"{self} changes the volume of frames that are not scored; make Past the first view")
+            raise ValueError(f"{self} changes the volume of steps that are not scored; make Past the first view")
 
     def __repr__(self) -> str:
         return f"Views({', '.join(map(repr, self.views))})"
@@ -258,7 +258,7 @@ class History(View):
             if parent is not None and (parent.relation is None or parent.relation.intervals is not None):
                 raise ValueError(
                     f"{factor} reads {parent}, but {name} is the data, and a forecast has only their past; "
-                    f"give {name} a custom mask that hides the frames to predict, such as "
+                    f"give {name} a custom mask that hides the steps to predict, such as "
                     f'{name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
                 )
 
@@ -305,11 +305,11 @@ class Past(View):
             raise ValueError("a view with `Past` requires windows of one length; remove 'lengths' from the batch")
         x, masks, frames = data[WHOLE], data.masks(), self.frames
         if x.shape[1] < frames:
-            raise ValueError(f"this model continues from {frames} frames, but was given {x.shape[1]}")
+            raise ValueError(f"this model continues from {frames} steps, but was given {x.shape[1]}")
         for name in self.also:
             if name in data and data[name].shape[1] != x.shape[1] > frames:
                 raise ValueError(
-                    f"x {tuple(x.shape)} has {self.name} as its first frames, so {name} must cover the "
+                    f"x {tuple(x.shape)} has {self.name} as its first steps, so {name} must cover the "
                     f"whole window, (B, {frames} + T, D); got {tuple(data[name].shape)}"
                 )
         later = {name: data[name][:, frames:] for name in (WHOLE, *self.also) if name in data}

@@ -88,7 +88,7 @@ class Reader:
             batch = {whole_name: batch}
         if unknown := [name for name in batch if name not in (*names, *self.extras, *Batch.reserved)]:
             raise ValueError(
-                f"the batch holds {', '.join(unknown)}; expected some of {', '.join(names)}, 'lengths', 'mask'"
+                f"the batch has {', '.join(unknown)}; expected only {', '.join(names)}, 'lengths' and 'mask'"
             )
         exact = {*wide, whole_name, *self.view.names} if wide else set()  # the view computes the variables from these
         values = _tensors(Batch(batch), dtype, names, exact)
@@ -192,7 +192,7 @@ class Reader:
             return
         for factor in factorization.factors:
             if factor.parent(name) is not None and factor.mask(name, length)[:, past:].any():
-                raise ValueError(f"{factor} reads more than the first {past} frames of {name}, but no others exist")
+                raise ValueError(f"{factor} reads more than the first {past} steps of {name}, but no others exist")
         values[name] = functional.pad(values[name], (0, 0, 0, length - past))
 
     def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
@@ -223,7 +223,7 @@ class Reader:
         for name, bad in not_finite.items():
             if bad:
                 raise ValueError(
-                    f"{name} holds values that are not finite; where entries are missing, set 'mask' False in the batch"
+                    f"{name} has NaN or infinite values; remove them, or give a boolean 'mask' that is False there"
                 )
         for name, invalid in outside.items():
             if invalid.any():

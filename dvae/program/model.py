@@ -251,6 +251,10 @@ class DynamicalVAE(nn.Module):
             conditional.units[name] = self.units[name]
         return self.units[name]
 
+    def extra_repr(self) -> str:
+        """Return the two equations, for the text of the model."""
+        return "\n".join(str(equation) for equation in (self.generative, self.inference) if equation.factors)
+
     @property
     def wide(self) -> frozenset[str]:
         """Names of the variables whose values are in float64 whatever the precision of the model."""

@@ -25,7 +25,7 @@ class Program(Protocol):
 
     @property
     def per(self) -> str:
-        """Unit of one log-likelihood: "frame" or "window"."""
+        """Unit of one log-likelihood: "step", "frame" or "window"."""
 
     def model(self, batch: Any, **options: Any) -> Any:
         """Run the generative program on a batch."""

@@ -93,7 +93,7 @@ def annealed_bound(
         temperatures: L, number of temperatures.
         chains: K, number of chains per sequence.
         leaps: number of leapfrog steps of a transition, each a gradient of model and guide.
-        latents: exact draws (B, ...) from the posterior by name, such as the latents of simulated data; the chains the
+        latents: exact draws (B, ...) from the posterior by name, such as the latents of simulated data; the
             chains then run from these to the guide and give an upper bound.
         seed: seed of the chains.
         chunk: largest number of sequences times chains in memory.

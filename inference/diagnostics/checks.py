@@ -119,7 +119,7 @@ def default_statistics(windows: HeldOutWindows) -> dict[str, Statistic]:
     if scales := scales_of(windows):
         unit, note = (
             "scales",
-            "statistics of all columns together are in the scales of their columns, from the training data",
+            "scales: statistics over all columns divide each column by its scale in the training data",
         )
     elif len(units) > 1:
         unit, note = "", f"statistics without a unit mix numbers in {', '.join(unit or '1' for unit in units)}"

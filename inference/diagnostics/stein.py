@@ -69,9 +69,13 @@ class SteinDiscrepancy(Result):
     @property
     def verdict(self) -> str:
         """Result of the test in one sentence."""
-        number = f"p = {self.p_value:.2g} for {len(self.sequences)} sequences together, {self.draws} draws of each"
+        count = len(self.sequences)
+        which = "1 sequence" if count == 1 else f"all {count} sequences together"
+        number = f"p = {self.p_value:.2g} for {which}, {self.draws} draws of each"
         if self.p_value <= 0.05:
-            individual = f"; {(self.p_values <= 0.05).sum()} of them are significant at 5 % on their own"
+            individual = (
+                f"; at 5 %, {(self.p_values <= 0.05).sum()} of {count} are significant alone" if count > 1 else ""
+            )
             return f"the guide is not the posterior ({number}{individual})"
         return f"no evidence against the guide ({number})"
 

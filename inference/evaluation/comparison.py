@@ -428,7 +428,8 @@ class Comparison(Result):
             "\n".join(
                 [
                     f"mean ± standard error over {unit}s{clustered} ± over seeds",
-                    "95 %: from both, by Student's t, in brackets its degrees of freedom",
+                    "95 %: confidence interval from both errors (df: degrees of freedom of Student's t)",
+                    f"k-hat > {KHAT}: share of {unit}s whose IWAE bound is unreliable",
                     *([] if self.samples else self.notes),
                     *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),
                 ]
@@ -450,7 +451,7 @@ class Comparison(Result):
         limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "not computed"
         table = _table(
             "latents under the guide, teacher-forced",
-            f"active: variance of the posterior mean over data above {ACTIVE}\ninformation {limit}",
+            f"active units: variance of the posterior mean over the data above {ACTIVE}\ninformation: {limit}",
             ("latent", f"KL\nnats a {self._words[2]}", "active\nunits", "information\nnats"),
         )
         for name in self.ranking:

@@ -205,7 +205,7 @@ def _is_deterministic(model: Any, is_drawn: bool) -> bool:
 def _forecast_notes(measures: Sequence[Measure], samples: int, of_means: Sequence[str]) -> Iterator[str]:
     """Yield notes on scores that are not available or not informative for these forecasts."""
     if omitted := [f"{measure.name} ({measure.least})" for measure in measures if measure.least > samples]:
-        yield f"left out, as they need more than {samples} forecasts: {', '.join(omitted)}"
+        yield f"left out, with the number of forecasts that they need, more than {samples}: {', '.join(omitted)}"
     affected = [each.name for each in measures if each.of_draws and not each.of_means and each.least <= samples]
     if of_means and affected:
         names = f"forecasts of {', '.join(of_means)}"

@@ -350,7 +350,8 @@ class Evaluation(Result):
     def _caption(self) -> str:
         freedom = f"{len(self.clips) - 1} degrees of freedom"
         clip, _ = axis_names(self.data)
-        return "\n".join([f"mean ± standard error over windows, clustered by {clip} ({freedom})", *self.notes])
+        error = f"mean ± standard error over windows, clustered by {clip} ({freedom}); K: forecasts of each window"
+        return "\n".join([error, *self.notes])
 
     def _title(self) -> str:
         name = str(self.protocol.get("name", ""))

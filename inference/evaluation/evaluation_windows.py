@@ -109,7 +109,7 @@ def prepare_windows(data: Any) -> EvaluationWindows:
         )
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
-            f"windows must have a frame to observe and a frame to predict, but of {batch['x'].shape[1]} frames "
+            f"windows must have a step to observe and a step to predict, but of {batch['x'].shape[1]} steps "
             f"{observed} are observed"
         )
     eval_windows = EvaluationWindows(windows, batch, observed, list(windows.keys))

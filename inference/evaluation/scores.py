@@ -163,7 +163,7 @@ def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
     """Return the score of all columns together, in the unit of the data."""
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
-        note = "scores of all columns together are in the scales of their columns, from the training data"
+        note = "scales: scores over all columns divide each column by its scale in the training data"
         means = windows.description.get("means", [0.0] * len(scales))
         return replace(measure, function=_in_scales(measure.function, means, scales), unit="scales", note=note)
     mixed_note = (

@@ -20,6 +20,8 @@ from torch import nn
 from ...data.batch import WHOLE
 from ...data.schema import Schema
 from ...data.sequences import Batched, Fingerprinted, Source, as_batches, as_source, has_splits, take_split
+from ...distributions.family import FamilyModule
+from ...distributions.product import ProductModule
 from ...locking import seeded
 from ...program.batch import check_scale
 from ...program.conditional import like
@@ -84,7 +86,7 @@ class Fit:
         ('finished', [1, 2, 3])
     """
 
-    history: list[dict[str, Any]]
+    history: list[dict[str, Any]] = field(repr=False)
     step: int
     best_step: int | None
     best_bound: float | None
@@ -107,11 +109,13 @@ class Fit:
         best = f"{name} {self.best_bound:.3f} nats a {self.per} at training step {self.best_step}"
         if self.last_value is None or self.best_bound >= self.last_value:
             return best
-        advice = ["train for more steps"]
-        if self.model is None or not any(getattr(module, "residual", False) for module in self.model.modules()):
-            advice.append("try residual=1, which adds the output to the last value")
-        if not self_fed:
-            advice.append("try scheduled_sampling=1, which trains on the model's own output")
+        advice, model = ["train for more steps"], self.model
+        if isinstance(model, DynamicalVAE) and _reads_past_data(model):
+            heads = [model.generator[name].head for name in model.observed]
+            if not any(head.residual or isinstance(head, FamilyModule | ProductModule) for head in heads):
+                advice.append("try residual=1, which adds the output to the last value")
+            if not self_fed:
+                advice.append("try scheduled_sampling=1, which trains on the model's own output")
         return f"{best}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
 
     def series(self, name: str) -> tuple[list[int], list[float]]:
@@ -145,6 +149,12 @@ class Fit:
         if not likelihood:
             term_panel.set_yscale("log")  # scales of energies differ by orders of magnitude, which weights compensate
         return figure
+
+
+def _reads_past_data(model: DynamicalVAE) -> bool:
+    """Return whether a data variable is generated from data of earlier steps."""
+    parents = {parent.name for name in model.observed for parent in model.generative.factor(name).parents}
+    return bool(parents.intersection(model.observed))
 
 
 class Interrupted(KeyboardInterrupt):
@@ -199,7 +209,7 @@ def fit(
         objective: objective to minimise; `Evidence()` by default.
         stages: consecutive stages with their own objectives, instead of `objective`, for all steps of the run.
         out: run directory for checkpoints and `log.jsonl` (see `checkpoints`). If a method is fitted to data that can
-            be opened again, `dvae.load` and `dvae.resume` read the run.
+            be opened again, `dvae.load` and the command `dvae resume` read the run.
         resume: whether to continue the run in `out` from its last checkpoint up to `steps`.
         config: description of the run in JSON types, for `config.json`; training options are added to it. A resumed run
             keeps its own if none is given.
@@ -242,7 +252,8 @@ def fit(
             raise ValueError("a recipe has its own validation data; remove validation")
         return _fit(model, data.batches, data.validation, **_prepare_options(data, model, loop_options | options))
     if resume:
-        raise ValueError(f"fit cannot resume the run of a method; use dvae.resume({os.fspath(out or 'RUN')!r})")
+        run = os.fspath(out or "RUN")
+        raise ValueError(f"fit cannot resume the run of a method; use the command `dvae resume {run}`")
     if validation is None and has_splits(data):
         validation = data
     train = as_source(take_split(data, "train"))

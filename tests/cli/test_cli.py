@@ -74,7 +74,7 @@ def test_show_prints_the_audit_and_draws_the_graph(capsys, tmp_path):
         ("show srnn --generative p(x_t)", "not both"),
         ("fit", "dvae fit --help"),
         ("data get", "dvae data get --help"),
-        ("sweep --step 4", "--step is no option of dvae sweep (did you mean '--steps'"),
+        ("sweep --step 4", "--step is not an option of dvae sweep (did you mean '--steps'"),
         ("fit vae --optimizer adm --out run", "did you mean 'adam'"),
         ("fit vae --learning-rate -1 --out run", "learning_rate is -1.0; it must be finite and at least 0"),
         ("fit vae --decay 1.5 --out run", "decay is 1.5; it must be between 0 and 1"),
@@ -579,7 +579,7 @@ def test_scores_are_equal_for_every_format_and_representation(people, tmp_path, 
         return dvae.Evaluation.load(out)
 
     forms = table(*runs, "--data", str(npz))
-    assert any("bounds of 6d: densities of turns" in note for note in forms.notes)
+    assert any("bounds of 6d: densities of joint rotations" in note for note in forms.notes)
     for run in runs:
         name = Path(run).name
         for other in (table(run, "--data", str(npz)), table(run, "--data", str(folder))):

@@ -142,9 +142,9 @@ def test_values_that_are_not_finite_are_an_error_in_every_block(monkeypatch):
     monkeypatch.setattr("dvae.data.blocks.NUMBERS", 20)
     values = torch.from_numpy(walks((9, 5, 2)))
     values[4, 2, 1], values[7, 0, 0] = torch.nan, torch.inf
-    with pytest.raises(ValueError, match=r"x has 2 entries that are NaN or infinite, the first in sequence 4;"):
+    with pytest.raises(ValueError, match=r"x is NaN or infinite in 2 entries, the first in sequence 4;"):
         Sequences({"x": values})
-    with pytest.raises(ValueError, match=r"x has 1 entries that are NaN or infinite, the first in sequence 7;"):
+    with pytest.raises(ValueError, match=r"x is NaN or infinite in 1 entries, the first in sequence 7;"):
         Sequences({"x": values, "lengths": torch.tensor([2] * 9)})
     Sequences({"x": values, "mask": values.isfinite()})
     people = motion.simulate(clips=1, frames=30)

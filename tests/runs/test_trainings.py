@@ -65,9 +65,14 @@ def test_options_that_are_not_given_come_from_the_method(people, tmp_path, monke
 def test_show_prints_the_training_options_of_a_method(capsys):
     assert main(["show", "cvae"]) == 0
     output = capsys.readouterr().out
-    assert "fitted to human36m in 39063 steps of 64, adam, learning rate 0.001, at the end 0" in output
-    assert "fitted to other data in 2000 steps of 32" in output
+    assert (
+        "training defaults for human36m: 39063 steps, batches of 64, adam, learning rate 0.001 that falls to 0"
+        in output
+    )
+    assert "training defaults for other data: 2000 steps, batches of 32" in output
     assert main(["show", "pose-prior"]) == 0
-    assert "fitted to human36m in 1225 steps of 33, adam, learning rate 0.01" in capsys.readouterr().out
+    assert (
+        "training defaults for human36m: 1225 steps, batches of 33, adam, learning rate 0.01" in capsys.readouterr().out
+    )
     assert main(["show", "pose-prior", "--out", "graph.png"]) == 2
     assert "leave out --out" in capsys.readouterr().err

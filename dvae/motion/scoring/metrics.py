@@ -94,8 +94,9 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
 
 def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:
     """Return the explanation of multimodal errors for the caption of a table."""
-    closer = f"all windows whose last poses are closer than {threshold:g} m{', itself included' if itself else ''}"
-    return f"MM: over the futures of {closer}; {alone} of {windows} have no other"
+    own = "; they include the window itself" if itself else ""
+    closer = f"windows whose last observed pose is closer than {threshold:g} m{own}"
+    return f"MM (multimodal): true futures are those of all {closer}; {alone} of {windows} have no other"
 
 
 def multimodal_errors(samples: Array, truths: Array) -> Tensor:

@@ -354,14 +354,14 @@ def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
         return mean_of_known(moved(_where_true(forecasts, truth)), 1)
 
     real = mean_of_known(moved(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :]), -1)
-    scope = f"of the windows of each {label}, {len(names)} in all" if label else "of all windows as one class"
+    scope = f"each {label} is a class, {len(names)} in total" if label else "all windows are one class"
     return Measure(
         "CMD",
         function,
         "m",
         partial=windows.missing,
         pool=lambda motion, clips: motion_pseudo_values(motion, real, classes, clips),
-        note=f"CMD: {scope}, against the pace of their true futures",
+        note=f"CMD: {scope}; its forecasts are compared with the pace of its true futures",
         basis={"CMD": {"label": label, "classes": names}},
     )
 
@@ -381,7 +381,7 @@ def _jerk(windows: Windows | ExchangedWindows) -> Measure:
         return mean_of_known(jerk(torch.cat([observed, _where_true(forecasts, truth)], 2)), 1)
 
     real = mean_of_known(jerk(Batch(windows.all()).mask_to_nan()[:, start:]), 0)
-    note = f"jerk: {real:.1f} m/s³ of real motion"
+    note = f"jerk: real motion has {real:.1f} m/s³"
     return Measure("jerk", function, "m/s³", "", partial=windows.missing, note=note)
 
 

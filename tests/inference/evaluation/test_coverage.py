@@ -118,7 +118,7 @@ def test_rows_with_too_few_forecasts_have_no_intervals_and_a_note(truth, scored)
     few = evaluate(model, windows, scores=calibrated, samples=10, references=False, progress=False)
     assert {"coverage 50 %", "coverage 80 %"} <= few["model"].keys()
     assert not {"coverage 90 %", "coverage 95 %", "PIT mean"} & few["model"].keys()
-    note = "left out, as they need more than 10 forecasts: coverage 90 % (19), coverage 95 % (39)"
+    note = "left out, with the number of forecasts that they need, more than 10: coverage 90 % (19), coverage 95 % (39)"
     assert note in " ".join(few.notes)
     with pytest.raises(KeyError, match="histogram"):
         few.departure("model")

@@ -168,4 +168,4 @@ def test_jerk_is_the_third_derivative_including_the_seam(windows):
     leap[4:] = 0.1  # a jump between past and future gives 1, -2, 1 in six third differences
     assert jerk(leap) == pytest.approx(0.1 * 3**0.5 * fps**3 * 4 / 6)
     real = np.linalg.norm(np.diff(windows.positions(x)[:, 1:, 1:].numpy(), 3, axis=1), axis=-1).mean() * fps**3
-    assert measure.note == f"jerk: {real:.1f} m/s³ of real motion"
+    assert measure.note == f"jerk: real motion has {real:.1f} m/s³"
