@@ -157,9 +157,7 @@ def _note_omitted(samples: int, out: Path, figure: Path | None = None) -> None:
         {} if figure is None else {f"the interval of {100 * level:g} %": samples_needed(level) for level in BANDS}
     )
     if omitted := [f"{name} ({draws})" for name, draws in n_needed.items() if draws > samples]:
-        note(
-            f"left out, with the number of draws (--samples) that they need, more than {samples}: {', '.join(omitted)}"
-        )
+        note(f"left out at --samples {samples} (draws needed in brackets): {', '.join(omitted)}")
 
 
 def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:

@@ -138,9 +138,9 @@ class Units(nn.Module):
         if values.ndim == 3 and exceeds_float32(values.dtype) and self.scale.dtype is torch.float32:
             imprecise = imprecise_sequences(values, summary.mean)
             if imprecise.any():
-                rows, coordinate = np.asarray(imprecise).any(1), imprecise.any(0).argmax()
+                rows, coordinate = imprecise.any(1), imprecise.any(0).argmax()
                 warnings.warn(
-                    f"in {rows.sum()} of {len(rows)} sequences, such as {rows.argmax()}, coordinate {coordinate} "
+                    f"in {rows.sum()} of {len(imprecise)} sequences, such as {rows.argmax()}, coordinate {coordinate} "
                     "varies by less than float32 resolves at its distance from the mean of all sequences, "
                     f"{summary.mean[coordinate]:.9g}; {LEVELS}",
                     stacklevel=3,  # the decorator `no_grad` adds a frame

@@ -189,13 +189,15 @@ def test_the_number_of_draws_suffices_for_the_quantiles(table_runs, tmp_path, ca
         assert main([*run, str(tmp_path / "a.npz"), "--samples", "9"]) == 0
         assert "left out" not in capsys.readouterr().err
         assert main([*run, str(tmp_path / "a.csv"), "--samples", "9"]) == 0
-        note = "left out, because they need more than 9 draws (--samples): q025 (39), q050 (19), q950 (19), q975 (39)"
+        note = "left out at --samples 9 (draws needed in brackets): q025 (39), q050 (19), q950 (19), q975 (39)"
         assert note in " ".join(capsys.readouterr().err.split())
         columns = [name for name in pd.read_csv(tmp_path / "a.csv") if name.startswith("q")]
         assert columns == ["q100", "q250", "q500", "q750", "q900"]
     out = ["--out", str(tmp_path / "a.npz"), "--figure", str(tmp_path / "a.png"), "--samples", "19"]
     assert main(["forecast", str(table_runs / "autoregressive"), *out]) == 0
-    assert "need more than 19 draws (--samples): the interval of 95 % (39)" in " ".join(capsys.readouterr().err.split())
+    assert "left out at --samples 19 (draws needed in brackets): the interval of 95 % (39)" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def test_a_report_shows_forecast_fans_of_a_table(table_runs, tmp_path):

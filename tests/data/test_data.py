@@ -127,7 +127,7 @@ def test_fitting_a_method_to_arrays_equals_building_it_from_their_sizes(data):
 def test_evaluating_on_arrays_without_observed_steps_is_an_error(model, name):
     for data in (X, X.numpy(), {"x": X}):
         with pytest.raises(
-            TypeError, match=r"got (Tensor|ndarray|dict); of an array x \(N, T, D\).*ArrayWindows\(x, ob"
+            TypeError, match=r"got (Tensor|ndarray|dict); pass an array x \(N, T, D\) as `dvae.ArrayWindows\(x, ob"
         ):
             ENTRIES[name](model, data)
 

@@ -457,7 +457,7 @@ def test_composed_views_add_their_log_determinants():
     )
     assert not view.keeps_volume
     assert Views(parts, History("h")).keeps_volume
-    with pytest.raises(ValueError, match="changes the volume of frames that are not scored"):
+    with pytest.raises(ValueError, match="changes the volume of steps that are not scored"):
         Views(Scaled(), Past("s"))
     assert Views(Past("s"), Scaled()).log_det(Batch({"x": x})).shape == (B,)
 

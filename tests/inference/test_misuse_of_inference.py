@@ -111,7 +111,7 @@ EVALUATION = [
     (lambda: run(dvae.compare, {"a": nn.Linear(2, 2)}, X), "Linear"),
     (lambda: run(dvae.compare, {"a": MODEL}, X, particles=0), "at least 1"),
     (lambda: run(dvae.compare, {"a": [MODEL, linear_gaussian_surrogate(*DKF, {"z": 2, "x": 1}, T)]}, X), "seed"),
-    (lambda: run(conformal_bands, MODEL, WINDOWS), "clips"),
+    (lambda: run(conformal_bands, MODEL, WINDOWS), "at least 9 sequences"),
     (lambda: run(conformal_bands, MODEL, WINDOWS, 1), "between"),
     (lambda: run(evaluate, {}, WINDOWS, samples=0), "samples"),
     (lambda: run(evaluate, {}, WINDOWS, scores="motion"), "scores"),

@@ -47,7 +47,7 @@ def test_scores_of_columns_with_different_units_do_not_depend_on_the_units(units
     measure_units = {measure.name: measure.unit for measure in panel_scores(windows)}
     assert (measure_units["energy score"], measure_units["CRPS"], measure_units["width 90 %"]) == ("scales",) * 3
     assert (measure_units["CRPS, a"], measure_units["coverage 50 %"]) == (UNITS[units][0], "share")
-    assert "in the scales of their columns" in proper(windows)[0].note
+    assert "divide each column by its scale" in proper(windows)[0].note
 
 
 def test_scores_of_columns_with_one_unit_are_in_that_unit():
@@ -74,7 +74,7 @@ def test_statistics_of_columns_with_different_units_do_not_depend_on_the_units()
     units = {name: check.unit for (_, _, name), check in first.checks.items()}
     assert [units[name] for name in ("mean", "scale", "roughness", "smallest", "largest")] == ["scales"] * 5
     assert (units["correlation length"], units["lag-1 correlation"], units["zeros"]) == ("steps", "", "share")
-    assert "of all columns together are of numbers in their scales" in " ".join(str(first).split())
+    assert "statistics over all columns divide each column by its scale" in " ".join(str(first).split())
 
 
 def test_a_model_without_latents_has_no_posterior_checks():

@@ -183,7 +183,7 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
     result.save(tmp_path / "evaluation.json")
     again = Evaluation.load(tmp_path / "evaluation.json")
     sizes = {"windows": 12, "frames": FRAMES, "coordinates": SIZE}
-    assert again.data == {"fingerprint": windows.fingerprint, "called": ["sequence", "step"], **sizes}
+    assert again.data == {"fingerprint": windows.fingerprint, "called": ["group", "step"], **sizes}
     assert again.to_json() == result.to_json()
     assert (again.samples, again.seed, again.bound_particles) == (5, 5, 3)
     assert again.protocol == {"observed": OBSERVED}

@@ -201,7 +201,7 @@ def test_an_impossible_launch_is_an_error(monkeypatch):
 
 
 def test_torchrun_sets_the_number_of_processes(monkeypatch):
-    assert processes._places(2) == (2, 1)
+    assert processes._count_processes(2) == (2, 1)
     for name, value in {"TORCHELASTIC_RUN_ID": "none", "LOCAL_WORLD_SIZE": "2", "WORLD_SIZE": "6"}.items():
         monkeypatch.setenv(name, value)
     assert processes._count_processes(1) == processes._count_processes(2) == (2, 3)
