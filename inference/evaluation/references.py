@@ -10,7 +10,6 @@ from torch import Tensor
 from ...data.batch import Batch
 from ...data.sequences import (
     HeldOutWindows,
-    columns_of,
     interpolate_missing,
     mean_of_known,
     sequences,
@@ -21,10 +20,8 @@ from .evaluation_windows import EvaluationWindows
 
 Forecaster = Callable[[slice], Tensor]
 """Function from a slice of windows to forecasts (K, B, H, D)."""
-OF_ARRAYS = ("last value", "nearest neighbours")
-"""Default reference rows of windows without named columns."""
-OF_TABLES = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
-"""Default reference rows of windows with named columns."""
+USUAL = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
+"""Default reference rows of windows that name none."""
 
 _EXACT = "donot_use_mm_for_euclid_dist"
 
@@ -225,9 +222,8 @@ class References:
 
     @property
     def usual(self) -> list[str]:
-        """Available default rows of an evaluation: the names in the windows, or else the rows for their kind."""
-        names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
-        return [name for name in names if not self.missing_requirement(name)]
+        """Available default rows of an evaluation: the names in the windows, or else all rows."""
+        return [name for name in self._names or USUAL if not self.missing_requirement(name)]
 
     @property
     def _names(self) -> Mapping[str, str]:

@@ -9,7 +9,7 @@ import signal
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -293,6 +293,27 @@ def _prepare_options(recipe: Recipe, model: nn.Module, options: Mapping[str, Any
     return {**options, **recipe_options}
 
 
+CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+"""Where Linux states how many cores a container may use."""
+
+
+def _thread_advice() -> str:
+    """Return a warning if torch has more threads than free cores, which makes small networks many times slower."""
+    threads, cores = torch.get_num_threads(), os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    with suppress(OSError, ValueError):  # a container's limit: "max 100000" or "200000 100000"
+        quota, period = CPU_LIMIT.read_text(encoding="ascii").split()
+        cores = min(cores, max(round(int(quota) / int(period)), 1))
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    if threads == 1 or (threads <= cores and busy <= 1.25 * cores):  # a fit before this one counts as busy, too
+        return ""
+    return (
+        f"torch uses {threads} threads on {cores} cores, where {busy:.1f} threads run; training can be many times "
+        "slower than on one thread; set OMP_NUM_THREADS=1 or call torch.set_num_threads(1)"
+    )
+
+
 def _fit(
     model: nn.Module,
     train: Any,
@@ -325,6 +346,8 @@ def _fit(
     with ExitStack() as stack:
         stack.callback(model.eval)
         state, first = svi.init(), svi.fabric.is_global_zero
+        if svi.fabric.device.type == "cpu" and (advice := _thread_advice()):
+            warnings.warn(advice, stacklevel=3)
         if run is not None and first:
             stack.enter_context(run.locked())
         processes.wait(svi.fabric)  # every process must look for an earlier run before the first one writes
