@@ -50,7 +50,7 @@ class Input:
 
 
 class Network(nn.Module):
-    """A module from parents to features under masks; its contract is described in `docs/networks.md`.
+    """A module from parents to features under masks; its contract is described in `docs/reference/networks.md`.
 
     Args:
         inputs: the parents.

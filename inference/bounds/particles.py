@@ -55,7 +55,7 @@ def fivo_bound(
 
     exp(bound) is unbiased for p(x) with any number of particles, so on average the bound rises with their number to the
     log evidence. With one particle it is the evidence lower bound at one draw. Without resampling it is the IWAE bound,
-    which it exceeds on long sequences unless the guide is nearly exact (docs/bounds.md).
+    which it exceeds on long sequences unless the guide is nearly exact (docs/explanation/bounds.md).
 
     Resampling is systematic. Static latents are drawn first and resampled with their particle. Several local latents
     are drawn in the guide's order within each step.

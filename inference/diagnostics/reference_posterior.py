@@ -371,7 +371,7 @@ def reference_posterior(
     """Compare a guide with the posterior of the latents of some sequences.
 
     The posterior of a linear-Gaussian model is exact. For any other model it is sampled by NUTS, which is slow: see
-    docs/criticism.md for the cost. The result reports whether sampling has converged.
+    docs/how-to/calibrate.md for the cost. The result reports whether sampling has converged.
 
     Args:
         model: generative model; its own guide is tested by default.

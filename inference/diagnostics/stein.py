@@ -133,8 +133,8 @@ def stein_discrepancy(
     """Test for each sequence whether a guide's draws are from the posterior, on data of any kind.
 
     The test uses the gradient of the log joint at the guide's draws, and no draws from the posterior. A small p-value
-    shows that the guide is wrong. A large one is weak evidence if there are many latent values: see docs/criticism.md
-    for the power of the test.
+    shows that the guide is wrong. A large one is weak evidence if there are many latent values: see
+    benchmarks/results/criticism for the power of the test.
 
     Args:
         model: generative model; its own guide is tested by default.

@@ -5,7 +5,7 @@ averaged, as if one process had all these batches. They are sent together with t
 are small and the number of messages costs more than their size. torch's own wrapper sends gradients in buckets, copies
 buffers at every pass, and refuses a parameter without a gradient.
 
-lightning-fabric starts the processes on one machine, torchrun those on several (`docs/scaling.md`).
+lightning-fabric starts the processes on one machine, torchrun those on several (`docs/how-to/scale_and_gpus.md`).
 """
 
 import atexit

@@ -21,7 +21,7 @@ choices were not applicable or worked less well:
   only couplings read the past, and a frame is a pose. The baseline of TrajeVAE adds its draw to the last pose.
 * A coupling multiplies by a factor between exp(-`bound`) and exp(`bound`), in the paper by sigmoid(k + 2) + 1e-6. Draws
   divide by this factor. With a bound of 2, one in nine draws left the range of the data and never returned (bandai2's
-  tuning split, docs/results/tuning.md).
+  tuning split, benchmarks/results/tuning).
 """
 
 from __future__ import annotations

@@ -15,6 +15,8 @@ from dvae import distributions
 from dvae.distributions import Family, Shape
 from dvae.inference.training.svi import NonFiniteError
 from dvae.networks import Dense, Recurrent
+from dvae.program.model import DynamicalVAE
+from dvae.testing import FactorizationContract
 
 PAIR = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
 MIXED = distributions.Product((((1,), Family("Poisson")), ((0, 3), distributions.Normal()), ((2,), Family("Gamma"))))
@@ -308,13 +310,17 @@ def test_a_custom_class_is_a_valid_family():
     assert built(Family(Twice)).generator["x"].head.label == "Twice"
 
 
-# ------------------------------------------------------------------------------ the custom family of docs/families.md
+# ------------------------------------------------------------ the custom family of docs/how-to/observations.md
 
-PAGE = (Path(__file__).parents[2] / "docs" / "families.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "observations.md").read_text(encoding="utf-8")
 NAMESPACE: dict = {}
-for block in re.findall(r"```python\n(.*?)```", PAGE.partition("## A family of one's own")[2], re.DOTALL):
-    exec(compile("import torch, dvae\npair = " + repr(PAIR) + "\n" + block, "families.md", "exec"), NAMESPACE)
+(example,) = re.findall(r"```python\n(.*?)```", PAGE.partition("## Your own distribution")[2], re.DOTALL)
+(definitions, _) = example.split("\nmodel = ")
+exec(compile("import torch, dvae\n" + definitions, "observations.md", "exec"), NAMESPACE)
 
 
-class TestCustomFamilyOfThePage(NAMESPACE["TestBursts"]):
-    """The family that docs/families.md defines."""
+class TestCustomFamilyOfThePage(FactorizationContract):
+    """The family that docs/how-to/observations.md defines."""
+
+    def build(self, size):
+        return DynamicalVAE(*PAIR, {"z": size, "x": size}, distributions={"p(x)": NAMESPACE["Bursts"]()})

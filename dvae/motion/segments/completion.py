@@ -65,7 +65,7 @@ class Deviations:
 
     They include the error of the decoder. Errors of neighbouring frames are correlated, but the likelihood assumes
     independent errors: verify the coverage of intervals on known segments. The defaults had the smallest vertex errors
-    on unseen styles (docs/results/motion_latent_4d.md).
+    on unseen styles (benchmarks/results/motion_latent_4d).
 
     Args:
         surface: metres, for the surface of a frame as a whole.
