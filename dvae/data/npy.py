@@ -30,7 +30,7 @@ NOTHING = 2**20
 
 
 class NpyError(ValueError):
-    """A file is damaged, or its content is not data."""
+    """Error for a file that is damaged or contains something other than plain data."""
 
 
 def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any]:
@@ -76,14 +76,14 @@ def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = 
 
 
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
-    """Return the numbers of an npy file as a read-only memory map; data are read on use.
+    """Return the numbers of an npy file as a read-only memory map; values are read from disk when they are used.
 
     If another process truncates the file, the program crashes. If the file is replaced, as `files.atomic_write` does,
     the map keeps the old content.
 
     Args:
         path: the file.
-        links: follow a link, for a path that the user typed.
+        links: whether to follow a symbolic link, for a path that the user typed.
 
     Raises:
         ValueError: if the path is a link or not a file, or the file is truncated or not an npy file of real numbers in
@@ -121,8 +121,8 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
             raise
         raise OSError(
             error.errno,
-            "every mapped file stays open, and the limit of open files is reached (ulimit -n); write fewer, longer "
-            "ones",
+            "the limit of open files is reached, because every mapped file stays open; raise the limit (ulimit -n), or "
+            "write fewer, longer files",
             path,
         ) from error
 
