@@ -41,7 +41,7 @@ class Groups:
             ValueError: if the labels are not integers of shape (B,).
         """
         if index.dim() != 1 or index.is_floating_point():
-            raise ValueError(f"group is {index.dtype} {tuple(index.shape)}; expected whole numbers (B,)")
+            raise ValueError(f"'group' of the batch is {index.dtype} {tuple(index.shape)}; expected integers (B,)")
         _, place, count = torch.unique(index, return_inverse=True, return_counts=True)
         rows = torch.arange(len(place), device=place.device)
         # the smallest row: with several writes to one place, the last one is undefined on a GPU
@@ -110,7 +110,9 @@ class Grouped(TorchDistribution):
     def expand(self, batch_shape: Any, _instance: object = None) -> Grouped:
         """Return itself; only its own batch shape is supported."""
         if torch.Size(batch_shape) != self.batch_shape:
-            raise NotImplementedError(f"the batch of its groups is {self.batch_shape}, not {batch_shape}")
+            raise NotImplementedError(
+                f"a grouped latent of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}"
+            )
         return self
 
     def log_prob(self, value: Tensor) -> Tensor:
