@@ -39,7 +39,7 @@ class Section:
 
     Args:
         title: heading.
-        cells: {run: its content}; equal contents are shown once.
+        cells: dictionary from run name to content; equal contents are shown once.
         about: explanation of one or two sentences.
         before: content for all runs together.
     """
