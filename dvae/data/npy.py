@@ -52,7 +52,7 @@ def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any
         raise NpyError(f"damaged, or not a plain array: the header of its npy file is {text[:100]!r}")
     lengths = [length.strip().removesuffix("L") for length in match["shape"].split(",") if length.strip()]
     if not all(re.fullmatch(r"\d{1,18}", length) for length in lengths):
-        raise NpyError(f"damaged: its shape is ({match['shape'][:100]})")
+        raise NpyError(f"damaged: its shape is ({match['shape'][:100]}), expected whole numbers")
     return dtype_of(match["descr"]), tuple(map(int, lengths)), "F" if match["order"] == "True" else "C"
 
 
@@ -71,8 +71,8 @@ def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = 
     """Check that the shape matches the number of bytes; also refuse an empty array with very large dimensions."""
     n_bytes, padded = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
     if len(shape) > 32 or n_bytes != size or padded > max(size, NOTHING):
-        short = f", needs {n_bytes:,}; it was cut short, copy or write it again" if n_bytes > size else ""
-        raise NpyError(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes{short}")
+        short = f" instead of {n_bytes:,}; it was cut short, so copy or write it again" if n_bytes > size else ""
+        raise NpyError(f"{verb} shape {shape} of {dtype}, but holds {size:,} bytes{short}")
 
 
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:

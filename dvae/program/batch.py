@@ -31,7 +31,7 @@ AnyBatch = Tensor | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader of a model's batches.
+    """Validation of a model's batches, and conversion to its precision and representation.
 
     Args:
         sizes: dimension of every variable.

@@ -76,8 +76,8 @@ class Conditional(nn.Module):
         ValueError: if the network and the distribution do not fit together.
 
     Attributes:
-        discrete, reparameterised, whole: as the distribution declares (`ConditionalDistribution.discrete`,
-            `ConditionalDistribution.event_dim`).
+        discrete, reparameterised: as the distribution declares (`ConditionalDistribution`).
+        whole: whether all coordinates form one event (`ConditionalDistribution.event_dim`).
     """
 
     interior_point: Tensor | None

@@ -356,7 +356,7 @@ class Oracle:
 
     @staticmethod
     def _divergence(distance: Tensor, precision: Tensor, root: Tensor) -> Tensor:
-        """Return KL(N(m, root root'), N(n, precision^-1)), given the distance of m and n under the precision."""
+        """Return KL(N(m, root root'), N(n, precision^-1)), given the squared Mahalanobis distance of m and n."""
         spread = (root.mT @ precision * root.mT).sum((-2, -1))
         log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
         divergence: Tensor = 0.5 * (spread + distance - root.shape[-1] - log_volume)

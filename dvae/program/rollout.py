@@ -114,7 +114,7 @@ class InputNoise:
 
 @dataclass(frozen=True)
 class Hidden:
-    """Entries of a data variable that the model may not read; it reads its own mean instead.
+    """Entries of a data variable that the model may not read; the model reads its own mean instead.
 
     Args:
         entries: (B, T, 1 or D), or (B, D) of a static variable.
@@ -566,7 +566,7 @@ class Sequence(TorchDistribution):
         return self.rollout.draw(self.name)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Draw as `rsample`, without a gradient; variables drawn in the same loop keep theirs."""
+        """Draw as `rsample`, without a gradient; variables drawn in the same loop keep their gradients."""
         return self.rsample(sample_shape).detach()
 
     def steps(self, value: Tensor) -> TorchDistribution:
@@ -598,7 +598,7 @@ class Sequence(TorchDistribution):
         return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Sequence:
-        """Return itself; a run has only one batch shape."""
+        """Return the distribution itself; any other batch shape raises an error."""
         if torch.Size(batch_shape) != self.batch_shape:
             raise NotImplementedError(
                 f"a Sequence of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}; "

@@ -40,7 +40,7 @@ class Dataset(Protocol):
 
     @classmethod
     def open(cls, path: str, *, skip_bad: bool = False, **options: Any) -> Self:
-        """Read a file, with the options of this kind from the command line."""
+        """Read a file; `options` are those that the command line has for this kind of data."""
 
     @property
     def location(self) -> str:

@@ -44,7 +44,7 @@ from .kinds import Dataset
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run of a sweep.
+    """Result of a run of a sweep.
 
     Args:
         path: run directory.
@@ -392,7 +392,7 @@ class _Log:
 
 
 class _Progress:
-    """Progress of a sweep: a line when each run ends, and a live table, or without a terminal a line at each start."""
+    """Progress of a sweep: a line at each end of a run, and a live table or, without a terminal, a line at each start."""
 
     def __init__(self, runs: Sequence[_Run], visible: bool) -> None:
         self.console = PlainConsole(stderr=True, quiet=not visible, force_jupyter=False)

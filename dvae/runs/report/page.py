@@ -120,7 +120,7 @@ def missing_part(text: str) -> Markup:
 
 
 def command(*words: str) -> Markup:
-    """Return a command to type."""
+    """Return a shell command that the reader can copy."""
     return Markup("<code>{}</code>").format(" ".join(words))
 
 
