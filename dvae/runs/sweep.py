@@ -392,7 +392,7 @@ class _Log:
 
 
 class _Progress:
-    """Progress of a sweep: a line at each end of a run, and a live table or, without a terminal, a line at each start."""
+    """Progress of a sweep: a line when a run ends, and a live table; without a terminal, a line when a run starts."""
 
     def __init__(self, runs: Sequence[_Run], visible: bool) -> None:
         self.console = PlainConsole(stderr=True, quiet=not visible, force_jupyter=False)
