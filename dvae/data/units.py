@@ -32,7 +32,7 @@ ROUNDING = 2e-15
 RESOLVED = 6e-6
 """Ratio of standard deviation to mean below which float32 loses more than a hundredth of the deviation."""
 SMALLEST = 1e-18
-"""Smallest standard deviation, such that the inverse of its square is a float32."""
+"""Smallest supported standard deviation; the inverse of its square is still a finite float32."""
 TOO_SMALL = f"models compute in float32, which needs at least {SMALLEST:g}; multiply the values by a constant"
 
 
@@ -41,7 +41,10 @@ LEVELS = "subtract from each sequence its own mean, or fit in float64"
 
 
 def is_imprecise(summary: ColumnSummary, center: Any) -> np.ndarray:
-    """Return whether columns vary, but by less than float32 resolves at their distance from a center."""
+    """Return whether each column varies by less than float32 resolves at its distance from a center, (C,).
+
+    It is False for constant columns.
+    """
     spread = np.sqrt(summary.variance)
     return (spread > ROUNDING * abs(summary.mean)) & (spread < RESOLVED * abs(summary.mean - center))  # type: ignore[no-any-return]
 
@@ -68,7 +71,7 @@ class Coordinate(NamedTuple):
     Args:
         mean, scale: mean and scale that standardise the values.
         typical: replacement for a missing value.
-        floor: smallest value whose logarithm is read; 0 to read values instead of logarithms.
+        floor: lower limit to which values are clipped before networks read their logarithms; 0 if networks read values.
         level, spread: mean and standard deviation of the logarithms.
     """
 
@@ -85,7 +88,9 @@ EXACT = ("mean", "typical")
 
 
 class Units(nn.Module):
-    """A mean for every coordinate and one scale for all, which preserves angles; 0 and 1 until `fit`.
+    """Standardisation with a mean for every coordinate and one common scale, which preserves angles.
+
+    Means are 0 and the scale is 1 until `fit` is called.
 
     Args:
         size: D.
@@ -117,7 +122,7 @@ class Units(nn.Module):
         Warns if float32 does not resolve how sequences (N, T, D) vary after their common mean is subtracted.
 
         Raises:
-            ValueError: if the values do not vary or have another size, or coordinates were given their units.
+            ValueError: if the values do not vary or have another size, or the units of the coordinates were given.
         """
         if self.scale.dim():
             raise ValueError("these coordinates have given units, which cannot be fitted; remove the call of fit")
@@ -148,7 +153,7 @@ class Units(nn.Module):
 
     @property
     def wide(self) -> bool:
-        """Whether values are in float64 and the model is not."""
+        """Whether values are read in float64 although the model has another precision."""
         return self.mean.dtype is torch.float64 is not self.scale.dtype
 
     @override

@@ -31,17 +31,17 @@ AnyBatch = Tensor | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader of a model's batches.
+    """Validation of a model's batches, and conversion to its precision and representation.
 
     Args:
         sizes: dimension of every variable.
-        local: name to whether the variable has a value for every step.
+        local: dictionary from variable name to whether the variable has a value for every step.
         observed: names of the data variables.
         context: names of the variables that a batch must give.
         view: transformation of the data that the model sees.
         extras: names of other entries that a batch may have.
         made: names of data variables that are deterministic given their parents; they are not passed to a program.
-        distributions: conditionals of the data, which give the support and the events of the values.
+        distributions: conditionals of the data, which declare the support and the coordinates of each joint event.
         density: whether the data have a density, so that a view that changes volume needs a log-determinant.
         grouped: names of static latents that groups of sequences share.
     """
@@ -60,14 +60,14 @@ class Reader:
     def read(
         self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor], wide: Collection[str] = ()
     ) -> Batch:
-        """Return the batch by name, in this precision and as the model sees it.
+        """Return the batch as a dictionary of tensors, in this precision and in the model's representation.
 
         Reading the result again does not change it.
 
         Args:
             batch: as in `DynamicalVAE.model`.
             dtype: precision of floating-point values.
-            means: name to the value at missing entries, where it is not 0.
+            means: dictionary from variable name to the values (D,) of missing entries; 0 for other variables.
             wide: names of variables that are read in float64 whatever the dtype.
 
         Raises:
@@ -112,8 +112,8 @@ class Reader:
                     if not torch.equal(masks[name][..., event].any(-1), masks[name][..., event].all(-1)):
                         raise ValueError(
                             f"the mask of {name} hides some entries of a step and not others, but its distribution has "
-                            f"one density for {len(event)} of them; hide them together, or give {name} a distribution "
-                            "with one for each, such as Normal()"
+                            f"one joint density for {len(event)} of them; hide all of these or none, or give {name} a "
+                            "distribution with a density for each entry, such as Normal()"
                         )
             fill = {name: means[name].to(result[name].dtype) if name in means else 0.0 for name in masks}
             result |= {name: torch.where(mask, result[name], fill[name]) for name, mask in masks.items()}
@@ -124,7 +124,7 @@ class Reader:
     def _check_mask(self, name: str, mask: Tensor, values: Batch) -> None:
         if name not in (*self.observed, self.view.history, WHOLE) or name not in values:
             tensors = {n: v for n, v in values.items() if isinstance(v, Tensor)}
-            raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(tensors)}")
+            raise ValueError(f"the batch has a mask of {name}, but no data of that name; it has {shapes(tensors)}")
         if mask.shape != values[name].shape or mask.dtype != torch.bool:
             raise ValueError(
                 f"the mask of {name} is {mask.dtype} {tuple(mask.shape)}; expected bool {tuple(values[name].shape)}, "
@@ -143,7 +143,7 @@ class Reader:
 
         Args:
             factorization: the factorization.
-            conditionals: name to `Conditional` of each factor.
+            conditionals: dictionary from the child of each factor to its `Conditional`.
             batch: batch that `read` returned.
             length: T; None for the length of the batch.
             size: B, if the batch does not determine it.
@@ -162,7 +162,9 @@ class Reader:
         local = {name: v for name, v in values.items() if v.dim() == 3}
         prefix = {name: v for name, v in local.items() if v.shape[1] < length}
         if max((v.shape[1] for v in local.values()), default=0) > length or not set(prefix) <= set(self.observed):
-            raise ValueError(f"expected {length} steps (fewer of data to continue), the batch holds {shapes(local)}")
+            raise ValueError(
+                f"expected {length} steps, or fewer for data that the model continues; the batch has {shapes(local)}"
+            )
         if lengths is not None:
             if lengths.is_floating_point() or lengths.shape != (size,):
                 raise ValueError(_lengths_message(lengths, length))
@@ -186,13 +188,13 @@ class Reader:
         )
 
     def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:
-        """Pad the history to all steps; its mask hides the padding."""
+        """Pad the history (`views.History`) to all steps; the custom mask of its relation hides the padding."""
         name = self.view.history
         if name is None or name not in values or (past := values[name].shape[1]) >= length:
             return
         for factor in factorization.factors:
             if factor.parent(name) is not None and factor.mask(name, length)[:, past:].any():
-                raise ValueError(f"{factor} reads more than the first {past} steps of {name}, but no others exist")
+                raise ValueError(f"{factor} reads {name} after step {past}, its last one; narrow the mask of {name}")
         values[name] = functional.pad(values[name], (0, 0, 0, length - past))
 
     def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
@@ -232,7 +234,7 @@ class Reader:
                     f"{name} holds {values[name][tuple(index)].item():g} (sequence {index[0]}, coordinate {index[-1]}),"
                     f" but under {distribution.factor}, {distribution.head.label}, values are "
                     f"{_describe_support(distribution.support)}; give {name} another"
-                    " distribution, move such entries inside, or hide them by the 'mask' of the batch"
+                    " distribution, correct such entries, or hide them by the 'mask' of the batch"
                 )
 
     def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:
@@ -267,7 +269,11 @@ def _lengths_message(lengths: Tensor, length: int) -> str:
 
 
 def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
-    """Return entries as tensors; floating-point values and these names are cast, counts and masks are not."""
+    """Return entries as tensors in their precision.
+
+    Floating-point entries and those in `names` get the dtype, or float64 if they are in `wide`. Masks and counts, such
+    as lengths, keep their type.
+    """
     tensors = Batch()
     for name, value in batch.items():
         if isinstance(value, Mapping):
@@ -363,7 +369,7 @@ def _describe_support(support: Any) -> str:
 
 
 def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tuple[int, int]:
-    """Return B and T, from the values if they determine them."""
+    """Return B and T as the values determine them, otherwise the given size and length."""
     sizes = {value.shape[0] for value in values.values()} or {size}
     if len(sizes) > 1:
         raise ValueError(f"the batch holds different numbers of sequences: {shapes(values)}")
@@ -412,7 +418,7 @@ def rows(value: Any, part: slice) -> Any:
 def in_chunks(
     make: Callable[[slice, int], Mapping[str, Tensor]], size: int, samples: int, chunk: int
 ) -> dict[str, Tensor]:
-    """Compute values (S, B, ...) for all sequences and samples in chunks, to limit memory in addition to the result.
+    """Compute values (S, B, ...) for all sequences and samples in chunks, to limit the memory of the computation.
 
     Args:
         make: function of a slice of b sequences and a number of samples n; returns values (n, b, ...) by name.

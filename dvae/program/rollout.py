@@ -35,16 +35,17 @@ class ScheduledSampling:
 
     Args:
         probability: probability of each frame, independently.
-        passes: None runs through time, exactly. A number of passes approximates this in parallel: each pass computes
-            the means of all steps at once from the history of the previous pass (T passes are exact). Within a pass,
-            several data variables follow the order of the model: a variable reads the means of earlier ones from the
-            same pass.
+        passes: None computes the means step by step, which is exact. A number of passes approximates this in parallel:
+            each pass computes the means of all steps at once from the history of the previous pass (T passes are
+            exact). If the model has several data variables, each reads the means of earlier variables from the same
+            pass.
         gradient: whether gradients flow through the means, and so back in time. Without it, as in Bengio et al., a step
             takes half the time or less, but the gradient differs from the gradient of the bound with scheduled
             sampling. Means at missing entries always have a gradient.
         start: number of first frames that are never replaced, such as those that a forecast observes.
-        blocks: numbers of frames: after `start`, the first number stays, the second may be replaced, and so on in turns
-            (Zhou et al., 2018, arXiv 1707.05363, use (5, 5)). None lets any frame be replaced.
+        blocks: a pair of numbers of frames. After `start`, the first number of frames is kept, the second number may be
+            replaced, and so on in turns (Zhou et al., 2018, arXiv 1707.05363, use (5, 5)). With None, any frame may be
+            replaced.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -113,7 +114,7 @@ class InputNoise:
 
 @dataclass(frozen=True)
 class Hidden:
-    """Entries of a data variable that the model may not read; it reads its own mean instead.
+    """Entries of a data variable that the model may not read; the model reads its own mean instead.
 
     Args:
         entries: (B, T, 1 or D), or (B, D) of a static variable.
@@ -139,24 +140,24 @@ class Rollout:
 
     Args:
         factorization: the factorization.
-        conditionals: name to `Conditional`.
+        conditionals: dictionary from child to `Conditional`.
         batch, length: B and T.
         values: known values: data, context, statics (B, D) and, once they are known, latents (B, T, D).
         data: names of the observed variables.
         lengths: (B,) valid steps of a ragged batch.
-        observed: name to (B, T, D), True where an entry of the data was observed. At other entries, the model reads its
-            own mean and the guide reads 0.
-        present: name of a local latent to (B, T), False at steps at which it is integrated out. Its density does not
-            count there, and networks that read it also read this mask (`networks.base.presence`).
-        prefix: name to the first values (B, O, D) of a variable that the run continues.
+        observed: dictionary from data variable to (B, T, D), True where an entry was observed. At other entries, the
+            model reads its own mean and the guide reads 0.
+        present: dictionary from local latent to (B, T), False at steps at which it is integrated out. Its density does
+            not count there, and networks that read it also read this mask (`networks.base.presence`).
+        prefix: dictionary from variables that the run continues to their first values (B, O, D).
         mean_emission: names of data variables that are set to their means instead of drawn.
-        feeding: replacement for the data's history, or None.
+        feeding: replacement for the data's history, a `ScheduledSampling` or `InputNoise`; None keeps the history.
         draws: current number of rows per sequence of the data (`fork`).
         drawing: draw the entries that the model may not read, instead of using its means.
         groups: groups of sequences that share the `grouped` variables; None if each sequence is its own group.
         grouped: names of static latents that groups share.
         sums: structure of the sum over discrete latents, if there are any.
-        states: name to drawn values of discrete latents, for draws of their readers; densities ignore them.
+        states: dictionary from discrete latent to drawn values, which draws of its readers use and densities ignore.
     """
 
     factorization: Factorization
@@ -361,7 +362,7 @@ class Rollout:
 
     @cached_property
     def _replacements(self) -> dict[str, Tensor]:
-        """Name to (B, T, D): the noisy data of the feeding; `history` adds the means block by block."""
+        """Dictionary from data variable to noisy data (B, T, D); `history` adds the model's means block by block."""
         noisy: dict[str, Tensor] = {}
         if not isinstance(self.feeding, InputNoise) or not self.feeding.scale:
             return noisy
@@ -565,7 +566,7 @@ class Sequence(TorchDistribution):
         return self.rollout.draw(self.name)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Draw as `rsample`, without a gradient; variables drawn in the same loop keep theirs."""
+        """Draw as `rsample`, without a gradient; variables drawn in the same loop keep their gradients."""
         return self.rsample(sample_shape).detach()
 
     def steps(self, value: Tensor) -> TorchDistribution:
@@ -597,7 +598,7 @@ class Sequence(TorchDistribution):
         return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Sequence:
-        """Return itself; a run has only one batch shape."""
+        """Return the distribution itself; any other batch shape raises an error."""
         if torch.Size(batch_shape) != self.batch_shape:
             raise NotImplementedError(
                 f"a Sequence of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}; "
@@ -635,7 +636,8 @@ class Marginal(Sequence):
     def steps(self, value: Tensor) -> TorchDistribution:
         """Raise an error: with states summed out, steps depend on one another."""
         raise NotImplementedError(
-            f"the variables that {self.name} reads are summed out, so its steps have no separate distributions"
+            f"{self.name} reads latents that are summed out, so its steps depend on one another and have no separate "
+            "distributions; use log_prob or by_step"
         )
 
     def by_step(self, value: Tensor) -> Tensor:
@@ -651,10 +653,11 @@ class Marginal(Sequence):
 
 
 def _runs(is_known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
-    """Yield first step and number of steps of each joint evaluation in a loop.
+    """Yield the first step and the number of steps of each evaluation in a loop.
 
-    Forward in time, these are stretches of steps with all values known, together with the next step. Its parameters
-    read only known values and earlier draws at the same step.
+    Forward in time, consecutive steps with known values are evaluated together with the step after them. The parameters
+    of that step read only known values and earlier draws at the same step. Backward in time, each step is evaluated
+    alone.
     """
     if direction < 0:
         yield from ((t, 1) for t in reversed(range(len(is_known))))
@@ -681,7 +684,8 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
                     t, s = np.argwhere(ahead)[0] + 1
                     raise ValueError(
                         f"the mask {parent.relation} of {factorization.factor(name)} reads {parent.name}_{s} at t={t} "
-                        f"of {length} steps, drawn after {name}_{t}; a mask keeps its direction at every length"
+                        f"of {length} steps, but {parent.name}_{s} is drawn after {name}_{t}; the mask must have the "
+                        "same direction in time at every length"
                     )
 
 

@@ -234,7 +234,7 @@ def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypat
     ("keys", "value", "message"),
     [
         (("data", "cut"), "steps", "unknown cut 'steps'"),
-        (("data", "kind"), "motion", "have a schema of the kind 'poses', got 'segments'"),
+        (("data", "kind"), "motion", "require a schema of kind 'poses', got 'segments'"),
         (("schema", "timed", "frames"), 16384, "is larger than its weights"),
         (("schema", "timed", "skeleton", "names"), ["a"], "skeleton|names|parents"),
     ],

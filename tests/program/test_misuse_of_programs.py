@@ -174,7 +174,7 @@ PROGRAMS = [
     (lambda: ScheduledSampling(1.0, blocks=(0, 5)), "blocks"),
     (lambda: InputNoise(math.nan), "finite"),
     (lambda: model(DKF, indicators=("z",)), "indicators"),
-    (lambda: model(GROUPED, {"g": 2, "w": 2, "x": 3}, grouped=("x",)), "groups share"),
+    (lambda: model(GROUPED, {"g": 2, "w": 2, "x": 3}, grouped=("x",)), "must name static latents"),
     (lambda: model(GROUPED, {"g": 2, "w": 2, "x": 3}, grouped=("w",)), "reads"),
     (lambda: MODEL.impute({"x": X, "mask": X == 0}, 3, particles=0), "particles"),
     (lambda: Discrete(1), "states"),

@@ -111,7 +111,7 @@ def table(tmp_path):
         ("training.seed = 3\n[a]\nmethod='vae'", r"seeds = \[...\] instead"),
         ("['../a']\nmethod='vae'", "cannot name run directories"),
         ("[a]\neach.inference=['faithful', 'q(z_t | x_t)']", "each text value its own table"),
-        ("[a]\nmethod='vae'\neach.latent=[3]\n['a-latent=3']\nmethod='srnn'", "another table's run"),
+        ("[a]\nmethod='vae'\neach.latent=[3]\n['a-latent=3']\nmethod='srnn'", "two tables give a run the name"),
         ("[a]\nx=" + "[" * 3000, "is not TOML"),
         ("steps = 3\n[a]\nmethod='vae'", "steps = 3 is in no table"),
         ("[a]\nmethod='srn'", r"\[a\]: unknown method 'srn' \(did you mean 'srnn'\?\)"),

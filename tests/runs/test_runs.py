@@ -211,7 +211,7 @@ def test_a_state_with_a_foreign_file_is_an_error(run, canary):
         (
             ("schema",),
             {"kind": "sequences", "sizes": {"x": 48}},
-            "of the kind 'motion' have a schema of the kind 'poses', got 'sequences'",
+            "of kind 'motion' require a schema of kind 'poses', got 'sequences'",
         ),
         (("schema", "protocol", "fps"), 0, "fps is 0; it must be at least 0.001"),
         (("schema", "protocol", "observed"), 10**9, "observed is 1000000000; it must be"),

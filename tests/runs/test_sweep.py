@@ -109,7 +109,7 @@ def test_wrong_arguments_are_errors(data, tmp_path):
     for methods, seeds, message in (
         ([], [0], "at least one method"),
         ([VAE], [], "at least one method and one seed"),
-        ([VAE], [0, 0], r"each once, got seeds \[0, 0\]"),
+        ([VAE], [0, 0], r"without duplicates, got seeds \[0, 0\]"),
         ([VAE, VAE], [0], "vae is given twice"),
         ({"a/b": VAE}, [0], "cannot name a directory"),
     ):

@@ -314,7 +314,7 @@ def test_operations_on_complete_bodies_raise_errors_with_advice():
     assert "--missing" not in str(error.value)
     flow = dvae.method("moglow", width=4, flow_steps=1)
     data = motion.MotionData("simulated", GAPS, motion.PROTOCOLS["simulated"])
-    with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide them together"):
+    with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide all of these or none"):
         dvae.fit(flow.build(data.schema), flow.train(data.windows("train"), None, 1), progress=False)
 
 
