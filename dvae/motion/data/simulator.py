@@ -58,7 +58,7 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
         clips: number of people, one clip each.
         frames: length of a clip.
         seed: random seed.
-        test: fraction of the clips, the last ones, in split "test"; the others are in "train".
+        test: fraction of the clips that form the split "test", the last ones; the other clips form "train".
 
     Returns:
         A `MotionSet`. Labels of a clip: `activity` (its first), `switches` ("walk@0 wave-left@41": activity
@@ -70,7 +70,10 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
         ValueError: fewer than 1 clip or 2 frames, or a test fraction outside 0 to 1.
     """
     if clips < 1 or frames < 2 or not 0 <= test <= 1:
-        raise ValueError(f"cannot simulate {clips} clips of {frames} frames with a share of {test} for test")
+        raise ValueError(
+            "expected at least 1 clip, at least 2 frames and a test fraction from 0 to 1, got "
+            f"clips={clips}, frames={frames} and test={test}"
+        )
     random = np.random.default_rng(seed)
     offsets = _morphology(random, clips)
     style = _style(random, clips)
@@ -170,7 +173,7 @@ def _phase(random: np.random.Generator, weights: np.ndarray, style: np.ndarray) 
 
 
 def _heading(random: np.random.Generator, weights: np.ndarray) -> np.ndarray:
-    """Return the heading (N, F) in radians: turns at a personal rate, and slow drift while walking."""
+    """Return the heading (N, F) in radians: a turning rate for each person, and slow drift while walking."""
     clips, frames = weights.shape[:2]
     rate = random.uniform(1.0, 2.2, (clips, 1)) * (_of(weights, "turn-left") - _of(weights, "turn-right"))
     rate = rate + 0.15 * _drift(random, clips, frames) * _of(weights, "walk")
