@@ -67,7 +67,7 @@ class SummaryEncoder:
 
     Args:
         width: width of the states.
-        hidden: widths of the perceptron on both.
+        hidden: widths of the perceptron that reads both states.
     """
 
     width: int

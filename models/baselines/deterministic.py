@@ -4,9 +4,9 @@
 
 A forecast continues from its own means. All K futures are therefore equal, and their diversity is 0.
 
-Our additions: networks read and predict standardised poses, by the mean pose and one scale. Windows may be rotated so
-that the last observed pose faces one way, which helps on small data sets. For skeletons that the papers do not use,
-networks are small.
+Our additions: networks read and predict poses that are standardised by the mean pose and one scale. Windows may be
+rotated so that the last observed pose faces one way, which helps on small data sets. For skeletons that the papers do
+not use, networks are small.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset, without headings if left and right of the skeleton are unknown."""
+        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
         preset = super().preset(skeleton)
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
@@ -90,7 +90,10 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         return self.with_presets({**self.presets[""], "heading": False})
 
     def fed(self) -> ScheduledSampling | InputNoise:
-        """Return what replaces the data's history in training; a schedule sets its level."""
+        """Return what the network reads in training in place of the true past: its own output, or noisy data.
+
+        A schedule sets the probability of its own output, or the scale of the noise.
+        """
         raise NotImplementedError
 
     @override

@@ -69,7 +69,7 @@ class DSF(ModesMethod):
 
     @override
     def objective(self) -> Objective:
-        """Return minus the expected number of futures, per frame as in `Evidence`."""
+        """Return minus the expected number of selected futures, per frame as in `Evidence`."""
         weights = {"cardinality": 1.0}
         weights |= {"norm": self.beta} if self.beta else {}
         weights |= {"join": self.join} if self.join else {}

@@ -3,9 +3,10 @@
     p(x_t | y_{1:T}, s)        no guide: there are no latents, and the likelihood is exact
 
 The first pose s and the given trajectories y are the columns of an image with a row for each coordinate. Values are
-standardised, and 0 (also the mean) where unknown. Convolutions and pooling halve the image repeatedly, and transposed
-convolutions restore its size, without skip connections. The output is the motion. Training minimises its absolute
-error: x has a Laplace distribution with a scale of one metre, whose negative log-density is this error plus a constant.
+standardised, and unknown values are 0, which is also the mean. Convolutions and pooling halve the image repeatedly, and
+transposed convolutions restore its size, without skip connections. The output is the motion. Training minimises its
+absolute error: x has a Laplace distribution with a scale of one metre, whose negative log-density is this error plus a
+constant.
 
 In training, either a gap in time hides the paths, or some joints have no path. A curriculum widens the gaps and removes
 more joints.
@@ -144,9 +145,9 @@ def start(model: InfillingModel, train: Windows) -> None:
 class RandomGaps:
     """Windows with given trajectories, where a curriculum hides a gap in time or the paths of some joints.
 
-    For each entry, batches contain the value of the curriculum that hides it, so that hidden entries remain hidden. A
-    gap of width w and position u, in a window of length 1, extends from u (1 - w) to u + (1 - u) w. Its range over u
-    covers the whole window, and it grows to both sides with w.
+    For each entry, batches contain the value of the curriculum from which on it is hidden. Hidden entries therefore
+    remain hidden as the curriculum rises. A gap of width w and position u, in a window of length 1, extends from u (1 -
+    w) to u + (1 - u) w. Its range over u covers the whole window, and it grows to both sides with w.
 
     Args:
         source: source of the windows.

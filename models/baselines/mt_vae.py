@@ -10,7 +10,7 @@ content and style. LN is layer normalisation without gain:
 
 The decoder reads the new style at every step, and no pose. For J joints and D numbers of w, the loss is
 
-    sum_t |x_t - mean_t| / J  +  a 5 sum_{t <= 8} |velocity_t - made velocity_t| / J  +  a max(KL / D, .01)
+    sum_t |x_t - mean_t| / J  +  a 5 sum_{t <= 8} |velocity_t - generated velocity_t| / J  +  a max(KL / D, .01)
       +  5 |w' - w''| / D,                                                              a = 1 - .99995^step
 
 w' is a draw from the prior, and w'' a draw from the guide given the style that results from w'. The velocity term also
@@ -148,7 +148,7 @@ class MTVAEModel(FutureModel):
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """Return errors of the first velocities, for draws of guide and prior, and the cycle error of the latter."""
+        """Return errors of the first velocities for draws of guide and prior, and the cycle error of the prior."""
         penalties, method = super().penalties(rollout, data, draws), self.method
         assert isinstance(method, MTVAE)
         if WHOLE not in data or not (method.velocity or method.cycle):
@@ -280,7 +280,7 @@ class Embedding(nn.Module):
 
 
 class NormedLSTM(nn.Module):
-    """An LSTM with layer-normalised gates, each over its units, and cells (Ba et al., 2016, arXiv 1607.06450).
+    """An LSTM whose cells and gates, each over its units, are layer-normalised (Ba et al., 2016, arXiv 1607.06450).
 
     Args:
         size: D, size of the input.
@@ -298,7 +298,7 @@ class NormedLSTM(nn.Module):
         """Return states (B, T, W).
 
         Args:
-            shares: contributions of the input to the gates, (B, 4 W), by step.
+            shares: contribution of the input to the gates at each step, (B, 4 W).
             hidden, cell: first state, (B, W) each.
         """
         states, weight = [], self.recurrent.weight.t()

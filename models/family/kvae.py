@@ -430,7 +430,7 @@ def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLa
     if not isinstance(network, KalmanNetwork):
         raise ValueError(f"smoothing needs the chain of a kvae model, but this model is {model.generative.text}")
     if samples < 1:
-        raise ValueError(f"samples is at least 1, got {samples}")
+        raise ValueError(f"`samples` must be at least 1, got {samples}")
     data = {name: repeat(value, samples) for name, value in model.read(batch).items()}
     run = model.rollout(data, guide=True)
     present, valid = run.present.get("a"), None if run.lengths is None else valid_steps(run.lengths, run.length).t()

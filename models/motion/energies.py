@@ -182,7 +182,7 @@ class EnergyModel(DynamicalVAE):
         return x if self.heading is None else self.heading.face(x)
 
     def positions(self, values: Mapping[str, Tensor], data: Batch) -> Batch:
-        """Return rotated positions (..., B, T, D) from x or all its parts as the networks see them."""
+        """Return positions (..., B, T, D), rotated as the networks see them, from x or from all its parts."""
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
         return self.view.inverse(Batch(values) | lengths)
 

@@ -75,7 +75,7 @@ class FutureMethod(PoseMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset, without headings if left and right of the skeleton are unknown."""
+        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
         preset = super().preset(skeleton)
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
@@ -88,7 +88,8 @@ class FutureMethod(PoseMethod):
     def build(self, data: Any) -> FutureModel:
         """Return the model for windows of poses relative to the pelvis.
 
-        From sizes alone, it is a model whose batches contain x and h, two frames of the size of x.
+        If `data` only gives sizes, the batches of the model contain x and two observed frames h, which have the size of
+        x.
 
         Raises:
             ValueError: if the poses have a root.

@@ -121,7 +121,7 @@ class GSPS(EnergyMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        """Return the generative model and the guide; here half of the steps are observed."""
+        """Return the generative model and the guide of sequences whose first half is observed."""
         generative = part_by_part(self.names, lambda length: max(1, length // 2))
         return generative, generative.prior_guide(self.names)
 
@@ -245,7 +245,7 @@ class GSPSModel(EnergyModel):
         """Return the energies, if they have a weight, of futures that were drawn together, (B,) each.
 
         Args:
-            values: mapping from name to rows, draw by draw, of a rollout with `draws`.
+            values: mapping from variable to its values in a rollout with `draws`; rows are ordered draw by draw.
             truth: (B, T, D), NaN where it was not observed.
             batch: batch after `read`, with "pseudo" and "valid" if there are further futures.
         """
@@ -326,7 +326,7 @@ class GSPSModel(EnergyModel):
             return super().impute(batch, samples, **options)  # which raises
         if (length := batch[WHOLE].shape[1]) != self.length:
             raise ValueError(
-                f"{self.method.name} fills gaps in windows of {self.length} frames, not {length}; cut the motion into "
+                f"{self.method.name} imputes windows of {self.length} frames, got {length}; cut the motion into "
                 "such windows, as `dvae impute` does without --clip"
             )
         motions, count = [], prod(self.draws.values())

@@ -173,7 +173,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         energy_options = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
         if self.loss == "evidence" and (unsupported := [name for name in energy_options if getattr(self, name)]):
             raise ValueError(
-                f"loss='evidence' has no {', '.join(unsupported)}; use loss='best-of-many' or leave them out"
+                f"loss='evidence' does not use {', '.join(unsupported)}; leave them out, or use loss='best-of-many'"
             )
         for name in ("diversity", "diversity_scale"):
             values = getattr(self, name)
@@ -282,7 +282,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def start(self, model: Any, windows: Any) -> None:
-        """Prepare a model, fit the units of the poses, and start a learned scale of x at these units."""
+        """Prepare a model: fit the units of the poses, and initialise a learned scale of x at these units."""
         start_priors(model, windows)
         if isinstance(model, EnergyModel):
             super().start(model, windows)

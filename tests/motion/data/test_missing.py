@@ -309,7 +309,7 @@ def test_operations_on_complete_bodies_raise_errors_with_advice():
         motion.ExchangedWindows(with_paths)
     data, method = small("trajevae")
     pose = GAPS.clips[0].positions[np.isnan(GAPS.clips[0].positions).any((1, 2))][0]
-    with pytest.raises(ValueError, match=r"the initial pose has no positions of .*fill the gaps first") as error:
+    with pytest.raises(ValueError, match=r"the initial pose has no positions of .*fill them in first") as error:
         method.build(data.schema).complete(pose, frames=5)
     assert "--missing" not in str(error.value)
     flow = dvae.method("moglow", width=4, flow_steps=1)
@@ -433,7 +433,7 @@ def test_gsps_fills_gaps_with_the_motion_nearest_to_all_observations():
         torch.manual_seed(2)
         filled = model.impute({**batch, "x": torch.where(batch["mask"], true, torch.nan)}, 1)["x"][0]
         torch.testing.assert_close(filled, true)
-    with pytest.raises(ValueError, match="gsps fills gaps in windows of 18 frames, not 12"):
+    with pytest.raises(ValueError, match="gsps imputes windows of 18 frames, got 12"):
         model.impute({name: value[:, :12] for name, value in batch.items()})
 
 
