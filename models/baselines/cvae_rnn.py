@@ -56,7 +56,7 @@ class CVAERNN(LatentTrajectoryMethod):
         skeleton: {**preset, "beta": 0.1 if skeleton else 1e-4}
         for skeleton, preset in LatentTrajectoryMethod.presets.items()
     }
-    """The KL weight is the paper's for its skeletons, otherwise tuned on the tuning split (docs/results/tuning.md)."""
+    """The KL weight has the paper's value for the paper's skeletons; others are tuned (docs/results/tuning.md)."""
     trainings: ClassVar[Mapping[str, Training]] = {
         **LatentTrajectoryMethod.trainings,
         "": Training(12_000, 16, 1e-3, 0.5),

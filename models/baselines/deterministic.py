@@ -41,7 +41,8 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         latent: always None; the method has no latents.
         emission: distribution of x. By default the distributions of a table's columns, or a normal with variance 1/2,
             whose negative log-density is the squared error. With any other emission, forecasts are draws.
-        width: width of the LSTMs' states; by default the paper's for Human3.6M and HumanEva, and 256 for others.
+        width: width of the LSTMs' states; by default the paper's value for Human3.6M and HumanEva, and 256 for other
+            skeletons.
         layers: number of LSTMs, each on the states of the previous one.
         standardise: whether networks read and predict standardised x, by its mean and one scale (`dvae.data.units`).
         heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures

@@ -48,7 +48,7 @@ PRESETS = table(
         "": (*SHAPE, 10, 50.0, 20.0, True),
     },
 )
-"""Options by skeleton: the paper's, and ours for other skeletons."""
+"""Options by skeleton: the paper's values, and our values for other skeletons."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class DLow(ModesMethod):
         diversity: lambda, weight of the similarity of the futures; None, here and below, for the preset.
         diversity_scale: s, in square metres.
         reconstruction: weight of the squared error of the best future.
-        held: parts of the body, or joints, with the same motion in all modes, such as lower.
+        held: parts of the body, or joints, with the same motion in all modes, such as "lower".
         hold: weight of the squared distance of held joints from their positions in the first mode, averaged over the
             other modes.
     """

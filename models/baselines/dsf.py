@@ -12,8 +12,7 @@ Distances are over all frames and coordinates. R is the radius of the ball that 
 keeps the futures near the data.
 
 Yuan and Kitani, 2020, arXiv 1907.04967; we know of no public code. Our choices are omega and rho. The network, its
-number of modes and the distances s are from DLow (arXiv 2003.08386), as the tables of motion prediction compare the
-two.
+number of modes and the distances s are from DLow (arXiv 2003.08386), as in published comparisons of the two.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ Kaufmann, Aksan, Song, Pece, Ziegler and Hilliges, 2020, arXiv 2010.11531, with 
 public implementation, whose network for gaps of any width has 4,703,425 parameters. It is a baseline in TrajeVAE's
 tables (arXiv 2104.00351). Our differences:
 
-* Widths of gaps are shares of a window; the paper has numbers of frames.
+* Widths of gaps are shares of a window; the paper gives them in frames.
 * The curriculum rises linearly.
 * Each window draws independently whether it has a gap or removed joints.
 * Joints are removed over the curriculum, not over all of training.
@@ -57,14 +57,14 @@ PRESETS = table(
     "maps heading",
     {"human36m": ((32, 64, 128, 256, 256), False), "": ((8, 16, 32, 64, 64), True)},
 )
-"""Options by skeleton: the paper's; for other skeletons, options that train in minutes on a CPU."""
+"""Options by skeleton: the paper's values; for other skeletons, values that train in minutes on a CPU."""
 
 HIDDEN = "hidden"
 """Key in training batches: the value of the curriculum from which an entry of y is hidden, (B, T, D)."""
 NARROWEST, SPREAD = 1 / 12, 1 / 6
 """Initial mean width of gaps and its standard deviation, relative to the final mean width."""
 IN_TIME, JOINTS = 0.7, 3
-"""Share of windows with a gap in time, and the largest number of joints removed from the others."""
+"""Share of windows with a gap in time, and the largest number of joints removed from each other window."""
 NEVER = 2.0
 """Value that no curriculum reaches, because curricula end at 1."""
 

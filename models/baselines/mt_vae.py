@@ -57,7 +57,7 @@ from ..motion.poses import table
 PRESETS = table(
     "latent width heading", {**dict.fromkeys(("human36m", "humaneva"), (512, 1024, False)), "": (64, 128, True)}
 )
-"""Options by skeleton: the public code's, and smaller ones for other skeletons."""
+"""Options by skeleton: the values of the public code, and smaller values for other skeletons."""
 FIRST = 8
 """Number of frames whose velocities enter the loss."""
 STEEPNESS = 3.0
@@ -72,7 +72,8 @@ class MTVAE(FutureMethod):
         latent: size of w.
         beta: limit of the rising weight of the KL; training ends at .95 of it.
         width: units of the recurrent networks and of embeddings; half of an embedding is style.
-        velocity: weight of the first velocities relative to positions; it rises like the weight of the KL.
+        velocity: weight of the error of the first velocities, relative to the error of positions; it rises like the
+            weight of the KL.
         cycle: weight of the cycle from latent to style and back.
         floor: nats for each number of w, averaged over the batch, below which the KL is not penalised.
     """

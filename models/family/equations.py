@@ -95,8 +95,8 @@ class Equations(LatentMethod):
         schema = Schema.of(data)
         if missing := [name for name in self._context() if name not in schema.sizes]:
             raise SchemaError(
-                f"the equations read {', '.join(missing)}, which has no factor and must be in the data, but they have "
-                f"{', '.join(schema.sizes)}; a table gives covariates as c, attributes as s, and uneven time "
+                f"the equations read {', '.join(missing)}, which has no factor and must be in the data, but the data "
+                f"have {', '.join(schema.sizes)}; a table gives covariates as c, attributes as s, and uneven time "
                 "steps as d"
             )
         return self.build_for_data(schema, extended=False)

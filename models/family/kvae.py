@@ -66,9 +66,10 @@ class KVAE(LatentMethod):
         width: width of the recurrent state that mixes the matrices.
         hidden: widths of the encoder; the decoder has them in reverse order.
         learn_noise: whether to learn diagonal Q and R; otherwise they are .08 I and .03 I.
-        phases: train in the paper's three phases: first encoder and decoder alone, after a tenth of the run also the
-            matrices, after a third also the network that mixes them. (On simulated people, 1500 steps, three seeds, the
-            validation bound is .9 nats a frame higher than when training all parts at once, standard error .25.)
+        phases: whether to train in the paper's three phases: first encoder and decoder alone, after a tenth of the run
+            also the matrices, after a third also the network that mixes them. (On simulated people, 1500 steps, three
+            seeds, the validation bound is .9 nats a frame higher than when training all parts at once, standard error
+            .25.)
     """
 
     name = "kvae"
@@ -148,7 +149,8 @@ class KalmanVAE(DynamicalVAE):
 class Encoding(Rollout):
     """A rollout of the guide that draws a_t from p(a_t | all other a) where the frame is not encoded.
 
-    With gradients enabled it does not: a bound ignores these frames, and drawing them would double its run time.
+    With gradients enabled, it does not draw them: a bound ignores these frames, and the draws would double its run
+    time.
 
     Args:
         network: network of p(a).

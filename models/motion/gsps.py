@@ -64,12 +64,14 @@ PRESETS = table(
         "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
     },
 )
-"""Options by skeleton: the paper's; for other skeletons, at 30 frames a second, 15 observed and 60 predicted frames."""
+"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed and 60 predicted frames at 30 Hz."""
 
 
 @dataclass(frozen=True)
 class GSPS(EnergyMethod):
-    """Diverse futures, part by part. Defaults are the paper's for Human3.6M and HumanEva-I, and smaller for others.
+    """Diverse futures, part by part.
+
+    The defaults are the paper's sizes for Human3.6M and HumanEva-I, and smaller sizes for other skeletons.
 
     Options with one number for each part also accept one number for all parts.
 

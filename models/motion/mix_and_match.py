@@ -63,7 +63,7 @@ EQUATIONS = {
     "add": ("p(z) p(x_t | x_{<t}, h, z)", "q(z)"),
     "step": ("p(z_t) p(x_t | x_{<t}, h, z_t)", "q(z_t | x_{<=t}, h)"),
 }
-"""Equations of the other ways to add the noise, by option."""
+"""Equations of the ways to add noise other than "mix", by value of the option `noise`."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class TrajectoryMethod(PoseMethod):
         rotate: whether to rotate every training window about the up axis by a uniform angle.
         heading: whether to rotate every window so that its first pose faces one way, and rotate the motion back. The
             model is then exactly equivariant, and `rotate` has no effect. By default off for Human3.6M, as in the
-            paper, which leaves it to learning, and on for other skeletons with known left and right.
+            paper, whose network has to learn it, and on for other skeletons with known left and right.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
@@ -437,11 +437,11 @@ class TrajectoryModel(DynamicalVAE):
         worst = int(leaps.argmax())
         if leaps[worst] > LEAP:
             message = (
-                f"the path of {joint} moves by {leaps[worst]:.4g} m a frame before its frame {frames[worst + 1]} "
-                f"(since {'the pose' if worst == 0 else f'frame {frames[worst]}'})"
+                f"the path of {joint} moves by {leaps[worst]:.4g} m per frame from "
+                f"{'the pose' if worst == 0 else f'its frame {frames[worst]}'} to its frame {frames[worst + 1]}"
             )
             if leaps[worst] > FAR:
-                raise ValueError(f"{message}; paths are in metres, in the same world as the pose")
+                raise ValueError(f"{message}; paths must be in metres, in the same coordinates as the pose")
             warnings.warn(message, stacklevel=3)
         return path
 

@@ -43,7 +43,7 @@ PRESETS = table(
     "latent beta components width feedforward layers dropout heading",
     {"human36m": (512, 0.01, 0, 256, 512, 2, 0.1, False), "": (32, 0.001, 15, 32, 128, 1, 0.0, True)},
 )
-"""Options by skeleton: the paper's; for other skeletons, options that train in minutes on a CPU."""
+"""Options by skeleton: the paper's values; for other skeletons, values that train in minutes on a CPU."""
 
 
 @dataclass(frozen=True)

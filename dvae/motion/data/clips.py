@@ -120,11 +120,11 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
     """
     label, positions = f"clip {clip.split}/{clip.name}", clip.positions
     if positions.dtype.kind not in "fiu":
-        return f"{label} holds {positions.dtype}, expected numbers"
+        return f"{label} has dtype {positions.dtype}, expected numbers"
     if positions.ndim != 3 or positions.shape[2] != 3:
         return f"{label} has shape {positions.shape}, expected (frames, joints, 3)"
     if positions.shape[1] != skeleton.joints:
-        return f"{label} has {positions.shape[1]} joints, skeleton {skeleton.name!r} has {skeleton.joints}"
+        return f"{label} has {positions.shape[1]} joints, but the skeleton {skeleton.name!r} has {skeleton.joints}"
     if not len(positions):
         return f"{label} has no frames"
     count = frames = 0

@@ -19,13 +19,16 @@ ACTIVITIES = ("stand", "walk", "wave-left", "wave-right", "wave-both", "turn-lef
 """The activities in the order of the codes in a clip's truth."""
 
 SHORTEST, MEAN_EXTRA = 0.7, 1.0
-"""Seconds: the duration of an activity is the first plus an exponential time whose mean is the second."""
+"""Duration of an activity in seconds: `SHORTEST` plus an exponential time with mean `MEAN_EXTRA`."""
 
 BLEND = 0.45
 """Duration in seconds of the transition between activities."""
 
 SETTLE = 0.4
-"""Seconds of smoothing between feet and pelvis: shorter shakes the body at each step, longer lets the feet slide."""
+"""Duration in seconds of the smoothing that lets the pelvis follow the feet.
+
+A shorter duration shakes the body at each step; a longer one lets the feet slide.
+"""
 
 _J = {name: joint for joint, name in enumerate(WALKER.names)}
 
@@ -61,10 +64,10 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
         test: fraction of the clips that form the split "test", the last ones; the other clips form "train".
 
     Returns:
-        A `MotionSet`. Labels of a clip: `activity` (its first), `switches` ("walk@0 wave-left@41": activity
-        and first frame of each), `height_m`, `cadence_hz`. Truth of a clip: `activity` (F,) codes into
-        `ACTIVITIES`, `weights` (F, 7) of the activities while they blend, `phase` (F,) of the gait and
-        `heading` (F,) in radians, `bone_lengths` (16,) in metres, `style` (7,).
+        A `MotionSet`. Labels of a clip: `activity` (its first activity), `switches` ("walk@0 wave-left@41": activity
+        and first frame of each), `height_m`, `cadence_hz`. Truth of a clip: `activity` (F,) codes into `ACTIVITIES`,
+        `weights` (F, 7) of the activities while they blend, `phase` (F,) of the gait and `heading` (F,) in radians,
+        `bone_lengths` (16,) in metres, `style` (7,).
 
     Raises:
         ValueError: fewer than 1 clip or 2 frames, or a test fraction outside 0 to 1.

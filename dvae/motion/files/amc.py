@@ -229,7 +229,7 @@ SUBJECT_02 = {
     "rthumb": ("rwrist", -0.59786, 0, 0.59786),
     "rfingers": ("rhand", -0.58887, 0, 0),
 }
-"""Parents and vectors of the bones of CMU's subject 02 in 1 / .45 inch; the benchmark gives this body to everybody."""
+"""Parents and vectors of the bones of CMU's subject 02 in 1 / .45 inch; the benchmark uses it for all people."""
 
 
 def read_expmap(path: str | Path) -> Recording:

@@ -37,7 +37,7 @@ WHICH = (
 )
 
 MOST_NUMBERS = 2**23
-"""Maximum number of values in a csv file of paths, with blank rows: a hundred thousand frames of twenty joints."""
+"""Maximum number of values in a csv file of paths, including blank rows: a hundred thousand frames of twenty joints."""
 
 _ARCHIVES = (
     ({f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)}, 32, HUMAN36M, HUMAN36M_KEPT),

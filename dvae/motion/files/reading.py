@@ -44,7 +44,7 @@ SAME = 1e-3
 BENDS = "rotations are left out, because a joint moves relative to its parent"
 
 LIKE = 1.6
-"""Maximum ratio of body sizes in one folder; smaller than 2.54, so that it detects inches among centimetres."""
+"""Maximum ratio of body sizes in one folder; below 2.54, to detect inches among centimetres."""
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ MOST_TEXT = 2**28
 """Maximum size of a motion text file in bytes: an hour of sixty joints at 60 Hz."""
 
 MOST_PLACES = 2**24
-"""Maximum number of frames times joints in a recording: the same duration."""
+"""Maximum number of frames times joints in a recording: an hour of sixty joints, as for `MOST_TEXT`."""
 
 
 END = "End"
-"""Suffix of the name of a joint at the end of a last bone."""
+"""Suffix of the name of a joint at the end of a bone without children."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,8 @@ class ActionClassifier(Trainable):
             labels = sorted({label for clip in windows.clips for label in clip.labels})
             raise ValueError(
                 f"a classifier needs at least two classes: training clips have {' and '.join(classes) or 'nothing'} "
-                f"for the label {self.label!r}; labels are {', '.join(labels) or 'none (is labels.csv next to the file?)'}"
+                f"for the label {self.label!r}; "
+                f"labels are {', '.join(labels) or 'none (is labels.csv next to the file?)'}"
             )
         return replace(self, classes=tuple(classes))
 

@@ -15,8 +15,8 @@ frames. As in the public code, it is computed for each class of motion, and aver
 number of windows. The class of a clip is its label "content"; without such labels, all windows form one class. The pace
 of a class is the pace of the true futures of the evaluated windows; the public code uses a constant for each of its
 data sets. CMD is one number for the whole set, with a jackknife over clips. Real motion does not score 0, because its
-pace varies. If joints are missing, a step of a joint counts only if the joint was observed in both frames, in futures
-as in the truth.
+pace varies. If joints are missing, a step of a joint counts only if the true joint was observed in both frames. The
+same steps are left out of the futures.
 
 Three scores measure the body: limb stretch, limb jitter and limb-angle error (SkeletonDiffusion: Curreli et al. 2025,
 arXiv:2501.06035, equation 13). Let l_t be the length of a limb in frame t of a future, and m its mean length over the

@@ -101,12 +101,12 @@ def with_nan(positions):
 
 BAD = [
     (with_nan, "train/walk has NaN .* 1 joint positions in 1 of 10 frames, first RKnee at frame 4"),
-    (lambda p: p[:, :12], "train/walk has 12 joints, skeleton 'walker' has 17"),
+    (lambda p: p[:, :12], "train/walk has 12 joints, but the skeleton 'walker' has 17"),
     (lambda p: p[..., :2], r"train/walk has shape \(10, 17, 2\), expected \(frames, joints, 3\)"),
     (lambda p: p[:0], "train/walk has no frames"),
     (lambda p: p * 1000, r"train/walk shows a person of 1\d{3} m .* millimetres"),
     (lambda p: p * 0.01, "train/walk shows a person of 0.01.* another unit"),
-    (lambda p: p.astype(object), "train/walk holds object"),
+    (lambda p: p.astype(object), "train/walk has dtype object"),
 ]
 
 
