@@ -146,8 +146,10 @@ class RandomGaps:
     """Windows with given trajectories, where a curriculum hides a gap in time or the paths of some joints.
 
     For each entry, batches contain the value of the curriculum from which on it is hidden. Hidden entries therefore
-    remain hidden as the curriculum rises. A gap of width w and position u, in a window of length 1, extends from u (1 -
-    w) to u + (1 - u) w. Its range over u covers the whole window, and it grows to both sides with w.
+    remain hidden as the curriculum rises.
+
+    A gap of width w and position u, in a window of length 1, extends from u (1 - w) to u + (1 - u) w. Gaps at different
+    u together cover the whole window. With increasing w, a gap grows to both sides.
 
     Args:
         source: source of the windows.

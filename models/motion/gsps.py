@@ -64,7 +64,7 @@ PRESETS = table(
         "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
     },
 )
-"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed and 60 predicted frames at 30 Hz."""
+"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ NETWORKS = table(
     {"humaneva": (8, 10, 256, 15, False), "human36m": (8, 10, 256, 20, False), "": (8, 6, 128, 10, True)},
 )
 PRESETS = {skeleton: options | NETWORKS[skeleton] for skeleton, options in ENERGIES.items()}
-"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed and 60 predicted frames at 30 Hz."""
+"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
 
 PARTS = ("lower", "upper")
 FRAMES = 15

@@ -85,7 +85,7 @@ def read_archive(
             if size > LARGEST:  # in a large mapped file, some arrays may have to be copied
                 raise ValueError(
                     f"it has more than {LARGEST:,} bytes of motion that cannot be memory-mapped; save it as "
-                    "uncompressed float32"
+                    "an npz of uncompressed float32 arrays"
                 )
             labelled = labels_of.get((split, name), labels_of.get((None, name), {}))
             yield Clip(split, name, positions, labelled, rotations=rotations if skeleton.rest else None)

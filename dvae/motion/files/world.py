@@ -107,7 +107,7 @@ def unit(recording: Recording) -> tuple[str, float]:
     if not fitting[name] <= log(WITHIN):
         raise ValueError(
             f"the body is about {height:.4g} tall (median over frames), which is not a person's height in any of "
-            f"{', '.join(UNITS)}; pass the length of the file's unit in metres, metres="
+            f"{', '.join(UNITS)}; pass the length of the file's unit in metres (`metres`)"
         )
     return name, UNITS[name]
 
@@ -166,7 +166,7 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
         ((first, _), first_name), ((other, _), other_name), *_ = units.items()
         raise ValueError(
             f"{first_name} seems to be in {first}, {other_name} in {other}; if all have the same unit, pass its length "
-            "in metres, metres="
+            "in metres (`metres`)"
         )
     axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
     return World(*next(iter(units)), axis, upwards)
