@@ -328,7 +328,7 @@ class KalmanNetwork(Network):
         return a, b, c
 
     def seen(self, emission: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the information G (..., N, N) and the potential g (..., N) about z in a (..., D)."""
+        """Return the information matrix G (..., N, N) and the potential g (..., N) that a (..., D) gives about z."""
         weighted = (emission * torch.exp(-self.log_emission)[:, None]).mT
         return weighted @ emission, (weighted @ a[..., None].double())[..., 0]
 
@@ -380,8 +380,8 @@ class Predicted:
     """The state of a `KalmanNetwork`: the given a, and the distribution of z_t given a_{<t}.
 
     Args:
-        known: a by step; None if the loop draws it.
-        present: (B,) by step, whether a is present; None if it always is.
+        known: given a, one value per step; None if the loop over steps draws a.
+        present: whether a is present, (B,) for each step; None if it is present at all steps.
         hidden: hidden state of the LSTM.
         mean, covariance: moments of z_t.
         emission: C_t; None before the first step.

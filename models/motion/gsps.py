@@ -244,7 +244,7 @@ class GSPSModel(EnergyModel):
         return self.energies(values, truth, data)
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Return the energies, if they have a weight, of futures that were drawn together, (B,) each.
+        """Return the energies of futures that were drawn together, (B,) each, except energies with weight 0.
 
         Args:
             values: mapping from variable to its values in a rollout with `draws`; rows are ordered draw by draw.
