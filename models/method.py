@@ -85,8 +85,8 @@ class LikelihoodMethod(Method):
             "normal" (scale read from the parents) or "student" (Student t). By default the distributions of a table's
             columns, or "fixed".
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
-            an offset: one-step forecasts are sharp, but free runs can drift without limit. A smaller share limits the
-            drift.
+            an offset: one-step forecasts are sharp, but long forecasts can drift without limit. A smaller share limits
+            the drift.
         scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
             ignore it. None: 1 for data with a horizon and 0 for others.

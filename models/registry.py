@@ -73,7 +73,9 @@ class Registry(UserDict[str, Any]):
         super().__init__({name: EntryPoint(name, value, group) for name, value in builtin.items()})
         for entry in entry_points(group=group):
             if entry.name in builtin:
-                raise ValueError(f"the name of entry point {entry.value} is already taken in {group}: {entry.name}")
+                raise ValueError(
+                    f"the entry point {entry.value} has the name {entry.name!r}, which {group} already has; rename it"
+                )
             self[entry.name] = entry
 
     @override
@@ -88,7 +90,7 @@ class Registry(UserDict[str, Any]):
             attributes: attributes of the class or of its bases, such as "source".
 
         Returns:
-            Their texts; None for an option of the method, which is a field of the dataclass.
+            Values of the attributes; None for each attribute that is an option, a field of the dataclass.
         """
         literals = _literals(*self.data[name].value.split(":"))
         if not literals.keys() >= {*attributes}:

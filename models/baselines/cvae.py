@@ -7,8 +7,8 @@ decoder reads the summary of h, w and its own mean at t-1 (at first the last obs
 Gradients flow through these means. Poses are absolute.
 
 Yuan and Kitani, 2020, arXiv 2003.08386, with 725,292 parameters for Human3.6M. With a mixture of normals as the prior,
-it is GMVAE (Dilokthanakul et al., 2016, arXiv 1611.02648) without its further latents, as in the tables of motion
-prediction.
+it is GMVAE (Dilokthanakul et al., 2016, arXiv 1611.02648) without its further latents, as in published comparisons of
+motion prediction.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class SummaryEncoder:
 
     Args:
         width: width of the states.
-        hidden: widths of the perceptron on both.
+        hidden: widths of the perceptron that reads both states.
     """
 
     width: int

@@ -56,7 +56,7 @@ class CVAERNN(LatentTrajectoryMethod):
         skeleton: {**preset, "beta": 0.1 if skeleton else 1e-4}
         for skeleton, preset in LatentTrajectoryMethod.presets.items()
     }
-    """The KL weight is the paper's for its skeletons, otherwise tuned on the tuning split (docs/results/tuning.md)."""
+    """The KL weight has the paper's value for the paper's skeletons; others are tuned (docs/results/tuning.md)."""
     trainings: ClassVar[Mapping[str, Training]] = {
         **LatentTrajectoryMethod.trainings,
         "": Training(12_000, 16, 1e-3, 0.5),
@@ -70,7 +70,7 @@ class CVAERNN(LatentTrajectoryMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.hidden:
-            raise ValueError("hidden is empty; a perceptron has at least one layer")
+            raise ValueError("hidden is empty; a perceptron has at least one layer, so give at least one width")
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -149,7 +149,7 @@ class Decoder:
 
     Args:
         summary: units of the summary, for each direction.
-        hidden: widths of the perceptrons; the one after the states omits the last.
+        hidden: widths of the perceptrons; the perceptron after the states has no layer of the last width.
         width: units of the state.
     """
 

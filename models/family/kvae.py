@@ -66,9 +66,10 @@ class KVAE(LatentMethod):
         width: width of the recurrent state that mixes the matrices.
         hidden: widths of the encoder; the decoder has them in reverse order.
         learn_noise: whether to learn diagonal Q and R; otherwise they are .08 I and .03 I.
-        phases: train in the paper's three phases: first encoder and decoder alone, after a tenth of the run also the
-            matrices, after a third also the network that mixes them. (On simulated people, 1500 steps, three seeds, the
-            validation bound is .9 nats a frame higher than when training all parts at once, standard error .25.)
+        phases: whether to train in the paper's three phases: first encoder and decoder alone, after a tenth of the run
+            also the matrices, after a third also the network that mixes them. (On simulated people, 1500 steps, three
+            seeds, the validation bound is .9 nats a frame higher than when training all parts at once, standard error
+            .25.)
     """
 
     name = "kvae"
@@ -148,7 +149,8 @@ class KalmanVAE(DynamicalVAE):
 class Encoding(Rollout):
     """A rollout of the guide that draws a_t from p(a_t | all other a) where the frame is not encoded.
 
-    With gradients enabled it does not: a bound ignores these frames, and drawing them would double its run time.
+    With gradients enabled, it does not draw them: a bound ignores these frames, and the draws would double its run
+    time.
 
     Args:
         network: network of p(a).
@@ -326,7 +328,7 @@ class KalmanNetwork(Network):
         return a, b, c
 
     def seen(self, emission: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the information G (..., N, N) and the potential g (..., N) about z in a (..., D)."""
+        """Return the information matrix G (..., N, N) and the potential g (..., N) that a (..., D) gives about z."""
         weighted = (emission * torch.exp(-self.log_emission)[:, None]).mT
         return weighted @ emission, (weighted @ a[..., None].double())[..., 0]
 
@@ -378,8 +380,8 @@ class Predicted:
     """The state of a `KalmanNetwork`: the given a, and the distribution of z_t given a_{<t}.
 
     Args:
-        known: a by step; None if the loop draws it.
-        present: (B,) by step, whether a is present; None if it always is.
+        known: given a, one value per step; None if the loop over steps draws a.
+        present: whether a is present, (B,) for each step; None if it is present at all steps.
         hidden: hidden state of the LSTM.
         mean, covariance: moments of z_t.
         emission: C_t; None before the first step.
@@ -430,7 +432,7 @@ def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLa
     if not isinstance(network, KalmanNetwork):
         raise ValueError(f"smoothing needs the chain of a kvae model, but this model is {model.generative.text}")
     if samples < 1:
-        raise ValueError(f"samples is at least 1, got {samples}")
+        raise ValueError(f"`samples` must be at least 1, got {samples}")
     data = {name: repeat(value, samples) for name, value in model.read(batch).items()}
     run = model.rollout(data, guide=True)
     present, valid = run.present.get("a"), None if run.lengths is None else valid_steps(run.lengths, run.length).t()

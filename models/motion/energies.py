@@ -97,7 +97,7 @@ class EnergyMethod(PoseMethod):
             model.pose_prior.load_state_dict(prior.state_dict())
 
     def scored(self, windows: Windows) -> Source:
-        """Return windows with pseudo ground truths if these have a weight; all options must be resolved."""
+        """Return windows with pseudo ground truths if their weight is not 0; all options must be resolved."""
         method: Any = self
         if not method.multimodal:
             return windows
@@ -138,7 +138,7 @@ class EnergyModel(DynamicalVAE):
         self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
 
     def best(self, samples: Tensor, truth: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Return the energies of the best sample that have a weight, (B,) each.
+        """Return the energies of the best sample whose weight is not 0, (B,) each.
 
         Args:
             samples: positions (S, B, T, D) of the frames to score, rotated as the networks see them.
@@ -156,7 +156,7 @@ class EnergyModel(DynamicalVAE):
         return terms
 
     def realism(self, samples: Tensor, truth: Tensor, frames: Tensor) -> dict[str, Tensor]:
-        """Return the energies of limb lengths, angles and pose prior that have a weight, (B,) each.
+        """Return the energies of limb lengths, angles and pose prior whose weight is not 0, (B,) each.
 
         Args:
             samples: (S, B, T, D), whose limb lengths are scored in all frames.
@@ -182,7 +182,7 @@ class EnergyModel(DynamicalVAE):
         return x if self.heading is None else self.heading.face(x)
 
     def positions(self, values: Mapping[str, Tensor], data: Batch) -> Batch:
-        """Return rotated positions (..., B, T, D) from x or all its parts as the networks see them."""
+        """Return positions (..., B, T, D), rotated as the networks see them, from x or from all its parts."""
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
         return self.view.inverse(Batch(values) | lengths)
 

@@ -64,12 +64,14 @@ PRESETS = table(
         "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
     },
 )
-"""Options by skeleton: the paper's; for other skeletons, at 30 frames a second, 15 observed and 60 predicted frames."""
+"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
 
 
 @dataclass(frozen=True)
 class GSPS(EnergyMethod):
-    """Diverse futures, part by part. Defaults are the paper's for Human3.6M and HumanEva-I, and smaller for others.
+    """Diverse futures, part by part.
+
+    The defaults are the paper's sizes for Human3.6M and HumanEva-I, and smaller sizes for other skeletons.
 
     Options with one number for each part also accept one number for all parts.
 
@@ -121,7 +123,7 @@ class GSPS(EnergyMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        """Return the generative model and the guide; here half of the steps are observed."""
+        """Return the generative model and the guide of sequences whose first half is observed."""
         generative = part_by_part(self.names, lambda length: max(1, length // 2))
         return generative, generative.prior_guide(self.names)
 
@@ -242,10 +244,10 @@ class GSPSModel(EnergyModel):
         return self.energies(values, truth, data)
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Return the energies, if they have a weight, of futures that were drawn together, (B,) each.
+        """Return the energies of futures that were drawn together, (B,) each, except energies with weight 0.
 
         Args:
-            values: mapping from name to rows, draw by draw, of a rollout with `draws`.
+            values: mapping from variable to its values in a rollout with `draws`; rows are ordered draw by draw.
             truth: (B, T, D), NaN where it was not observed.
             batch: batch after `read`, with "pseudo" and "valid" if there are further futures.
         """
@@ -326,7 +328,7 @@ class GSPSModel(EnergyModel):
             return super().impute(batch, samples, **options)  # which raises
         if (length := batch[WHOLE].shape[1]) != self.length:
             raise ValueError(
-                f"{self.method.name} fills gaps in windows of {self.length} frames, not {length}; cut the motion into "
+                f"{self.method.name} imputes windows of {self.length} frames, got {length}; cut the motion into "
                 "such windows, as `dvae impute` does without --clip"
             )
         motions, count = [], prod(self.draws.values())

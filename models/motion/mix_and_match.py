@@ -63,7 +63,7 @@ EQUATIONS = {
     "add": ("p(z) p(x_t | x_{<t}, h, z)", "q(z)"),
     "step": ("p(z_t) p(x_t | x_{<t}, h, z_t)", "q(z_t | x_{<=t}, h)"),
 }
-"""Equations of the other ways to add the noise, by option."""
+"""Equations of the ways to add noise other than "mix", by value of the option `noise`."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class MixAndMatchMotion(PoseMethod):
         width: L, units of recurrent networks and of the code; by default 1024 for Human3.6M's skeleton, as in the
             paper, and 128 for others.
         latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 otherwise.
-        scale: standard deviation of the quaternions' numbers, which sets the relative weight of the KL.
+        scale: standard deviation of each coordinate of the quaternions, which sets the relative weight of the KL.
         skeleton: weight of the squared error of positions without the root's rotation, relative to the error of
-            quaternions; both are means over their numbers.
+            quaternions; both are means over coordinates.
         velocity: whether to predict the difference from the previous pose instead of the pose.
         curriculum: share of training over which the drawn indices change from the first ones to random ones; 0 for
             random indices from the start.
@@ -149,7 +149,8 @@ class MixAndMatchMotion(PoseMethod):
     def build(self, data: Any) -> DynamicalVAE:
         """Return the model for windows of quaternions.
 
-        From sizes alone, it is a model whose batches contain x and h, two frames of the size of x.
+        If `data` only gives sizes, the batches of the model contain x and two observed frames h, which have the size of
+        x.
 
         Raises:
             SchemaError: if the windows have another representation.

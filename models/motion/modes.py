@@ -46,9 +46,9 @@ from .futures import HISTORY, FutureMethod, FutureModel, LastState
 
 MODE, NOISE = "k", "e"
 WHOLE_SETS = "sets"
-"""Key of batches that contain every window in all modes, mode by mode, for energies to compare; its value is True."""
+"""Key of batches, with value True, that contain every window in all modes, mode by mode; energies compare the modes."""
 OF_CVAE = ("latent", "width", "hidden", "heading")
-"""Options of the CVAE."""
+"""Options of `ModesMethod` that are options of the CVAE."""
 SHAPE = (CVAE.latent, CVAE.width, CVAE.hidden)
 """Sizes of the CVAE if there is no run."""
 

@@ -103,7 +103,7 @@ class MotionLatent(Method):
     def build(self, data: Any) -> DynamicalVAE:
         """Return the model for segments (`dvae.motion.Segments`).
 
-        From a schema with only the sizes of its variables and a length, it is a model without a surface.
+        If the schema has only the sizes of its variables and a length, the model has no surface.
         """
         schema = Schema.of(data)
         sizes, length = {name: schema.size(name) for name in (*PARTS, SHAPE)}, schema.length or 100
@@ -198,7 +198,7 @@ class MotionLatentModel(DynamicalVAE):
 
     @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """Return the squared error of the surface, mean over vertices, in deviations, if the objective has draws."""
+        """Return the squared error of the surface, mean over vertices, / (2 deviation^2); empty without `draws`."""
         if not draws or not set(PARTS) <= data.keys():
             return {}
         predicted = self._unpack({name: rollout.parameters(name, rollout.values[name])[0] for name in PARTS})

@@ -17,7 +17,7 @@ from ..method import Method
 
 
 def table(options: str, rows: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
-    """Return presets by skeleton from rows of values and the names of their options."""
+    """Return the presets of each skeleton as {option: value}, from one text of option names and rows of values."""
     return {skeleton: dict(zip(options.split(), values, strict=True)) for skeleton, values in rows.items()}
 
 
@@ -69,7 +69,7 @@ class PoseMethod(Method):
         if schema.protocol.root != "drop":
             raise ValueError(
                 f"{self.name} predicts poses relative to the pelvis, but the protocol {schema.protocol.name} has "
-                f"root={schema.protocol.root!r}; use one with root='drop'"
+                f"root={schema.protocol.root!r}; use a protocol with root='drop'"
             )
         return schema
 

@@ -1,6 +1,6 @@
 """Base of the methods that complete a motion from one pose and given paths of some joints.
 
-    s the first pose, y_{1:T} the given trajectories, r_{1:T} the other joints', x_{1:T} the motion
+    s the first pose, y_{1:T} the given trajectories, r_{1:T} those of the other joints, x_{1:T} the motion
 
 Poses are positions in metres relative to the first pelvis, so that the body moves through space. y and r are copies of
 x with zeros at all other joints. In training, every joint of a window is given with probability `keep`, over all its
@@ -55,7 +55,7 @@ class TrajectoryMethod(PoseMethod):
         rotate: whether to rotate every training window about the up axis by a uniform angle.
         heading: whether to rotate every window so that its first pose faces one way, and rotate the motion back. The
             model is then exactly equivariant, and `rotate` has no effect. By default off for Human3.6M, as in the
-            paper, which leaves it to learning, and on for other skeletons with known left and right.
+            paper, whose network has to learn it, and on for other skeletons with known left and right.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
@@ -67,7 +67,7 @@ class TrajectoryMethod(PoseMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset, without headings if left and right of the skeleton are unknown."""
+        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
         preset = super().preset(skeleton)
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
@@ -83,7 +83,8 @@ class TrajectoryMethod(PoseMethod):
     def build(self, data: Any) -> DynamicalVAE:
         """Return the model for windows with a root and one observed frame.
 
-        From sizes alone, it has the paper's options, and its batches contain x and y, r and s of the size of x.
+        If `data` only gives sizes, the model has the paper's options, and its batches contain x, y, r and s, which all
+        have the size of x.
 
         Raises:
             ValueError: if windows have no root or more than one observed frame, or the size of x is missing.
@@ -96,8 +97,8 @@ class TrajectoryMethod(PoseMethod):
             suitable = (name for name, other in PROTOCOLS.items() if (other.root, other.observed) == REQUIRED_PROTOCOL)
             raise ValueError(
                 f"{self.name} moves a body through space from one pose, but the protocol {protocol.name} has "
-                f"root={protocol.root!r} and {protocol.observed} observed frames; use one with root='relative' and "
-                f"observed=1, such as {', '.join(suitable)}"
+                f"root={protocol.root!r} and {protocol.observed} observed frames; use a protocol with root='relative' "
+                f"and observed=1, such as {', '.join(suitable)}"
             )
         return self.build_on(schema.skeleton, schema.frames - 1)
 
@@ -151,9 +152,9 @@ class LatentTrajectoryMethod(TrajectoryMethod):
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Return one stage that minimises squared errors and the weighted KL, on the same windows.
+        """Return one stage that minimises squared errors and the weighted KL, with windows as in `TrajectoryMethod`.
 
-        The best weights have the lowest loss, because the bound does not include beta, which is part of the model.
+        The best weights are chosen by the loss, not by the bound, because the bound does not include beta.
         """
         method: Any = self.resolve_defaults(train)
         stages = [Stage(steps, Evidence(kl_weight=method.beta, select="loss"))]
@@ -161,7 +162,7 @@ class LatentTrajectoryMethod(TrajectoryMethod):
 
 
 class Paths(View):
-    """A view that adds given trajectories to the motion; a batch without trajectories gives none."""
+    """A view that adds given trajectories to the motion; if a batch has none, no joint is given."""
 
     @override
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
@@ -212,7 +213,7 @@ class TrajectoryModel(DynamicalVAE):
 
     @override
     def model(self, batch: AnyBatch | None = None, *, curriculum: float = 1.0, **options: Any) -> dict[str, Tensor]:
-        """Run the generative program; a batch without trajectories gives none.
+        """Run the generative program; if a batch has no trajectories, no joint is given.
 
         Raises:
             ValueError: if the batch has no initial pose.
@@ -262,7 +263,7 @@ class TrajectoryModel(DynamicalVAE):
         if fix:
             raise ValueError(f"cannot fix {', '.join(fix)}; give known parts of a motion as trajectories, in y")
         if horizon < 1 or samples < 1:
-            raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
+            raise ValueError(f"`horizon` and `samples` must be at least 1, got {horizon} and {samples}")
         if not 0 <= temperature < inf:
             raise ValueError(f"temperature is {temperature}; it must be finite and at least 0")
         data = self.read(batch)
@@ -313,7 +314,8 @@ class TrajectoryModel(DynamicalVAE):
             raise ValueError(f"the trajectories have {trajectories.shape[1]} frames, but the horizon is {horizon}")
         if not trajectories.isfinite().all():
             raise ValueError(
-                "trajectories must be finite, and 0 at joints that are not given; `complete` accepts paths with gaps"
+                "trajectories must be finite, and 0 at joints that are not given; `complete` accepts paths "
+                "with missing frames"
             )
         length = max(horizon, self.frames or horizon)
         tail = trajectories[:, -1:].expand(-1, max(length - trajectories.shape[1], 0), -1)
@@ -340,8 +342,8 @@ class TrajectoryModel(DynamicalVAE):
         Args:
             initial_pose: positions (J, 3) of all joints, in metres, in world coordinates.
             trajectories: mapping from joint to path (T, 3), in metres, in the same coordinates. The first frame follows
-                the pose; a frame with a NaN is missing. A joint has its name in the skeleton, or one such as
-                "left_wrist".
+                the pose; a frame with a NaN is missing. Joints are named as in the skeleton, or by a common name such
+                as "left_wrist".
             frames: T, number of frames; required without trajectories.
             samples: S, number of motions.
             exact: whether to put the given joints exactly on their paths, with the most likely change of the latents
@@ -366,7 +368,7 @@ class TrajectoryModel(DynamicalVAE):
         ]:
             raise ValueError(
                 f"the initial pose has no positions of {', '.join(missing)}, but must be complete; choose another "
-                "window, or fill the gaps first (`dvae impute RUN --filled FILE`)"
+                "window, or fill them in first (`dvae impute RUN --filled FILE`)"
             )
         if problem := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
             raise ValueError(problem.replace("clip initial/pose", "the initial pose"))
@@ -379,7 +381,7 @@ class TrajectoryModel(DynamicalVAE):
             lengths["frames"] = frames
         if len(set(lengths.values())) != 1 or min(lengths.values()) < 1:
             lengths_text = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
-            raise ValueError(f"expected paths of one length, or frames= without any; got {lengths_text}")
+            raise ValueError(f"expected paths of equal length, or `frames` if there are no paths; got {lengths_text}")
         if exact and not paths:
             raise ValueError("exact=True makes motions follow paths, but got no path; give trajectories")
         if exact and not self.latents:
@@ -435,11 +437,11 @@ class TrajectoryModel(DynamicalVAE):
         worst = int(leaps.argmax())
         if leaps[worst] > LEAP:
             message = (
-                f"the path of {joint} moves by {leaps[worst]:.4g} m a frame before its frame {frames[worst + 1]} "
-                f"(since {'the pose' if worst == 0 else f'frame {frames[worst]}'})"
+                f"the path of {joint} moves by {leaps[worst]:.4g} m per frame from "
+                f"{'the pose' if worst == 0 else f'its frame {frames[worst]}'} to its frame {frames[worst + 1]}"
             )
             if leaps[worst] > FAR:
-                raise ValueError(f"{message}; paths are in metres, in the same world as the pose")
+                raise ValueError(f"{message}; paths must be in metres, in the same coordinates as the pose")
             warnings.warn(message, stacklevel=3)
         return path
 

@@ -360,7 +360,7 @@ def test_only_a_mapped_archive_may_be_larger_than_memory(tmp_path, monkeypatch):
     monkeypatch.setattr("dvae.motion.files.arrays.LARGEST", 3 * positions.nbytes)
     single = stored(tmp_path / "a.npz", **{f"train/{n}": positions for n in range(5)})
     assert len(motion.read_motion(single)) == 5
-    with pytest.raises(ValueError, match=r"it has more than [\d,]+ bytes of motion that is not mapped as float32"):
+    with pytest.raises(ValueError, match=r"it has more than [\d,]+ bytes of motion that cannot be memory-mapped"):
         motion.read_motion(single, metres=1.0)
     double = stored(tmp_path / "b.npz", **{f"train/{n}": positions.astype(np.float64) for n in range(5)})
     with pytest.raises(ValueError, match="it would unpack to"):

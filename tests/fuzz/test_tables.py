@@ -195,8 +195,8 @@ def labels(path):
     ("content", "message"),
     [
         (b"\xff\xfe", "is not text"),
-        (b"split,clip,style\ntrain,walk\n", "row 2 has 2 cells, the header 3"),
-        (b"split,clip,style\ntrain,walk,a,b\n", "row 2 has 4 cells, the header 3"),
+        (b"split,clip,style\ntrain,walk\n", "row 2 has 2 cells, expected 3"),
+        (b"split,clip,style\ntrain,walk,a,b\n", "row 2 has 4 cells, expected 3"),
         (b"split,clip,style,style\ntrain,walk,a,b\n", "column 'style' occurs twice"),
         (b"split,clip\ntrain,walk\n" + b"a" * 200_000 + b",b\n", "row 3 is not a row of a csv file .*field larger"),
         (b'split,clip\n"train,walk\n' + b"a\n" * 100_000, "field larger"),

@@ -186,7 +186,7 @@ def test_an_implausible_unit_is_an_error_and_differing_units_are_reported(bvh):
     with pytest.raises(ValueError, match=r"person_0001\.bvh: its body is 0\.\d+ times as large as in"):
         read_motion(bvh, metres=0.01)
     scaled(bvh / "train" / "person_0000.bvh", 7)
-    with pytest.raises(ValueError, match=r"0\.bvh: the body is about .* tall .* give the metres"):
+    with pytest.raises(ValueError, match=r"0\.bvh: the body is about .* tall .* pass the length"):
         read_motion(bvh / "train" / "person_0000.bvh")
 
 
@@ -315,7 +315,7 @@ def test_recordings_without_splits_are_divided(people):
 
     assert [clip.key for clip in both.divided(0.5, 30)] == [("train", "a-b-x"), ("test", "c-x")]  # too short for parts
     assert [clip.split for clip in single.divided(0.5, 30)] == ["train"]
-    with pytest.raises(ValueError, match="the share for test is 1"):
+    with pytest.raises(ValueError, match="`test` must be a fraction above 0 and below 1, got 1"):
         single.divided(1)
 
 

@@ -36,8 +36,8 @@ def recordings(walkers, tmp_path_factory):
 def test_formats_and_names_that_do_not_fit_are_errors(walkers, tmp_path):
     for path, format, message in (
         ("a.bvh", None, "stores one clip per file, but there are 3"),
-        ("a", None, "which format.*--format"),
-        ("a.csv", "bvh", "which format"),
+        ("a", None, "the format is unknown.*--format"),
+        ("a.csv", "bvh", "the format is unknown"),
         ("a", "npz", "end its name in .npz"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -155,7 +155,7 @@ def test_a_fitted_classifier_is_loaded_and_resumed(run, file, tmp_path, capsys):
         ),
         (
             lambda: ActionClassifier(**SMALL).resolve_defaults(windows("train", people(ways=("up", "up")))),
-            "needs two classes: training clips have up for",
+            "needs at least two classes: training clips have up for",
         ),
         (
             lambda: ActionClassifier(**SMALL, classes=("up", "left")).train(windows("test")),
@@ -242,7 +242,7 @@ def test_unknown_classes_count_for_fid_only_and_are_reported(fitted):
             lambda: windows("test", motion.simulate(clips=9, frames=40, test=0.4)),
             "distinguishes ways, but no label 'way'",
         ),
-        (lambda: windows("test", people(3), replace(SHORT, test_stride=99)), "these are 1 windows of 1 clips"),
+        (lambda: windows("test", people(3), replace(SHORT, test_stride=99)), "got 1 windows of 1 clips"),
     ],
 )
 def test_windows_unlike_those_of_a_classifier_are_errors(condition, message, fitted):
