@@ -132,7 +132,7 @@ def clip_index(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 
 @contextmanager
 def seeded_evaluation(model: nn.Module, seed: int) -> Iterator[None]:
-    """Use evaluation mode, no gradients and draws from `seed`, and restore mode and random state afterwards."""
+    """Set evaluation mode, disable gradients and seed the draws; restore mode and random state on exit."""
     with seeded(seed, next(model.parameters()).device), evaluating(model), torch.no_grad():
         yield
 
