@@ -248,7 +248,10 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
     }
     if not contenders or not all(contenders.values()):
         empty = next((name for name, versions in contenders.items() if not versions), None)
-        raise ValueError("expected models to compare: " + (f"{empty!r} has no model" if contenders else "no models"))
+        raise ValueError(
+            "expected at least one model in every row of models, got "
+            + (f"none in {empty!r}" if contenders else "no rows")
+        )
     for name, versions in contenders.items():
         for version in versions:
             if not isinstance(version, DynamicalVAE):

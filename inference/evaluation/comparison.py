@@ -367,7 +367,7 @@ class Comparison(Result):
     @override
     def check(self) -> None:
         if self.extents["sequence"] != {len(self.keys)}:
-            raise ValueError(f"expected values of {len(self.keys)} sequences, got {self.extents['sequence']}")
+            raise ValueError(f"`keys` lists {len(self.keys)} sequences, but arrays have {self.extents['sequence']}")
         for name, row in self.rows.items():
             if not {"ELBO", "IWAE bound", "k-hat"} <= row.bounds.keys():
                 raise ValueError(

@@ -334,8 +334,8 @@ def conformal_bands(
     factors = {region: quantile(largest_by_region(far, region), places, level) for region in REGIONS}
     if not all(factor.isfinite().all() for factor in factors.values()):
         raise ValueError(
-            "these prediction bands would be infinite: either forecasts have no spread, as point forecasts (pass "
-            f"`residuals`, windows to estimate a spread), or a value was observed in too few {clip}s"
+            "these prediction bands would be infinite. Either forecasts have no spread, such as point forecasts: pass "
+            f"`residuals`, windows to estimate a spread. Or a value was observed in too few {clip}s: use more windows"
         )
     return PredictionBands(
         level=level,

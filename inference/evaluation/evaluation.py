@@ -324,7 +324,7 @@ class Evaluation(Result):
     @override
     def check(self) -> None:
         if self.extents.get("clip", {len(self.clips)}) != {len(self.clips)}:
-            raise ValueError(f"expected values of {len(self.clips)} clips, got {self.extents['clip']}")
+            raise ValueError(f"`clips` lists {len(self.clips)} clips, but arrays have {self.extents['clip']}")
         if unknown := {name for row in self.rows.values() for name in row.clip_means} - self.metrics.keys():
             raise ValueError(f"metrics has no entry for {', '.join(sorted(unknown))}")
 

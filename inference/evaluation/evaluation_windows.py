@@ -109,8 +109,8 @@ def prepare_windows(data: Any) -> EvaluationWindows:
         )
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
-            f"windows must have a step to observe and a step to predict, but of {batch['x'].shape[1]} steps "
-            f"{observed} are observed"
+            f"windows must have at least 1 observed step and 1 step to predict, but {observed} of "
+            f"{batch['x'].shape[1]} steps are observed"
         )
     eval_windows = EvaluationWindows(windows, batch, observed, list(windows.keys))
     if eval_windows.mask is not None:

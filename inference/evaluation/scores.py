@@ -35,7 +35,7 @@ class Metric:
         unit: unit of the score.
         program: "free-running" or "teacher-forced".
         better: "lower", "higher", or "" for neither.
-        partial: whether the score is NaN for some clips, which are then omitted.
+        partial: whether the score may be NaN for some clips; its mean then omits them.
     """
 
     unit: str = ""

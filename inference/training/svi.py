@@ -294,7 +294,7 @@ class SVI:
         return processes.sum_over_processes(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Return the mean over processes of a value per frame of the last step, weighted by numbers of frames."""
+        """Return the mean over processes of a value per frame, weighted by their numbers of frames in the last step."""
         return self.total(value * self._share)
 
     def settle(self) -> None:
