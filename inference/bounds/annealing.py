@@ -148,7 +148,7 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, A
         ValueError: when a latent is missing, or has another shape.
     """
     if missing := [name for name in model.latents if name not in latents]:
-        raise ValueError(f"reverse chains need start values of all latents; missing are {', '.join(missing)}")
+        raise ValueError(f"`latents` must have a start value for every latent; missing are {', '.join(missing)}")
     first = data[model.observed[0]]
     values = {}
     for name in model.latents:

@@ -134,7 +134,7 @@ class Correction:
         return [(self.shift, 1), (self.stretch, 1), *linked]
 
     def freed(self, change: Callable[[Tensor], Tensor]) -> Correction:
-        """Return a copy with changed free parameters."""
+        """Return a copy in which `change` has been applied to each free parameter."""
         links = tuple(replace(link, weight=change(link.weight)) for link in self.links)
         return replace(self, shift=change(self.shift), stretch=change(self.stretch), links=links)
 
@@ -220,7 +220,8 @@ def semi_amortized_guide(
         missing: whether the guide also reads, in its order of drawing, the latents that it ignores although the
             posterior depends on them (`audit`).
         steps: number of steps of Adam, with a learning rate that falls to 0.
-        rate: learning rate of the first step, in deviations of the guide; the weights of one location share it.
+        rate: learning rate of the first step, in standard deviations of the guide. Weights that affect the same
+            location divide it equally among them.
         draws: number of draws of every sequence in each step.
         reach: largest distance in steps of linear dependencies between local latents; None for no limit.
         seed: seed of the draws.

@@ -92,11 +92,12 @@ class Calibration(Result):
 
     @property
     def spread(self) -> np.ndarray:
-        """Standard deviation of the truth about the guide's mean, relative to the guide's, (Q,); above 1: too narrow.
+        """Standard deviation of the truth about the guide's mean, divided by the guide's, (Q,).
 
-        Bias and spread are the mean and deviation of the normal truth that makes these ranks among L standard normal
-        draws most likely. They are accurate if guide and posterior are normal. If ranks accumulate at an end, the data
-        do not determine them; a prior with less weight than one simulation keeps them finite.
+        Above 1, the guide is too narrow. Bias and spread are maximum likelihood estimates: the mean and standard
+        deviation of a normal truth, given its ranks among L standard normal draws. They are accurate if guide and
+        posterior are normal. If ranks accumulate at 0 or L, the likelihood has no finite maximum; a prior with less
+        weight than one simulation keeps the estimates finite.
         """
         return np.exp(self._normals[:, 1])
 
@@ -240,7 +241,7 @@ def calibrate(
         draws: L, number of draws from the guide for each simulation.
         guide: Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
         steps: steps of local latents to rank, from 1; all by default.
-        context: context variables (C, T, D) or (C, D), used in turn.
+        context: context variables (C, T, D) or (C, D) by name; simulations use the C values in turn.
         seed: seed of simulations and draws.
         chunk: largest number of sequences times draws in memory.
         progress: whether to show a progress bar.

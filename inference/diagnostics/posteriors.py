@@ -43,8 +43,8 @@ class Descent:
         steps: number of steps of Adam.
         rate: initial learning rate; it falls to 0 along a cosine.
         starts: S, number of starts for each sequence; the lowest result is kept.
-        candidates: number of draws from the prior, and from the guide if there is one. These draws and the mean of the
-            prior's are divided among the starts; each start is the most probable of its share.
+        candidates: number of draws from the prior, and from the guide if there is one. These draws, and the mean of the
+            draws from the prior, are divided among the starts. Each start is the most probable candidate of its part.
         renewed: number of steps between calls of `renew`.
         newton: number of Newton steps at the end, each with its own curvature.
 
@@ -354,7 +354,7 @@ def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str
 
 
 def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lower roots (B, P, P) of the inverse curvature, and the number of directions in which it was raised.
+    """Return lower triangular roots (B, P, P) of the inverse curvature, and the number of raised directions.
 
     Where the curvature is less than the prior's, it is raised to the prior's.
     """

@@ -225,7 +225,7 @@ class _Evaluator:
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return the scores and histograms of free-running forecasts that `samples` suffices for."""
+        """Return the free-running scores and histograms that need at most `samples` forecasts per window."""
         measures = [measure for measure in self.measures if measure.least <= samples]
         eval_windows, results = self.eval_windows, []
         index = torch.arange(len(eval_windows.keys))

@@ -198,10 +198,10 @@ class Evaluation(Result):
     def departure(self, method: str, histogram: str = "PIT", alpha: float = 0.05) -> tuple[np.ndarray, ...]:
         """Return the difference between a method's PIT distribution and uniform, with a simultaneous band.
 
-        The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Their number is the
-        effective number of these dependent ranks, from their spread over clips (`estimates.effective_number`). This is
-        an approximation, except for clips of one number each. A curve that leaves the band at any point indicates that
-        forecasts are not calibrated.
+        The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Ranks of one clip depend
+        on each other, so the envelope is for their effective number, estimated from their spread over clips
+        (`estimates.effective_number`). It is an approximation, unless each clip contributes a single number. A curve
+        that leaves the band at any point indicates that forecasts are not calibrated.
 
         Returns:
             Points between bins, the share of the PIT below each minus the point itself, and the lower and upper end of
@@ -258,7 +258,7 @@ class Evaluation(Result):
         Bands are two standard errors, clustered by clip. The scores come from `scores.over_horizon`.
 
         Raises:
-            KeyError: when no method has a histogram of a frame.
+            KeyError: when no method has a histogram of a single frame.
         """
         _, frame = axis_names(self.data)
 
@@ -324,7 +324,7 @@ class Evaluation(Result):
     @override
     def check(self) -> None:
         if self.extents.get("clip", {len(self.clips)}) != {len(self.clips)}:
-            raise ValueError(f"expected values of {len(self.clips)} clips, got {self.extents['clip']}")
+            raise ValueError(f"`clips` lists {len(self.clips)} clips, but arrays have {self.extents['clip']}")
         if unknown := {name for row in self.rows.values() for name in row.clip_means} - self.metrics.keys():
             raise ValueError(f"metrics has no entry for {', '.join(sorted(unknown))}")
 

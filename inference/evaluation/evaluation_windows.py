@@ -109,8 +109,8 @@ def prepare_windows(data: Any) -> EvaluationWindows:
         )
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
-            f"windows must have a step to observe and a step to predict, but of {batch['x'].shape[1]} steps "
-            f"{observed} are observed"
+            f"windows must have at least 1 observed step and 1 step to predict, but {observed} of "
+            f"{batch['x'].shape[1]} steps are observed"
         )
     eval_windows = EvaluationWindows(windows, batch, observed, list(windows.keys))
     if eval_windows.mask is not None:
@@ -132,7 +132,7 @@ def clip_index(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 
 @contextmanager
 def seeded_evaluation(model: nn.Module, seed: int) -> Iterator[None]:
-    """Use evaluation mode, no gradients and draws from `seed`, and restore mode and random state afterwards."""
+    """Set evaluation mode, disable gradients and seed the draws; restore mode and random state on exit."""
     with seeded(seed, next(model.parameters()).device), evaluating(model), torch.no_grad():
         yield
 

@@ -151,7 +151,7 @@ class Result(Displayed):
 
     @property
     def extents(self) -> Mapping[str, set[int]]:
-        """Sizes of the arrays by dimension; several if arrays differ in it."""
+        """Set of array sizes for each dimension, with several sizes if arrays differ."""
         return flatten(self).sizes
 
     @property

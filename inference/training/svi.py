@@ -235,7 +235,7 @@ class SVI:
         The draws from the guide are the same at each call, so bounds differ only by the weights. Processes share the
         data, and each returns the terms of all data. The row of a model without a likelihood has a "loss" instead of a
         bound. An objective that selects by "loss" adds it to the row. A run with scheduled sampling adds
-        "self_fed/bound", the bound with the feeding at the end of the run.
+        "self_fed/bound", the bound with the scheduled-sampling probability at the end of the run.
 
         Args:
             data: x as a tensor (N, T, D), a batch, an object whose `all()` returns a batch, or one whose
@@ -294,7 +294,7 @@ class SVI:
         return processes.sum_over_processes(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Return the mean over processes of a value per frame of the last step, weighted by numbers of frames."""
+        """Return the mean over processes of a value per frame, weighted by their numbers of frames in the last step."""
         return self.total(value * self._share)
 
     def settle(self) -> None:

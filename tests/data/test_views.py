@@ -427,7 +427,7 @@ def test_the_log_score_includes_the_log_determinant_of_the_future():
     plain = seeded(predictive_bound, with_view(None), x * FACTORS, n_observed, 8).bound
     scaled = seeded(predictive_bound, with_view(Scaled()), x, n_observed, 8).bound
     torch.testing.assert_close(scaled, plain + (T - n_observed) * FACTORS.abs().log().sum())
-    with pytest.raises(ValueError, match="the share of the future in it is not known"):
+    with pytest.raises(ValueError, match="the part of the future is unknown"):
         predictive_bound(with_view(Mixed()), x, n_observed, 8)
 
 
