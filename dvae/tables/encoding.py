@@ -122,8 +122,8 @@ class PanelSchema(Schema):
             elif column.family not in ("binary", "category") and varies and scale < RESOLVED * abs(mean):
                 raise ValueError(
                     f"column {column.name!r} has mean {mean:.9g} and standard deviation {scale:.3g}, which float32 "
-                    f"does not resolve in the family {column.family!r}; give it the family 'real', whose mean models "
-                    "subtract in float64"
+                    f"does not resolve in the family {column.family!r}; give it the family 'real'; models subtract "
+                    "the mean of real columns in float64"
                 )
             if column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, mean or 1.0
@@ -168,7 +168,7 @@ class PanelSchema(Schema):
     @property
     @override
     def view(self) -> View:
-        """The identity, with the context as optional inputs."""
+        """View that leaves x unchanged and offers the context as optional inputs."""
         return ContextView(tuple(name for name in self.sizes if name != "x"))
 
     @property
@@ -203,7 +203,7 @@ class PanelSchema(Schema):
     @property
     @override
     def together(self) -> Sequence[int]:
-        """Index of the column of each coordinate; all 0 if a step is observed or missing as a whole."""
+        """Index of the column of each coordinate; all 0 if every step is either fully observed or fully missing."""
         targets = enumerate(self.columns.targets)
         return [0 if is_whole(self.columns) else index for index, column in targets for _ in column.coordinates]
 
@@ -332,7 +332,7 @@ def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
 
 
 def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Warn if float32 does not resolve how a column varies within a sequence, after the overall mean is subtracted."""
+    """Warn if a column varies within a sequence by less than float32 resolves after the mean is subtracted."""
     center = np.array([means.get(name, 0.0) for name in columns.names])
     imprecise = np.array([is_imprecise(ColumnSummary.of(blocks(values)), center) for _, values in training])
     for column, mean, sequences in zip(columns.columns, center, imprecise.T, strict=True):
@@ -355,5 +355,5 @@ def _encode(values: np.ndarray, column: Column) -> np.ndarray:
 
 
 def is_whole(columns: Columns) -> bool:
-    """Return whether a step is always observed or missing as a whole."""
+    """Return whether every step is either fully observed or fully missing."""
     return any(column.family in WHOLE_STEPS for column in columns.targets)
