@@ -68,8 +68,8 @@ class Glimpse:
         frames: number of evenly spaced frames, of the 100 of a segment, to observe at unknown times; replaces --seconds
             and --fps.
         points: number of surface points observed at each time.
-        gaps: share of missing points or markers.
-        known_body: the shape of the body is given, and not inferred.
+        gaps: share of points or markers to remove, at least 0 and below 1.
+        known_body: whether the true body shape is given instead of inferred.
     """
 
     seen: Literal["surfaces", "points", "markers"] | None = None
@@ -97,7 +97,9 @@ class Glimpse:
         frames = None
         if self.frames is not None:
             if self.frames > model.timed.frames:
-                raise UsageError(f"--frames is {self.frames}; segments of this run have {model.timed.frames}")
+                raise UsageError(
+                    f"--frames is {self.frames}; segments of this run have {model.timed.frames} frames; give fewer"
+                )
             frames = np.linspace(0, model.timed.frames - 1, self.frames).round().tolist()
         options: dict[str, Any] = {"seconds": self.seconds, "frames": frames, "points": self.points, "gaps": self.gaps}
         observations = simulate_observations(model, x, shape, self.seen, fps=self.fps or 30.0, seed=seed, **options)
@@ -112,7 +114,7 @@ class Recovery:
         glimpse: simulated observations of known segments.
         deviations: standard deviations of the observations from the output of the model.
         descent: optimisation of the most probable segments.
-        source: names of segments, or of takes, whose first segment is used; or split/name.
+        source: names of segments, or of takes, whose first segment is used; split/name if a name is not unique.
         file: your own observations, instead.
         aggregate: use a normal distribution fitted to the latents of known segments as prior of z, instead of N(0, I).
     """
@@ -182,7 +184,7 @@ def _other_segments(data_set: Any, takes: Collection[str]) -> Mapping[str, Any] 
 
 
 def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:
-    """Yield warnings for readers of the table."""
+    """Yield warnings about the results, to print with the table."""
     remaining = recovered.completed.posterior.left
     if n_unconverged := int((remaining > APART).sum()):
         yield (
