@@ -41,9 +41,9 @@ from .calendar import check_zone
 
 Role = Literal["target", "known", "past", "static"]
 WHOLE_STEPS = ("correlated",)
-"""Families with one event for all their columns."""
+"""Families with one joint distribution over all their columns, whose values are observed or missing together."""
 MOST = 4096
-"""Maximum number of columns, and of classes of a column."""
+"""Maximum number of columns of a table, and of classes of a column."""
 _CHAIN = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"(?:\\.|[^"\\\n])*+"|'[^'\n]*+')\s*\.\s*){64}""")
 """A dotted key deeper than in any schema; `tomllib` takes quadratic time to parse it."""
 

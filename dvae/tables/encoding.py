@@ -54,8 +54,9 @@ class PanelSchema(Schema):
     Args:
         columns: schema of the table.
         cut: how sequences are split and cut.
-        means, scales: means and scales of the standardised columns, over the training data.
-        logarithms: smallest value, and mean and standard deviation of the logarithms, of columns read as logarithms.
+        means, scales: dictionaries from standardised column to its mean and scale over the training data.
+        logarithms: dictionary from column that models read as logarithm to its smallest positive value, and the mean
+            and standard deviation of its logarithms.
         with_missing: names of columns with an indicator: those with missing training values, or known only up to the
             present.
         step: median time between steps; 0 if steps are evenly spaced.
@@ -89,11 +90,13 @@ class PanelSchema(Schema):
         covariates = self.columns.of("known", "past", "static")
         if missing := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
             raise ValueError(
-                f"no mean and scale of {', '.join(sorted(missing))}; models need both to standardise values"
+                f"no mean and scale of {', '.join(sorted(missing))}; expected both for every real "
+                "covariate, as `PanelSchema.from_data` computes them"
             )
         if missing := {c.name for c in self.columns.of("past")} - {*self.with_missing}:
             raise ValueError(
-                f"no indicator of {', '.join(sorted(missing))}; covariates known up to the present need one"
+                f"no indicator of {', '.join(sorted(missing))}; add these covariates, known up to the present, to "
+                "`with_missing`"
             )
 
     @classmethod
@@ -338,8 +341,8 @@ def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequ
     for column, mean, sequences in zip(columns.columns, center, imprecise.T, strict=True):
         if sequences.any() and column.family not in ("binary", "category"):
             warnings.warn(
-                f"column {column.name!r} varies by less than float32 resolves at its distance from {mean:.9g} in "
-                f"{sequences.sum()} of {len(training)} training sequences, such as "
+                f"column {column.name!r} varies by less than float32 resolves, because its values are far from "
+                f"{mean:.9g}, in {sequences.sum()} of {len(training)} training sequences, such as "
                 f"{training[sequences.argmax()][0]!r}; {LEVELS}",
                 stacklevel=3,
             )

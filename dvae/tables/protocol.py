@@ -25,7 +25,8 @@ class Cut:
         validation: share for validation.
         test: share for test.
         seed: random seed of the split by sequence or group.
-        season: period of the data in steps, such as 7 for days; the reference forecast "seasonal" repeats it.
+        season: period of the data in steps, such as 7 for daily data with a weekly period; the reference forecast
+            "seasonal" repeats it.
 
     Raises:
         ValueError: if only one of `observed` and `horizon` is given, `split` is "time" without them, the season exceeds

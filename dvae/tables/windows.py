@@ -206,7 +206,7 @@ class PanelWindows:
         return self._cut(indices, low + (u_start * (last - low + 1)).long())
 
     def _sample_groups(self, batch_size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return range and first step of windows of some groups, drawn in proportion to their number of windows."""
+        """Return range and first step of random windows; groups are drawn in proportion to their number of windows."""
         names = [self.panel.series[index].group for index, _, _ in self._ranges]
         cumulative = torch.cat([self._weights.new_zeros(1), self._weights])
         first = torch.tensor([n for n, name in enumerate(names) if n == 0 or names[n - 1] != name])
@@ -327,7 +327,7 @@ class PanelWindows:
 
     @cached_property
     def _windows(self) -> tuple[Tensor, Tensor]:
-        """Range and first step of the listed windows; all of them, or `some`."""
+        """Range and first step of each listed window; `some` restricts the list."""
         return self._list_windows()
 
     def _list_windows(self) -> tuple[Tensor, Tensor]:
