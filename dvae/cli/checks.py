@@ -125,9 +125,9 @@ def posterior(
 ) -> None:
     """Compare a run's guide with the posterior of the latents of some test windows.
 
-    Computes the kernel Stein discrepancy of the guide in moments, and then means, deviations and correlations of the
-    guide and of NUTS, which takes minutes for each window: begin with few --frames. Prints both tables, and writes each
-    to posterior.json in the run, or to --out, as soon as it is computed.
+    First computes the kernel Stein discrepancy of the guide, which is quick. Then computes means, deviations and
+    correlations of the guide and of NUTS, which takes minutes for each window: begin with few --frames. Prints both
+    tables, and writes each to posterior.json in the run, or to --out, as soon as it is computed.
 
     Args:
         run: the run directory.
@@ -196,11 +196,12 @@ def gap(
         count: number of test windows, drawn at random; the time is proportional to it.
         particles: number of particles of the IWAE and FIVO bounds, and number of draws that ELBOs average.
         temperatures: number of temperatures of annealed importance sampling; more give closer bounds.
-        chains: number of chains for each window.
+        chains: number of chains of annealed importance sampling for each window.
         fitting: number of optimiser steps that fit a separate guide to each window; 0 omits the parts of the gap.
-        reach: steps between latents that these guides read linearly; by default all that the equations allow.
+        reach: largest distance in steps of linear dependencies between local latents in these guides; no limit by
+            default.
         seed: seed of the draws.
-        batch_size: number of windows at once.
+        batch_size: number of windows processed at once.
         out: file to write instead of gap.json in the run.
         figure: save all bounds on one axis.
     """
@@ -330,7 +331,7 @@ def edges(
         source: data to fit to.
         generative: equation of the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
         inference: equation of the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; by default "faithful", a guide with all
-            dependencies of the posterior, derived again for every reduced model; "" for a model without latents.
+            dependencies of the posterior, derived anew for every reduced model; "" for a model without latents.
         latent: size of the latents.
         out: directory of the run directories, such as whole-seed0 and model-without-z_t-1-to-z_t-seed0.
         seeds: seeds of initial weights, batches and draws, one run for each.

@@ -86,7 +86,7 @@ class Glimpse:
             raise ValueError("--frames is for unknown times, --seconds and --fps are for known times; give only one")
 
     def of(self, model: Any, truth: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tensor]:
-        """Return the observations of x (B, N, D) and beta (B, S)."""
+        """Return simulated observations of segments, given their x (B, N, D) and beta (B, S)."""
         if self.seen is None:
             raise UsageError("--from requires --seen surfaces, points or markers")
         if self.seen != "points" and self.points != Glimpse.points:
@@ -111,11 +111,11 @@ class Recovery:
     """Recovery of segments with a run of motion-latent.
 
     Args:
-        glimpse: simulated observations of known segments.
+        glimpse: options of simulated observations of known segments.
         deviations: standard deviations of the observations from the output of the model.
-        descent: optimisation of the most probable segments.
+        descent: options of the optimisation that finds the most probable segments.
         source: names of segments, or of takes, whose first segment is used; split/name if a name is not unique.
-        file: your own observations, instead.
+        file: npz file of your own observations, instead of simulated ones.
         aggregate: use a normal distribution fitted to the latents of known segments as prior of z, instead of N(0, I).
     """
 

@@ -122,8 +122,8 @@ def texts(column: Any) -> Any:
 def dates(column: Any) -> Any:
     """Parse dates, in their time zone if they have one.
 
-    Accepted formats are ISO 8601, dates with English month names, and digits if some values determine day and month.
-    Dates with several offsets from UTC are converted to UTC.
+    Accepted formats are ISO 8601, dates with English month names, and numeric dates if some values determine the order
+    of day and month. Dates with several offsets from UTC are converted to UTC.
 
     Raises:
         AmbiguousDates: if the order of day, month and year is not determined, or only some dates have an offset.

@@ -233,7 +233,7 @@ class PanelWindows:
     def batches(self, batch_size: int) -> Iterator[Any]:
         """Return an iterator over batches of the listed windows.
 
-        Windows of several lengths or of groups are loaded at once.
+        If sequences are whole or have groups, all windows are loaded into memory first.
         """
         if self.length is None or self.schema.columns.group:
             return Sequences(self.all()).batches(batch_size)
