@@ -360,7 +360,7 @@ def _check_header(name: str, member: Any) -> None:
 
 
 def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | ColumnHints | None, Cut | None]:
-    """Return the content of the schema file next to a file, or None for each missing part.
+    """Return columns and cut of the schema file next to a file, as in `read_schema`; (None, None) without a file.
 
     Raises:
         ValueError: if the schema is invalid; the message names its file.
@@ -382,7 +382,7 @@ def read_schema(text: str) -> tuple[Columns | ColumnHints | None, Cut | None]:
     cut = entries.pop("cut", None)
     if cut is not None:
         if not isinstance(cut, dict):
-            raise ValueError("cut must be a table: [cut]")
+            raise ValueError(f"cut is {cut!r:.100}; expected a table, [cut]")
         allowed = [field.name for field in fields(Cut)]
         for name in cut:
             if name not in allowed:

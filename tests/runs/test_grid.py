@@ -131,7 +131,7 @@ def test_an_invalid_grid_is_an_error_with_its_table(study, text, message):
 def test_the_command_line_accepts_methods_or_a_grid(study, tmp_path, capsys):
     out = ["--out", str(tmp_path / "runs")]
     for arguments, message in (
-        (["vae", "--grid", str(study)], "no method and --grid"),
+        (["vae", "--grid", str(study)], "give either methods or --grid"),
         (["--grid", str(study), "--latent", "3"], "each.latent"),
         (["--grid", str(tmp_path / "none.toml")], "none.toml"),
     ):

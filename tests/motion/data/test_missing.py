@@ -528,7 +528,7 @@ def test_impute_writes_filled_motion_files(fitted, tmp_path, capsys):
     capsys.readouterr()
     for arguments, message in (
         (["--filled", str(tmp_path / "all.bvh")], "can contain one of"),
-        (["--particles", "2", "--out", str(tmp_path / "i.npz")], "--particles chooses among fillings of tables"),
+        (["--particles", "2", "--out", str(tmp_path / "i.npz")], "--particles applies to tables only"),
         ([], "name it with --out or --filled"),
     ):
         assert main([*impute, *arguments]) == 2

@@ -261,7 +261,7 @@ def test_the_command_line_scores_runs_by_classifiers(run, file, tmp_path, capsys
     assert main([*arguments, "--classifier", str(tmp_path / "way")]) == 0
     assert {"ACC way", "path error"} <= Evaluation.load(out)["trajevae"].keys()
     for runs, message in (
-        ([tmp_path / "way"] * 2, "is the second for the label 'way'"),
+        ([tmp_path / "way"] * 2, "is a second classifier of the label 'way'"),
         ([model], "is a fitted trajevae, not an action-classifier"),
         ([run], "was fitted on other data or under another protocol"),
     ):
