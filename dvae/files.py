@@ -69,7 +69,7 @@ def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
     with open_plain(path, links=links) as file, with_path(path):
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise FileRefused(f"{path} has {size} bytes, and can rightly have {most} at most")
+            raise FileRefused(f"{path} has {size} bytes, but at most {most} are allowed")
         parts, remaining = [], most + 1
         while remaining and (
             part := file.read(min(remaining, 1 << 24))

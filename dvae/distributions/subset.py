@@ -68,7 +68,10 @@ class SubsetDistribution(TorchDistribution):
 
     def __init__(self, size: int, chosen: int, swapped: int | None = None) -> None:
         if not 0 <= chosen <= size or not 0 <= (swapped or 0) <= min(chosen, size - chosen):
-            raise ValueError(f"cannot choose {chosen} of {size} indices, {swapped} of them not among the first")
+            raise ValueError(
+                f"`chosen` must be between 0 and `size` {size}, and `swapped` at most `chosen` and `size - chosen`; "
+                f"got chosen={chosen}, swapped={swapped}"
+            )
         self.size, self.chosen, self.swapped = size, chosen, swapped
         super().__init__(torch.Size(), torch.Size([size]), validate_args=False)
 

@@ -119,8 +119,8 @@ class FrameGraph:
         """
         if local or any(p.relation != ALL for p in inputs):
             raise ValueError(
-                "FrameGraph sums up parents read over {1:T} for a static variable; use networks.SelfAttention or "
-                "networks.Attention for this factor"
+                "FrameGraph supports only a static variable with parents read over {1:T}; use networks.SelfAttention "
+                "or networks.Attention for this factor"
             )
         return FrameGraphNetwork(self, inputs, size)
 

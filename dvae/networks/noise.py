@@ -128,7 +128,7 @@ class _MixedDecoder(nn.Module):
     def forward(self, past: Tensor, z: Tensor, indices: Tensor | None = None) -> Tensor:
         indices = _require_indices(indices)
         if z.shape[-1] != self.latent:
-            raise ValueError(f"z has {z.shape[-1]} numbers, but this code was built for {self.latent}")
+            raise ValueError(f"z must have size {self.latent} in its last dimension, got {z.shape[-1]}")
         latent_code = _scatter_in_order(z, indices < 0.5) if self.layer is None else functional.relu(self.layer(z))
         mixture, code = indices * past + (1 - indices) * latent_code, past
         if self.block is not None:

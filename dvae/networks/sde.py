@@ -132,7 +132,7 @@ class Equation(nn.Module):
         super().__init__()
         shortest, longest = times
         if not 0 < shortest <= longest < math.inf:
-            raise ValueError(f"times must be positive, the shortest and the longest, got {times}")
+            raise ValueError(f"`times` must be (shortest, longest), positive, finite and in this order, got {times}")
         quantiles = (torch.arange(size) + 0.5) / size
         self.log_rate = nn.Parameter(-math.log(shortest) - math.log(longest / shortest) * quantiles)
         root = (0.5 * self.log_rate.detach()).exp()

@@ -137,7 +137,7 @@ def test_an_invalid_skeleton_is_an_error_that_names_the_file(tmp_path, case):
         (b'{"a":' * 10**6, "nested too deeply"),
         (b"7" * 10**5, "digits"),
         (b'{"fps": 1' + b"0" * 10**5 + b"}", "digits"),
-        (b" " * (2**24 + 1), "can rightly have 16777216 at most"),
+        (b" " * (2**24 + 1), "at most 16777216 are allowed"),
         (b'"' + b"a" * 10**6 + b'"', "expected JSON with joint_names"),
     ],
     ids=["empty", "utf-16", "cut", "lists", "objects", "digits", "fps", "large", "text"],

@@ -380,7 +380,7 @@ def test_a_log_with_too_many_rows_is_an_error_at_the_first_excess_row(tmp_path, 
         JSONLines(path).read()
     path.write_bytes(row * (2**25 // len(row) + 1))
     monkeypatch.setattr(trackers, "row_of", lambda line: pytest.fail("a row is made"))
-    with pytest.raises(CheckpointError, match=f"{path} has .* bytes, and can rightly have 33554432 at most; move it"):
+    with pytest.raises(CheckpointError, match=f"{path} has .* bytes, but at most 33554432 are allowed; move it"):
         JSONLines(path).read()
 
 
