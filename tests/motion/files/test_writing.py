@@ -181,7 +181,7 @@ def test_archives_of_clips_are_joined(walkers, tmp_path, capsys):
     for other, message in (
         (tmp_path / "a.bvh", "is an archive of clips and"),  # which was silently left out
         (paths[0], "occurs twice"),
-        (folder / "z.npz", "z is up, and y in"),
+        (folder / "z.npz", "its up axis is z, but y in"),
     ):
         save(folder / "z.npz", MotionSet([walkers.clips[0]], replace(WALKER, up="z")))
         assert main(["data", "convert", str(paths[0]), str(other), "--out", out]) == 1

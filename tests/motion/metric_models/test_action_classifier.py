@@ -240,7 +240,7 @@ def test_unknown_classes_count_for_fid_only_and_are_reported(fitted):
         (lambda: windows("test", protocol=replace(SHORT, predicted=5)), "fitted to 6 predicted frames at .* have 5 at"),
         (
             lambda: windows("test", motion.simulate(clips=9, frames=40, test=0.4)),
-            "distinguishes ways, but no label 'way'",
+            "distinguishes ways, but no clip has the label 'way'",
         ),
         (lambda: windows("test", people(3), replace(SHORT, test_stride=99)), "got 1 windows of 1 clips"),
     ],
