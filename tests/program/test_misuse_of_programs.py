@@ -178,7 +178,7 @@ PROGRAMS = [
     (lambda: model(GROUPED, {"g": 2, "w": 2, "x": 3}, grouped=("w",)), "reads"),
     (lambda: MODEL.impute({"x": X, "mask": X == 0}, 3, particles=0), "particles"),
     (lambda: Discrete(1), "states"),
-    (lambda: model(("p(k_t | k_{<t}) p(x_t | k_t)", ""), {"k": Discrete(3), "x": 2}), "states"),
+    (lambda: model(("p(k_t | k_{<t}) p(x_t | k_t)", ""), {"k": Discrete(3), "x": 2}), "cannot be summed out"),
     (lambda: model(("p(k_t | k_{t-1}) p(x_t | k_{1:T})", ""), {"k": Discrete(3), "x": 2}), "summed out"),
     (lambda: model(("p(k_t | k_{t-9}) p(x_t | k_t)", ""), {"k": Discrete(3), "x": 2}), "sum over"),
     (lambda: model(("p(k_t) p(x_t | k_t)", "q(k_t | x_t)"), {"k": Discrete(3), "x": 2}), "summed out"),
