@@ -180,7 +180,7 @@ PROGRAMS = [
     (lambda: Discrete(1), "states"),
     (lambda: model(("p(k_t | k_{<t}) p(x_t | k_t)", ""), {"k": Discrete(3), "x": 2}), "cannot be summed out"),
     (lambda: model(("p(k_t | k_{t-1}) p(x_t | k_{1:T})", ""), {"k": Discrete(3), "x": 2}), "summed out"),
-    (lambda: model(("p(k_t | k_{t-9}) p(x_t | k_t)", ""), {"k": Discrete(3), "x": 2}), "sum over"),
+    (lambda: model(("p(k_t | k_{t-9}) p(x_t | k_t)", ""), {"k": Discrete(3), "x": 2}), "but a sum supports at most"),
     (lambda: model(("p(k_t) p(x_t | k_t)", "q(k_t | x_t)"), {"k": Discrete(3), "x": 2}), "summed out"),
     (lambda: model(STATES, {"k": Discrete(3), "x": 2}, distributions={"p(k)": Normal()}), "categorical"),
     (lambda: dvae.iwae_bound(SUMMED, {"x": Y, "mask": Y > 0}, 1), "means"),
