@@ -52,13 +52,14 @@ def options_of(name: str, kind: type[Any], *aside: str, common: Collection[str] 
         aside: names of fields of `kind` to omit.
         common: names of the options that `--help` shows; all by default.
     """
-    hints = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind)  # without ranges, which `kind` checks with a clearer error
     options, schedules = [], {*get_args(Schedule)}
     for option in fields(kind):
         hint = hints[option.name]
         if schedules & {*get_args(hint)}:
             hint = reduce(or_, [part for part in get_args(hint) if part not in schedules])
-        optional: Any = Annotated[bool, tyro.conf.FlagCreatePairsOff] if hint is bool else hint | None
+        mark = tyro.conf.FlagCreatePairsOff if hint is bool else tyro.conf.DisallowNone
+        optional: Any = Annotated[bool if hint is bool else hint | None, mark]
         annotated = optional if common is None or option.name in common else Annotated[optional, EXPERT]
         options.append((option.name, annotated, False if hint is bool else None))
     kept = [option for option in options if option[0] not in aside]
