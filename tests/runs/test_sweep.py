@@ -108,7 +108,7 @@ def test_a_run_with_other_options_is_an_error_before_any_work(swept, data, chang
 def test_wrong_arguments_are_errors(data, tmp_path):
     for methods, seeds, message in (
         ([], [0], "at least one method"),
-        ([VAE], [], "either methods or --grid, and at least one seed"),
+        ([VAE], [], "at least one method and one seed"),
         ([VAE], [0, 0], r"without duplicates, got seeds \[0, 0\]"),
         ([VAE, VAE], [0], "vae is given twice"),
         ({"a/b": VAE}, [0], "cannot name a directory"),
