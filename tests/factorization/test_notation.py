@@ -246,8 +246,8 @@ def test_a_cyclic_factorization_is_an_error_that_names_the_cycle(text, message):
             "q(w)",
             ["x"],
             None,
-            "the latent z has no factor in the guide; add q(z_t | ...), or name z as observed; a discrete one is "
-            "summed out and needs none: sizes={'z': dvae.Discrete(states)}",
+            "the latent z has no factor in the guide; add q(z_t | ...), or name z as observed, or sum z out if it is "
+            "discrete: sizes={'z': dvae.Discrete(states)}",
         ),
         ("p(w) p(z_t)", ["x"], None, "expected p(...) for the generative model"),
         ("q(w) q(z)", ["x"], None, "z has one value per step in the generative model"),
