@@ -1,7 +1,8 @@
 """Interface of conditional distributions: a specification builds a module, which maps features to a distribution.
 
-    DistributionSpec.build(Shape) -> Distribution        Distribution(features) -> parameters
-    Distribution.distribution(parameters) -> Pyro's
+    DistributionSpec.build(Shape)                                 returns a ConditionalDistribution
+    ConditionalDistribution.forward(features)                     returns parameters
+    ConditionalDistribution.distribution(parameters)              returns a Pyro distribution
 
 The parameters are plain tensors, so a loop over time creates no distribution objects. For a model variable without
 parents, the module has no features and learns the parameters itself. Priors therefore have the same interface.
@@ -145,7 +146,7 @@ class ConditionalDistribution(nn.Module):
         return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """Return the parameters of the distribution, a tuple of tensors (..., P) with a P of their own.
+        """Return the parameters of the distribution, a tuple of tensors (..., P); P may differ between parameters.
 
         Args:
             features: (B, T, H) at all steps, or at T steps from step `t` on; (B, H) for a static variable, or for a

@@ -380,11 +380,11 @@ class Directions:
         """Return the module for a variable of this shape.
 
         Raises:
-            ValueError: D is not divisible by 3, or, the number of features is not D although `project` is False.
+            ValueError: D is not divisible by 3, or the number of features is not D although `project` is False.
         """
         if shape.size % 3 or not (self.project or shape.features == shape.size):
             raise ValueError(
-                "Directions require a size that is divisible by 3 and, with project=False, as many features; "
+                "Directions require a size that is divisible by 3 and, with project=False, one feature per coordinate; "
                 f"{shape.name} has size {shape.size}, and the network returns {shape.features} features"
             )
         return DirectionsModule(self, shape)

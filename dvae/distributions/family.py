@@ -318,8 +318,8 @@ class FamilyModule(ConditionalDistribution):
     def mean(self, parameters: Parameters) -> Tensor:
         if not self.centre:
             raise ValueError(
-                f"{self.kind.__name__} has neither a mean nor a mode, which missing data and forecasts without draws "
-                "require; use another distribution, or complete data and drawn forecasts"
+                f"{self.kind.__name__} has neither a mean nor a mode, but missing data and forecasts without draws "
+                "require one; choose another distribution, or use complete data and drawn forecasts"
             )
         return getattr(self.distribution(parameters), self.centre)  # type: ignore[no-any-return]
 

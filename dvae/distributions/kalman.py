@@ -117,7 +117,7 @@ class LinearGaussianChain:
 
     @property
     def lag_one(self) -> Tensor:
-        """Cov(z_{t+1}, z_t) given all weights, (T - 1, B, N, N)."""
+        """Covariances Cov(z_{t+1}, z_t) given all weights, (T - 1, B, N, N), for t = 1 to T - 1."""
         return self.smoothed.covariance[1:] @ self._gain.mT
 
     def draw(self, noise: Tensor) -> Tensor:

@@ -131,8 +131,9 @@ class VampModule(Prior):
         reads = guide.parents if guide else ()
         if not reads or any(parent.name not in shape.data or not parent.local for parent in reads):
             raise ValueError(
-                f"a Vamp requires a guide of {shape.name} that reads the data {', '.join(shape.data)} over time and "
-                f"nothing else, such as q({shape.name} | {shape.data[0]}_{{1:T}}), got {guide or 'the prior itself'}"
+                f"a Vamp requires a guide of {shape.name} that reads the data {', '.join(shape.data)} over time "
+                f"and nothing else, such as q({shape.name} | {shape.data[0]}_{{1:T}}), got "
+                f"{guide or 'the prior as the guide'}"
             )
         self.components, self.steps = spec.components, spec.steps
         object.__setattr__(self, "guide", shape.guide)  # bypasses registration: the model already owns this module

@@ -133,12 +133,12 @@ class Audit(_TextTable):
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
-        """Missing parents as text, such as `{"z": ("z_{<t}",)}`; a latent without missing parents has no entry."""
+        """Missing parents of each latent as text, such as `{"z": ("z_{<t}",)}`; without any, a latent has no entry."""
         return _terms(self.missing_parents)
 
     @property
     def redundant(self) -> dict[str, tuple[str, ...]]:
-        """Redundant parents as text, as in `missing`; a latent without redundant parents has no entry."""
+        """Redundant parents of each latent as text, as in `missing`; without any, a latent has no entry."""
         return _terms(self.redundant_parents)
 
     @property
@@ -329,8 +329,8 @@ class Derived:
 class Alternatives(_TextTable):
     """All guides of a model that `faithful_inverse` derives, none of which has missing parents.
 
-    Guides without a loop over time come first; among these and among the others, guides with fewer edges come first.
-    `alternatives[i]` is the factorization of guide i, and `len` counts the guides.
+    Guides without a loop over time come first, sorted by their number of edges, then guides with a loop, sorted in the
+    same way. Index an object with i for the factorization of guide i; `len` returns the number of guides.
 
     Attributes:
         generative: factorization of the model.

@@ -4,9 +4,9 @@ The posterior of latents that are drawn one after the other is prod_i p(v_i | v_
 its Markov boundary among the given variables. d-separation is a compositional graphoid, so this boundary is unique: it
 contains v if v is not d-separated from v_i by all other given variables (Pearl, 1988).
 
-A guide that reads exactly the boundary misses nothing, and all of its edges are necessary. Each order has its own such
-guide (Webb, Golinski, Zinkov, Siddharth, Rainforth, Teh and Wood, 2018, arXiv 1712.00287). Boundaries are computed in
-the graph unrolled over time, by the moral-graph criterion (Lauritzen, Dawid, Larsen and Leimer, 1990), and converted
+A guide that reads exactly the boundary misses no dependency, and all of its edges are necessary. Each order has its own
+such guide (Webb, Golinski, Zinkov, Siddharth, Rainforth, Teh and Wood, 2018, arXiv 1712.00287). Boundaries are computed
+in the graph unrolled over time, by the moral-graph criterion (Lauritzen, Dawid, Larsen and Leimer, 1990), and converted
 back into relations.
 """
 
@@ -47,10 +47,11 @@ class MarkovBoundaries:
         self.children = [self._to_bits(dag.succ[node]) for node in self.nodes]
 
     def of(self, node: Node, given: AbstractSet[Node]) -> set[Node]:
-        """Return the Markov boundary of a node: the smallest subset of `given` that makes it independent of the others.
+        """Return the Markov boundary of a node.
 
-        The boundary contains a given node u exactly if the other given nodes do not d-separate `node` from u. All nodes
-        that are not given are integrated out.
+        It is the smallest subset of `given` that makes the node independent of the rest of `given`. It contains a given
+        node u exactly if the other given nodes do not d-separate `node` from u. All nodes that are not given are
+        integrated out.
 
         Args:
             node: a node that is not in `given`.

@@ -359,11 +359,15 @@ class Factorization:
         )
 
     def describe_edge(self, child: str, parent: Parent) -> str:
-        """Return one of the `edges` in words, such as "x_{<t} to z_t"."""
+        """Return one of the `edges`, (child, parent), in words, such as "x_{<t} to z_t"."""
         return f"{parent} to {_plain(child, 't' if self.local(child) else None)}"
 
     def without(self, child: str, parent: Parent) -> Factorization:
         """Return the factorization without one of its `edges`.
+
+        Args:
+            child: name of the child of the edge.
+            parent: parent of the edge, with the relation as in `edges`.
 
         Raises:
             ValueError: the factorization does not contain this edge.
@@ -427,7 +431,7 @@ class Factorization:
             names = tuple(nx.lexicographical_topological_sort(now, key=self.variables.index))
         except nx.NetworkXUnfeasible:
             factor, parent = self._blame(now)
-            late = f"drawn after {factor.child}_t" if parent.name != factor.child else "what it draws"
+            late = f"drawn after {factor.child}_t" if parent.name != factor.child else "the variable that it draws"
             raise self._undrawable(factor, parent, f"{parent.name}_t is {late}", direction) from None
         return Block(names, direction)
 

@@ -180,8 +180,8 @@ class Relation:
         mask = np.asarray(self.function(T))
         if mask.dtype != bool or mask.shape not in ((T, T), (1, T)):
             raise ValueError(
-                f"the mask {self.name} at T={T} is {mask.dtype} {mask.shape}; expected a bool array "
-                f"({T}, {T}) with rows t and columns s (or (1, {T}): the same row for every t)"
+                f"the mask {self.name} at T={T} has dtype {mask.dtype} and shape {mask.shape}; expected a bool array "
+                f"of shape ({T}, {T}), rows t and columns s, or (1, {T}) for the same row at every t"
             )
         return mask
 

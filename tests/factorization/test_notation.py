@@ -223,7 +223,10 @@ def test_blocks_draw_parents_before_children(pair, T):
             "p(z_t | x_{>=t}) reads x_{>=t}, but a generative model is drawn forward in time "
             "(cycle x_2 -> z_2 -> x_2); did you mean x_{<t}?",
         ),
-        ("p(x_t | x_t)", "p(x_t | x_t) reads x_t, but x_t is what it draws (cycle x_2 -> x_2); did you mean x_{t-1}?"),
+        (
+            "p(x_t | x_t)",
+            "p(x_t | x_t) reads x_t, but x_t is the variable that it draws (cycle x_2 -> x_2); did you mean x_{t-1}?",
+        ),
         ("q(z_t | z_{1:T})", "backward"),
         ("q(z_t | z_{t-1}, u_{t+1}) q(u_t | z_{t-2})", "reads"),
         ("p(w | x_{1:T}) p(x_t | w)", "p(w | x_{1:T}) reads x_{1:T}, but x is drawn from w (cycle x_2 -> w -> x_2)"),
