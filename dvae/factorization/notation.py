@@ -728,7 +728,7 @@ class _Reader:
         try:
             return Relation.parse(inside)
         except ValueError as error:
-            hint = f" ({', '.join(self.masks)} here)" if self.masks else ""
+            hint = f" ({', '.join(self.masks)})" if self.masks else ""
             self.fail(f"{error}{hint if 'unknown' in str(error) else ''}", opening)
 
 

@@ -102,7 +102,9 @@ class Relation:
             if interval[0] > interval[1]:
                 raise ValueError(f"the range {{{text}}} is empty; write the earlier step first: {{{high}:{low}}}")
             return cls.of([interval])
-        raise ValueError(f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and any name given in masks=")
+        raise ValueError(
+            f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and the names of custom masks in `masks`"
+        )
 
     @property
     def parts(self) -> tuple[Relation, ...]:
