@@ -107,7 +107,7 @@ NETWORKS = [
     (lambda: model(NOISY, {"z": 2, "x": 3, "s": 3}, network={"p(x)": WithNoise("s", Dense((4,)))}), "KnownNoise"),
 ]
 DISTRIBUTIONS = [
-    (lambda: ConditionalFlow(0).build(Shape(2, 1)), "at least one"),
+    (lambda: ConditionalFlow(0).build(Shape(2, 1)), "at least 1"),
     (lambda: QRFlow(0).build(Shape(2, local=False)), "layers"),
     (lambda: QRFlow(2).build(Shape(5, local=False)).to_noise(torch.zeros(2, 4)), "takes"),
     (lambda: QRFlow(2).build(Shape(5, local=False)).whiten(torch.zeros(5, 5)), "values"),
@@ -116,7 +116,7 @@ DISTRIBUTIONS = [
     (lambda: Family("Poisson", given={"rate": 1.0}).build(Shape(2, 3)), "left to be read"),
     (lambda: Family("Poisson", residual=1.0).build(Shape(2, 3)), "location"),
     (lambda: Family("Uniform").build(Shape(2, 3)), "parameters"),
-    (lambda: NormalMixture(0).build(Shape(2, 3)), "at least one"),
+    (lambda: NormalMixture(0).build(Shape(2, 3)), "at least 1"),
     (lambda: StudentT(df=2.0).build(Shape(2, 2)), "variance"),
     (lambda: FixedNormal(project=False).build(Shape(2, 3)), "features"),
     (lambda: FixedNormal(scale=0.0).build(Shape(2, 2)), "positive"),
