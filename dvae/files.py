@@ -1,7 +1,7 @@
 """Safe file access: open only plain files of bounded size, and replace files atomically.
 
-A folder copied from elsewhere may contain links to the user's files, FIFOs and devices that never return or never end,
-and files larger than memory. All files in a run directory are therefore opened through this module. The path of the
+A folder copied from elsewhere may contain links to the user's files, FIFOs and devices that block or never end, and
+files larger than memory. All files in a run directory are therefore opened through this module. The path of the
 folder itself is given by the user and may be a link.
 """
 
@@ -37,8 +37,11 @@ def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bo
 
     Args:
         path: path of the file.
-        flags: flags of `os.open`.
+        flags: flags of `os.open`, such as `os.O_RDONLY`.
         links: whether to follow a link, for a path given by the user.
+
+    Returns:
+        The open file, which the caller must close.
 
     Raises:
         FileRefused: the path is a link, a directory, a FIFO, a socket or a device.
@@ -62,6 +65,11 @@ def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bo
 def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
     """Return the content of a plain file of at most `most` bytes.
 
+    Args:
+        path: path of the file.
+        most: maximum size in bytes.
+        links: whether to follow a link, for a path given by the user.
+
     Raises:
         FileRefused: the path is not a plain file, or the file is larger.
         OSError: the file does not exist or cannot be read.
@@ -77,7 +85,7 @@ def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
             parts.append(part)
             remaining -= len(part)
     if not remaining:
-        raise FileRefused(f"{path} grew beyond {most} bytes while it was read")
+        raise FileRefused(f"{path} grew beyond {most} bytes while it was read; wait until it is complete")
     return b"".join(parts)
 
 
@@ -179,7 +187,8 @@ def with_path(path: str | os.PathLike[str], temporary: Path | None = None) -> It
 
     Args:
         path: a file, or a folder of files.
-        temporary: temporary name of `path` until it is complete.
+        temporary: path that is written first and then renamed to `path`. Errors about this path, or about files in it,
+            are raised with the final path instead.
     """
     try:
         yield

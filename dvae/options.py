@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 LONGEST = 10_000
 """Maximum number of characters of a string, and of entries of a tuple of strings or of a mapping."""
 DEEPEST = 64
-"""Maximum number of layers: entries of a tuple of numbers."""
+"""Maximum number of layers, and thus of entries of a tuple that does not contain strings."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,9 @@ class Range:
     """A range of allowed numbers.
 
     Args:
-        least, most: ends of the range.
-        above, below: whether to exclude the lower or upper end. Infinite ends are always excluded.
+        least, most: lower and upper end of the range.
+        above: whether to exclude the lower end.
+        below: whether to exclude the upper end. Infinite ends are always excluded.
     """
 
     least: float = -inf
@@ -89,6 +90,10 @@ def check(options: Any) -> None:
 def require(hint: Any, **values: Any) -> None:
     """Check that arguments have a given type and range.
 
+    Args:
+        hint: allowed type, such as `Size` or `Literal["a", "b"]`.
+        values: arguments by name; errors contain the name.
+
     Raises:
         TypeError, ValueError: as in `check`.
     """
@@ -98,7 +103,13 @@ def require(hint: Any, **values: Any) -> None:
 
 
 def problem(name: str, value: Any, hint: Any) -> Exception | None:
-    """Return the error for a value that does not match its type, or None if it does."""
+    """Return the error for a value that does not match its type, or None if it does.
+
+    Args:
+        name: name of the option, for the message.
+        value: value of the option.
+        hint: allowed type, as in `require`.
+    """
     origin, arguments = get_origin(hint), get_args(hint)
     message = f"{name} is {reprlib.repr(value)}"
     if origin is Annotated:
@@ -157,7 +168,7 @@ def tuples(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every option of a nested configuration with its dotted name."""
+    """Yield (dotted name, value) of every option of a nested configuration, such as ("training.steps", 100)."""
     for name, value in options.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{name}.")
