@@ -54,11 +54,13 @@ def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bo
         number = os.open(path, flags | (_PLAIN & ~getattr(os, "O_NOFOLLOW", 0) if links else _PLAIN), 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV):
-            raise FileRefused(f"{path} is no file but a link, a directory, a FIFO, a socket or a device") from error
+            raise FileRefused(
+                f"{path} must be a plain file, not a link, a directory, a FIFO, a socket or a device"
+            ) from error
         raise
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
-        raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device")
+        raise FileRefused(f"{path} must be a plain file, not a directory, a FIFO, a socket or a device")
     return os.fdopen(number, "r+b" if flags & os.O_RDWR else "wb" if flags & os.O_WRONLY else "rb", buffering=0)
 
 
@@ -107,7 +109,7 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def write_all(file: BinaryIO, content: bytes) -> None:
-    """Write all content to an unbuffered file, which may accept it in several parts."""
+    """Write all content to an unbuffered file, whose `write` may write only a part at a time."""
     remaining = memoryview(content)
     while remaining:
         remaining = remaining[file.write(remaining) :]
@@ -123,7 +125,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """
     path = Path(path)
     if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
-        raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
+        raise FileRefused(
+            f"{path} is a directory, a FIFO, a socket or a device, which is not replaced; choose another name"
+        )
     with create_folder(path.parent):
         _remove_leftovers(path.parent)
         new = path.with_name(f"{temporary()}{uuid4().hex}")

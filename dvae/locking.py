@@ -22,7 +22,10 @@ SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
 
 
 class _ProgramLock(ContextDecorator):
-    """A reentrant lock, usable as a context manager or a decorator."""
+    """A reentrant lock, usable as a context manager or a decorator.
+
+    It removes Pyro's table of shapes from the messages of errors that are raised while it is held.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.RLock()

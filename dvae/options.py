@@ -77,6 +77,9 @@ Positive = Annotated[float, Range(0, above=True)]
 def check(options: Any) -> None:
     """Check that every field of a dataclass has its declared type and range.
 
+    Args:
+        options: instance of the dataclass.
+
     Raises:
         TypeError: a value has another type.
         ValueError: a value is out of range or not an allowed name; the message suggests the nearest name.
@@ -210,7 +213,7 @@ def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Except
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    """Return the types of the fields; {} if a type name cannot be resolved outside its own file."""
+    """Return {name of a field: its type}; {} if a type name of the dataclass cannot be resolved here."""
     try:
         hints = get_type_hints(kind, include_extras=True)
     except NameError:

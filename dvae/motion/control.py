@@ -111,7 +111,13 @@ def follow_paths(
 
 
 def smooth_covariance(frames: int) -> Tensor:
-    """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, conditioned on 0 at frame 0."""
+    """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, given the value 0 at frame 0.
+
+    The process has variance 1 before conditioning, and the length scale `SMOOTH`.
+
+    Args:
+        frames: T, number of frames.
+    """
     frame = torch.arange(frames + 1, dtype=torch.float64)
     distance = sqrt(3) / SMOOTH * (frame[:, None] - frame).abs()
     kernel = (1 + distance) * (-distance).exp()

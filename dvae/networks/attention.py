@@ -53,7 +53,7 @@ class Attention:
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: `heads` does not divide `width`, or the activation is unknown.
@@ -76,7 +76,7 @@ class SelfAttention(Attention):
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SelfAttentionNetwork:  # type: ignore[override]
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: no parent of a local child is read over {1:T}, {<=t} or {>=t}, `heads` does not divide `width`,
@@ -119,12 +119,18 @@ class Layer(nn.Module):
         return query.transpose(1, 2)
 
     def weights(self, stream: Tensor, keys: Tensor, bias: Tensor) -> Tensor:
-        """Return the attention weights (B, heads, T, S)."""
+        """Return the attention weights (B, heads, T, S) of the stream (B, T, W) on keys (B, heads, S, W / heads)."""
         query = self.queries(stream)
         return (query @ keys.transpose(-1, -2) / math.sqrt(query.shape[-1]) + bias).softmax(-1)
 
     def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
-        """Return the stream (B, T, W) after attention under an additive bias, broadcastable to (B, heads, T, S)."""
+        """Return the stream (B, T, W) after attention and perceptron.
+
+        Args:
+            stream: (B, T, W).
+            keys, values: (B, heads, S, W / heads) of S tokens.
+            bias: bias that is added to the scores; broadcasts to (B, heads, T, S).
+        """
         if stream.shape[1] == 1:  # for a single query, the fused kernel takes several times as long
             attended = self.weights(stream, keys, bias) @ values
         else:
@@ -207,7 +213,10 @@ class AttentionNetwork(Network):
         self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
 
     def bias(self, parent: Input, length: int) -> Tensor:
-        """Return (heads, T, T), or (1, 1, T) for a static child: minus slope times distance if visible, else -inf."""
+        """Return the attention bias for a parent: minus slope times distance at visible steps, -inf at others.
+
+        It is (heads, T, T); for a static child it is (1, 1, T), without distances.
+        """
         assert parent.relation is not None
         mask = visible(parent.relation, length, self.slopes.device)
         if not self.local:
@@ -249,7 +258,7 @@ class AttentionNetwork(Network):
         return weights
 
     def queries(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
-        """Return the stream (B, T, W), or (B, 1, W) for a static child."""
+        """Return the first stream, computed from the parents at single steps: (B, T, W), or (B, 1, W) if static."""
         stream = self.origin.expand(batch, length if self.local else 1, -1)
         if self.point is None:
             return stream
@@ -259,7 +268,14 @@ class AttentionNetwork(Network):
     def tokens(
         self, parents: Sequence[Input], values: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return tokens (B, 1 + T * parents, W), the start token first, and their bias for every step."""
+        """Return tokens (B, 1 + T * parents, W), the start token first, and the attention bias of every step for them.
+
+        Args:
+            parents: the parents read over ranges.
+            values: {name: features (B, T, D)}.
+            batch, length: B and T.
+            lengths: (B,) number of valid steps of each sequence, or None.
+        """
         tokens = [self.embed[parent.name](values[parent.name]) for parent in parents]
         bias = functional.pad(self.biases(parents, length, lengths), (1, 0))
         return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), bias
@@ -283,7 +299,10 @@ class AttentionNetwork(Network):
         return torch.cat([embed.weight.mT, embed.bias[None], self.start_token[None]])
 
     def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
-        """Return the bias of every step to the parents' valid steps, (B or 1, heads or 1, T or 1, T * parents)."""
+        """Return the attention bias of every step for all parents, -inf at padding.
+
+        It is (B, heads, T, T * parents); B is 1 without `lengths`, and heads and T are 1 for a static child.
+        """
         empty = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
         bias = torch.cat([empty, *(self.bias(parent, length) for parent in parents)], dim=-1)[None]
         if lengths is None:
@@ -364,7 +383,7 @@ class SelfAttentionNetwork(Network):
                 "SelfAttention needs a local child with a parent read at {1:T}, {<=t} or {>=t}, but the child is "
                 f"{'local' if local else 'static'} and the parents are "
                 f"{', '.join(f'{p.name} at {p.relation.name}' for p in others if p.relation) or 'static'}; use "
-                " networks.Attention for this factor"
+                "networks.Attention for this factor"
             )
         tokens = [self.extractors.seen(parent).size for parent in (*self.encoded, *self.statics)]
         self.embed = nn.Linear(sum(tokens), spec.width)
@@ -397,7 +416,7 @@ class SelfAttentionNetwork(Network):
         return stream
 
     def bias(self, length: int) -> Tensor:
-        """Return (1, heads, T, T): minus slope times distance if visible, else -inf."""
+        """Return the attention bias (1, heads, T, T): minus slope times distance at visible frames, -inf at others."""
         relation = self.encoded[0].relation
         assert relation is not None
         mask = visible(relation, length, self.slopes.device)

@@ -191,7 +191,16 @@ class NetworkSpec(Protocol):
     """Specification of a network: a frozen dataclass with a `build` method."""
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
-        """Return the network of a factor with these parents, for a child of dimension `size`."""
+        """Return the network of a factor.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: dimension of the child.
+
+        Raises:
+            ValueError: the network does not support such a factor.
+        """
         ...
 
 

@@ -83,7 +83,7 @@ class CosineEncoder:
     components: int = 0
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineEncoderNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is static, or the parents are not those described above.
@@ -110,7 +110,7 @@ class CosineDecoder(CosineEncoder):
     latent: str = "z"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineDecoderNetwork:  # type: ignore[override]
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is static, or the parents are not those described above.

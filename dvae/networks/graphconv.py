@@ -53,7 +53,7 @@ class GraphConv:
     blocks: int = 4
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GraphConvNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is static, a size does not match the number of nodes, no parent contains all nodes, a
@@ -88,7 +88,7 @@ class GraphConvNetwork(FixedLengthNetwork):
         self.trajectories.sort(key=lambda trajectory: -len(trajectory[1]))
         if not self.trajectories or sorted(self.trajectories[0][1]) != list(range(len(self.trajectories[0][1]))):
             raise ValueError(
-                "GraphConv needs a parent that contains every node, such as the history h_{1:O}; the parents are "
+                "GraphConv needs a parent whose `nodes` are all nodes, such as the history h_{1:O}; the parents are "
                 f"{', '.join(parent.name for parent in self.inputs)}"
             )
         cosine_basis(spec.length, coefficients)  # raises an error for too many coefficients

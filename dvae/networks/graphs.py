@@ -113,7 +113,7 @@ class FrameGraph:
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FrameGraphNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is local, or a parent is not read over {1:T}.

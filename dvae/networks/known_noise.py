@@ -44,7 +44,7 @@ class WithNoise:
     network: NetworkSpec = field(default_factory=Recurrent)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WithNoiseNetwork:
-        """Return the network of a factor that reads the scale.
+        """Return the network of a factor that reads the scale, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the factor does not read the scale, reads it at other steps than t, has no other parents, or the

@@ -31,7 +31,7 @@ class Linear:
     scale: float = 0.3
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network of a factor, as in `NetworkSpec.build`."""
         return LinearNetwork(self, inputs, local, size)
 
 

@@ -116,6 +116,11 @@ def memoize(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed
     """Return compute(), or its cached result for the same owner and identical input objects, within `memoizing`.
 
     Factors that share a module, such as h_t in SRNN, thus evaluate it once without a reference to each other.
+
+    Args:
+        owner: object to which the result belongs, such as the module.
+        inputs: all objects that determine the result; they are compared by identity.
+        compute: function that computes the result.
     """
     cache = _CACHE.get()
     if cache is None:
@@ -128,7 +133,12 @@ def memoize(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed
 
 
 def store_result(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
-    """Store a result for `memoize` that was computed in another way, such as within a loop."""
+    """Store a result that was computed in another way, such as within a loop, so that `memoize` returns it.
+
+    Args:
+        owner, inputs: as in `memoize`.
+        result: the result.
+    """
     cache = _CACHE.get()
     if cache is not None:
         cache[_key(owner, inputs)] = (inputs, result)

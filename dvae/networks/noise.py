@@ -161,7 +161,7 @@ def half(width: int) -> int:
 
 @dataclass(frozen=True)
 class Concatenate:
-    """A network on the concatenation of the code and z."""
+    """Replace the code of the past by the output of a network that reads the concatenated code and z."""
 
     def latent(self, width: int) -> int:
         """Return half the size of the code."""
@@ -188,7 +188,7 @@ class _Concatenated(nn.Module):
 
 @dataclass(frozen=True)
 class AddProjected:
-    """The code of the past plus a linear map of z. There is no encoder, because the guide is the prior."""
+    """Add a linear map of z to the code of the past. There is no encoder, because the guide is the prior."""
 
     def latent(self, width: int) -> int:
         """Return half the size of the code."""
@@ -225,4 +225,4 @@ class Noise(Protocol):
         """
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """Return the module from the code of the past, z and the drawn indices to the initial code of the future."""
+        """Return the module from past code (B, L), z (B, `latent`) and indices to the decoder's initial code (B, L)."""

@@ -62,7 +62,7 @@ class Recurrent:
     mean: bool = False
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> RecurrentNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: an option is invalid, the parents do not match `stack` or `mean`, or a parent has a custom mask.
@@ -156,7 +156,13 @@ class Memory(nn.Module):
         )
 
     def step(self, state: MemoryState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
-        """Return the state (B, W) at t; `state` is advanced in place."""
+        """Return the state (B, W) at step t; `state` is advanced in place.
+
+        Args:
+            state: state from `start`, after the steps before t in the order of the loop.
+            t: the step, counted from 0.
+            drawn: {name: list with the features (B, D) of each step} of the parents that the loop draws.
+        """
         value = state.steps[t if len(state.steps) > 1 else 0]
         for parent, lag, weight in state.live:
             value = torch.addmm(value, at(drawn[parent.name], t + lag, value, parent.size), weight)
@@ -416,6 +422,10 @@ def tie(first: Any, *others: Any) -> None:
     All forward memories must read the same parents at the same lags. Within `loop.memoizing`, their states are computed
     once for all networks.
 
+    Args:
+        first: network whose forward memory is shared.
+        others: networks that use it from now on.
+
     Raises:
         ValueError: a network has no single forward memory, or the memories differ in parents, lags or parameter shapes.
     """
@@ -480,7 +490,7 @@ class Dense:
     activation: str = "tanh"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DenseNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: a parent is read over a range without end, or the activation or a width is invalid.

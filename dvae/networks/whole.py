@@ -38,7 +38,7 @@ class WholeEncoder:
     activation: str = "relu"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeEncoderNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is local, or the factor does not read all steps of a parent.
@@ -64,7 +64,7 @@ class WholeDecoder(WholeEncoder):
 
     @override
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeDecoderNetwork:  # type: ignore[override]
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is static, a parent is not static, or `sizes` has another dimension for the child.

@@ -130,10 +130,10 @@ def test_special_files_are_errors(run, canary, name, kind):
         os.mkfifo(path)
     else:
         path.symlink_to(canary if kind == "link" else "/dev/zero")
-    with pytest.raises(CheckpointError, match=f"{path} is (a link|no file)"):
+    with pytest.raises(CheckpointError, match=f"{path} (is a link|must be a plain file)"):
         runs.resume(run, steps=6, progress=False)
     if name in (CONFIG, STATE, BEST):
-        with pytest.raises(CheckpointError, match=f"{path} is (a link|no file)"):
+        with pytest.raises(CheckpointError, match=f"{path} (is a link|must be a plain file)"):
             dvae.load(run)
 
 

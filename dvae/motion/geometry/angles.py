@@ -23,7 +23,7 @@ from .skeleton import Skeleton, differences, inverse_lengths
 Vector: TypeAlias = "str | tuple[Vector, str, Vector]"
 
 BLOCK = 4096
-"""Number of poses whose limits are estimated at once, so that their vectors stay in cache."""
+"""Number of poses whose cosines are computed at once, so that their vectors stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,11 @@ def _humaneva() -> Iterator[Angle]:
 
 
 def _trunk_and_limbs(head: Vector) -> Iterator[Angle]:
-    """Yield the angles for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head."""
+    """Yield the angles for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head.
+
+    Args:
+        head: vector along the head.
+    """
     trunk, across_hips = ("Neck", "-", "Spine"), ("LHip", "-", "RHip")
     hips, shoulders = (across_hips, "x", "Spine"), ("LShoulder", "-", "RShoulder")
     chest = (shoulders, "x", ("Neck", "-", "Chest"))  # normals point to the front

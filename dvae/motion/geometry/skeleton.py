@@ -47,7 +47,7 @@ def text_of(path: Path, most: int = MOST_TEXT) -> Iterator[TextIO]:
 
     Raises:
         OSError: the file does not exist.
-        ValueError: it has more than `most` bytes, or is not UTF-8.
+        ValueError: the file has more than `most` bytes, or is not UTF-8.
     """
     try:
         yield io.TextIOWrapper(io.BytesIO(files.read(path, most, links=True)), encoding="utf-8-sig")
@@ -157,7 +157,7 @@ class Skeleton:
         if joints > MOST_JOINTS:
             raise ValueError(f"{label}: {joints:,} joints, expected at most {MOST_JOINTS:,}")
         if len(self.parents) != joints:
-            raise ValueError(f"{label}: {joints} names but {len(self.parents)} parents")
+            raise ValueError(f"{label}: {joints} names but {len(self.parents)} parents, expected equal numbers")
         if repeated := sorted(name for name, count in Counter(self.names).items() if count > 1):
             raise ValueError(f"{label}: joint names repeat: {_join_names(repeated)}")
         roots = [self.names[j] for j, parent in enumerate(self.parents) if parent == -1]
@@ -170,7 +170,7 @@ class Skeleton:
                     f"but joints go from 0 to {joints - 1}"
                 )
         if cyclic := set(range(joints)) - set(self.order):
-            raise ValueError(f"{label}: {self.names[min(cyclic)]} is in a cycle of joints")
+            raise ValueError(f"{label}: {self.names[min(cyclic)]} is in a cycle of joints, expected a tree")
         for side in ("left", "right"):
             unknown = [j for j in getattr(self, side) if not 0 <= j < joints]
             if unknown:
@@ -262,7 +262,7 @@ class Skeleton:
         return torch.cat([joints[..., : self.root, :], joints[..., self.root + 1 :, :]], -2)
 
     def with_root(self, joints: Tensor, value: float = 0.0) -> Tensor:
-        """Return joints (..., J, 3); if the root is missing, insert it with the given value."""
+        """Return joints (..., J, 3); if the root is missing, insert it with the given value in all coordinates."""
         if joints.shape[-2] == self.joints:
             return joints
         root = torch.full_like(joints[..., :1, :], value)
@@ -337,7 +337,9 @@ class Skeleton:
         left = [joint for joint in self.left if self.parents[joint] not in self.left]
         right = [joint for joint in self.right if self.parents[joint] not in self.right]
         if not left or not right:
-            raise ValueError(f"skeleton {self.name!r} has no left and right joints, so headings are not defined")
+            raise ValueError(
+                f"skeleton {self.name!r} has no left and right joints, so it has no heading; give `left` and `right`"
+            )
         return left, right
 
     def heading(self, positions: Tensor) -> Tensor:
@@ -501,7 +503,13 @@ def _chains(skeleton: Skeleton, dtype: torch.dtype, device: torch.device) -> Ten
 
 
 def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:
-    """Rotate positions (..., 3) about the up axis by angles in radians that broadcast against (...)."""
+    """Return positions (..., 3) rotated about the up axis.
+
+    Args:
+        positions: (..., 3).
+        angle: angles in radians, which broadcast against (...); positive is counterclockwise seen from above.
+        up: up axis, "y" or "z".
+    """
     vertical = "xyz".index(up)
     first, second = (vertical + 1) % 3, (vertical + 2) % 3
     cos, sin = torch.cos(angle), torch.sin(angle)
