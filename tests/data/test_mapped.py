@@ -324,7 +324,7 @@ def test_links_are_followed_only_if_given_as_the_path(tmp_path):
         PanelData.open(inside)
     assert len(PanelData.open(inside / "a.npy").panel.series[0]) == 300
     os.mkfifo(tmp_path / "pipe.npy")
-    with pytest.raises(ValueError, match="no file but a directory, a FIFO"):
+    with pytest.raises(ValueError, match="must be a plain file, not a directory, a FIFO"):
         PanelData.open(tmp_path / "pipe.npy")
 
 

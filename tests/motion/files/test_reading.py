@@ -351,5 +351,5 @@ def test_other_data_are_mapped_to_the_skeleton_of_a_run(representation, tmp_path
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
 def test_pipes_in_a_folder_are_errors_without_waiting(bvh):
     os.mkfifo(bvh / "train" / "a.bvh")
-    with pytest.raises(ValueError, match=r"a\.bvh is no file but .* a FIFO"):
+    with pytest.raises(ValueError, match=r"a\.bvh must be a plain file, not .* a FIFO"):
         read_motion(bvh)
