@@ -50,5 +50,5 @@ def test_sequences_that_cannot_be_warped_are_errors():
         subsequence_costs(np.zeros((0, 4)), 3)
     with pytest.raises(ValueError, match="remove frames with missing joints"):
         subsequence_costs(np.full((2, 4), np.nan), 3)
-    with pytest.raises(ValueError, match="cannot be warped onto 4 at a pace"):
+    with pytest.raises(ValueError, match="cannot be aligned with a reference of 4 frames"):
         alignment(np.zeros((4, 20)))
