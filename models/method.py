@@ -53,11 +53,11 @@ class Method(Trainable):
         return generative, guide(generative, self.inference)
 
     def sizes(self) -> dict[str, int]:
-        """Return the sizes of the latents."""
+        """Return the sizes of the latents by name, such as {"z": 16}."""
         return {"z": self.latent or 0}
 
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Return the networks by factor."""
+        """Return the network specifications by factor, such as {"default": Recurrent(64)}."""
         raise NotImplementedError(
             f"{type(self).__name__} defines no networks; define `networks(self)`, which returns them by factor, such "
             'as {"default": Recurrent(64)}, or override `build`'

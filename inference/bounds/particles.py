@@ -121,7 +121,11 @@ class Filter:
         self.paths = {name: Rows([None] * self.known.length) for name in (*self._local(model.latents), *self.hidden)}
 
     def run(self, resample_below: float) -> FIVOBound:
-        """Run all steps. Afterwards `drawn` contains the draws of the surviving particles."""
+        """Run all steps and return the bound; afterwards `drawn` contains the draws of the surviving particles.
+
+        Args:
+            resample_below: share of the particles; the effective sample size below which they are resampled.
+        """
         model, length, batch = self.model, self.known.length, self.known.batch
         shape = self.particles, batch
         log_weights = self._draw_statics(late=False).view(shape)

@@ -54,9 +54,10 @@ class Link:
 
     Args:
         parent: name of the latent that is read.
-        to, of: indices (P,) among the S steps, in order, and steps of the parent, 0 for a static one.
-        weight: weights (B, P, E, D), in units.
-        centre, deviation: mean and standard deviation (B, P, E) of the values that are read.
+        to, of: steps (P,) of P pairs: step `to[p]` of the latent reads step `of[p]` of the parent. `to` increases, and
+            indexes the S steps; `of` is 0 for a static parent.
+        weight: weights (B, P, E, D) of a parent of dimension E and a latent of dimension D, for standardised values.
+        centre, deviation: mean and standard deviation (B, P, E) that standardise the values of the parent.
     """
 
     parent: str
@@ -67,7 +68,7 @@ class Link:
     deviation: Tensor
 
     def moves(self, values: Sequence[Tensor], steps: int) -> Tensor:
-        """Return shifts (k, B, S, D) in units, from values (k B, E) of the parent by step."""
+        """Return shifts (k, B, S, D) of the latent's location in its units, from values (k B, E) per parent step."""
         inputs = torch.stack([values[s] for s in self.of.tolist()], 1).unflatten(0, (-1, len(self.weight)))
         inputs = (inputs - self.centre) / self.deviation
         if steps == 1:

@@ -266,7 +266,7 @@ def bracket(
     Args:
         model: model with its guide.
         data: windows, x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
-        count: number of sequences to draw at random; None for all.
+        count: number of randomly chosen sequences to evaluate; None for all.
         particles: K, number of draws for the ELBOs and the IWAE bound, and number of particles of the FIVO bound.
         temperatures, chains: L and K of annealed importance sampling, as in `annealed_bound`.
         fitting: number of steps of the semi-amortized guides (`semi_amortized_guide`); 0 omits them and the parts of

@@ -188,7 +188,7 @@ class ChangeEncoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> ChangeEncoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return ChangeEncoderNetwork(self, inputs)
 
 
@@ -222,7 +222,7 @@ class StyleDecoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> StyleDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return StyleDecoderNetwork(self, inputs, size)
 
 

@@ -228,7 +228,10 @@ class GSPSModel(EnergyModel):
         return super().guide(batch, **self._with_draws(batch, options))
 
     def _with_draws(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options, with several draws if the batch has whole windows, whose truth scores futures."""
+        """Return the options, with several draws if the batch has whole windows.
+
+        The energies compare these draws with the true future, which only whole windows contain.
+        """
         x = batch.get(WHOLE) if isinstance(batch, Mapping) else None
         is_complete = x is not None and x.shape[1] == self.length and options.get("length") is None
         return {**({"draws": self.draws} if is_complete else {}), **options}

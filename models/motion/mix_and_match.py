@@ -238,7 +238,7 @@ class FutureEncoder:
     noise: Noise | None
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureFilter(self.width).build(inputs, local, size) if local else FutureEncoderNetwork(self, inputs)
 
 
@@ -275,7 +275,7 @@ class FutureDecoder:
     velocity: bool
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureDecoderNetwork(self, inputs, size)
 
 

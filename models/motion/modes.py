@@ -296,7 +296,15 @@ class ModesModel(FutureModel):
         samples: int,
         chunk: int,
     ) -> dict[str, Tensor]:
-        """Return samples (S, B, ...) of all windows; `make` returns n draws (n, M b, ...) of b windows in M modes."""
+        """Return samples (S, B, ...) of all windows in all modes, computed in chunks of windows.
+
+        Args:
+            make: function of a slice of b windows, M modes and a number of draws n, which returns values (n, M b, ...)
+                by name.
+            data: data of the B windows.
+            samples: S. If it is not a multiple of the number of modes, the last samples are of random modes.
+            chunk: largest number of windows times modes at once.
+        """
         size, step = len(data[HISTORY]), max(chunk // self.modes, 1)
         n_full, n_rest = divmod(samples, self.modes)
         sets = [(torch.arange(self.modes), n_full)] if n_full or not n_rest else []
@@ -334,7 +342,7 @@ class ModesDecoder:
     sampler_hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> ModesDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return ModesDecoderNetwork(self, inputs, size)
 
 
