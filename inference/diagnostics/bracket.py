@@ -404,9 +404,15 @@ class _Work:
     def bounds(
         self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seeds: Sequence[int], advance: Any
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the bounds (B,) by name, and effective chains (B,); with exact latents, also an upper bound.
+        """Return the bounds (B,) by name, and the effective number of chains (B,).
 
         The draws of all ELBOs have the same seed, so that their differences have less noise.
+
+        Args:
+            data: batch of B sequences.
+            latents: exact latents of simulated data, which also give an upper bound; None for real data.
+            seeds: seeds of evaluation, of fitting the semi-amortized guides, and of annealed importance sampling.
+            advance: function called after each part of the work, for the progress bar.
         """
         model, bounds = self.model, {}
         evaluation_seed, fitting_seed, annealing_seed = seeds

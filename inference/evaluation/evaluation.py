@@ -119,7 +119,11 @@ class Evaluation(Result):
         return {name: self._score(name, means) for name, means in self._row(method).clip_means.items()}
 
     def difference(self, first: str, second: str, metric: str) -> Score:
-        """Return the paired difference of two methods in a metric, first minus second, with its standard error.
+        """Return the mean paired difference of two methods in a metric, first minus second, with its standard error.
+
+        Args:
+            first, second: names of the methods.
+            metric: name of the score, such as "CRPS".
 
         Raises:
             KeyError: when a method was not evaluated, or one of the two has no such metric.
@@ -129,6 +133,10 @@ class Evaluation(Result):
 
     def ratio(self, first: str, second: str, metric: str) -> Score:
         """Return the ratio of two methods' means in a metric, first divided by second, with its linearised error.
+
+        Args:
+            first, second: names of the methods.
+            metric: name of the score, such as "APD".
 
         Raises:
             KeyError: as `difference`.
