@@ -269,10 +269,16 @@ def _lengths_message(lengths: Tensor, length: int) -> str:
 
 
 def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
-    """Return entries as tensors in their precision.
+    """Return the entries of a batch as tensors in the precision of the model.
 
-    Floating-point entries and those in `names` get the dtype, or float64 if they are in `wide`. Masks and counts, such
-    as lengths, keep their type.
+    Floating-point entries and entries in `names` get the dtype, or float64 if they are in `wide`. Masks and counts,
+    such as lengths, keep their type.
+
+    Args:
+        batch: arrays or tensors by name.
+        dtype: precision of the model.
+        names: names of the variables.
+        wide: names of the variables that are read in float64.
     """
     tensors = Batch()
     for name, value in batch.items():
@@ -369,10 +375,19 @@ def _describe_support(support: Any) -> str:
 
 
 def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tuple[int, int]:
-    """Return B and T as the values determine them, otherwise the given size and length."""
+    """Return B and T of a batch.
+
+    Args:
+        values: values of variables by name, which determine B.
+        length: T; None if the values determine it.
+        size: B; used only if there are no values.
+
+    Raises:
+        ValueError: if values differ in B or T, B or T is 0, or T cannot be inferred.
+    """
     sizes = {value.shape[0] for value in values.values()} or {size}
     if len(sizes) > 1:
-        raise ValueError(f"the batch holds different numbers of sequences: {shapes(values)}")
+        raise ValueError(f"all variables of a batch must have the same number of sequences, got {shapes(values)}")
     if sizes == {0}:
         raise ValueError(f"the batch holds no sequences: {shapes(values)}")
     local = {name: value for name, value in values.items() if value.dim() == 3}
@@ -381,7 +396,7 @@ def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tupl
         if not steps:
             raise ValueError("cannot infer the number of steps without a batch; pass length=")
         if len(steps) > 1:
-            raise ValueError(f"the batch holds different numbers of steps: {shapes(local)}")
+            raise ValueError(f"all local variables of a batch must have the same number of steps, got {shapes(local)}")
         length = max(steps)
     if length < 1:
         raise ValueError(f"length must be at least 1, got {length}")

@@ -136,10 +136,10 @@ class Hidden:
 
 @dataclass
 class Rollout:
-    """A run of `factorization` over a batch.
+    """A run of a factorization over a batch: known values, and distributions and draws of the other variables.
 
     Args:
-        factorization: the factorization.
+        factorization: factorization to run, generative or of the guide.
         conditionals: dictionary from child to `Conditional`.
         batch, length: B and T.
         values: known values: data, context, statics (B, D) and, once they are known, latents (B, T, D).
@@ -260,7 +260,15 @@ class Rollout:
         }
 
     def know(self, name: str, value: Tensor) -> None:
-        """Record the value of a site, which later sites read."""
+        """Record the value of a site, which later sites read.
+
+        Args:
+            name: name of the variable.
+            value: (B, T, D), or (B, D) of a static variable.
+
+        Raises:
+            ValueError: if variables in the same loop were drawn with another value.
+        """
         if name in self._draws and not _same(value, self._draws[name]):
             handed_out = self.values.keys() & self._draws.keys() & set(self._block[name].names)
             dependants = sorted(handed_out - {name})
@@ -288,11 +296,16 @@ class Rollout:
         return valid if mask is None else mask & valid
 
     def evaluate(self, name: str, value: Tensor) -> TorchDistribution:
-        """Return the conditionals of a local variable at all steps; batch shape (B, T, D), or (B, T)."""
+        """Return the conditional distributions of a local variable at all steps, batch shape (B, T, D) or (B, T).
+
+        Args:
+            name: name of the variable.
+            value: (B, T, D), values of the variable, whose past the factor may read.
+        """
         return self.conditionals[name].distribution(self.parameters(name, value))
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
-        """Return the parameters (B, T, ...) for `evaluate`, memoized for one value."""
+        """Return the parameters (B, T, ...) of `evaluate`; the result for the last value is kept."""
         if not self._is_evaluated(name, value):
             history = self.history(name)  # this may run a loop that evaluates the variable
             if not self._is_evaluated(name, value):
@@ -414,7 +427,13 @@ class Rollout:
     def _run(
         self, block: Block, replacements: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
     ) -> dict[str, Tensor]:
-        """Return the unknown variables of a block; with `hidden`, its data with the model's means at those entries."""
+        """Draw the unknown variables of a block, or fill in hidden entries of its data, (B, T, D) by name.
+
+        Args:
+            block: variables that are computed in one loop over time.
+            replacements: values that the block reads in place of known ones.
+            hidden: entries of the block's data to replace by the model's means; None to draw the unknown variables.
+        """
         known = self.values.keys() | self.states.keys()
         live = [name for name in block.names if (name not in known if hidden is None else name in hidden)]
         values = {**self.known, **(replacements or {})}
@@ -508,7 +527,13 @@ class Rollout:
     def _known_steps(
         self, live: list[str], hidden: Mapping[str, Hidden] | None, values: Mapping[str, Tensor]
     ) -> list[bool]:
-        """Return for each step whether all values of a loop are known for every sequence."""
+        """Return for each step whether all values of a loop are known for every sequence.
+
+        Args:
+            live: names of the variables that the loop computes.
+            hidden: hidden entries of data by name, as in `_run`.
+            values: known values by name, (B, T, D).
+        """
         if any(name not in values for name in live):
             return [False] * self.length
         end = min(values[name].shape[1] for name in live)
@@ -523,7 +548,7 @@ class Rollout:
         return is_known + [False] * (self.length - end)
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
-        """Return the known first values of a variable, with `value` at missing entries."""
+        """Return the known first values of a variable at some steps, with `value` at missing entries."""
         values = self.prefix[name][:, steps]
         return torch.where(self.observed[name][:, steps], values, value) if name in self.observed else values
 
@@ -658,6 +683,10 @@ def _runs(is_known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
     Forward in time, consecutive steps with known values are evaluated together with the step after them. The parameters
     of that step read only known values and earlier draws at the same step. Backward in time, each step is evaluated
     alone.
+
+    Args:
+        is_known: for each step, whether its values are known.
+        direction: 1 if the loop runs forward in time, -1 if it runs backward.
     """
     if direction < 0:
         yield from ((t, 1) for t in reversed(range(len(is_known))))
@@ -690,5 +719,5 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
 
 
 def _same(value: Tensor, drawn: Tensor) -> bool:
-    """Return whether a site's value is the draw: Pyro may return it detached."""
+    """Return whether a site's value equals the draw; tensors may differ, since Pyro may detach the draw."""
     return value is drawn or torch.equal(value, drawn)
