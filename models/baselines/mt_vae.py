@@ -249,7 +249,7 @@ class StyleDecoderNetwork(FixedLengthNetwork):
         )
 
     def changed(self, style: Tensor, w: Tensor) -> Tensor:
-        """Return the new style (B, S)."""
+        """Return the new style (B, S), from the style of the past (B, S) and the latent w (B, D)."""
         inputs = torch.cat([normed(self.read(w)), style], -1)
         return normed(normed(self.out(normed(self.block(inputs)))) + style)
 

@@ -351,7 +351,12 @@ class GSPSModel(EnergyModel):
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:
-    """Return the generative model of parts in this order; `observed` returns O for T steps."""
+    """Return the generative factorization of parts, each of which reads the parts before it.
+
+    Args:
+        parts: names of the parts, in the order of their prediction.
+        observed: function from the number of steps T to the number of observed steps O.
+    """
     text = " ".join(
         f"p({code}) p({name}_t | h_{{1:O}}, {''.join(f'{before}_{{1:T}}, ' for before in parts[:i])}{code})"
         for i, (code, name) in enumerate(zip(_codes(parts), parts, strict=True))

@@ -118,7 +118,13 @@ class ModesMethod(FutureMethod):
         return Recipe(train, validation, [Stage(steps, method.objective())], 1.0, prepare)
 
     def start(self, model: ModesModel, train: Any, validation: Any, steps: int) -> None:
-        """Load the weights of the CVAE's decoder into a model.
+        """Load the weights of the decoder from a run of a CVAE into a model, or fit a CVAE first if there is no run.
+
+        Args:
+            model: model of this method.
+            train: training windows.
+            validation: validation windows, or None.
+            steps: number of steps to fit a CVAE.
 
         Raises:
             ValueError: if the run is not of a cvae, or has other windows or options.

@@ -301,6 +301,10 @@ class TrajectoryModel(DynamicalVAE):
     def _extend_paths(self, data: Batch, horizon: int) -> Batch:
         """Return the data with trajectories over all frames that the networks predict for a horizon.
 
+        Args:
+            data: batch as returned by `read`, with the first pose (B, D).
+            horizon: H, number of frames that are requested.
+
         Raises:
             ValueError: if trajectories end before the horizon or do not have the size of the poses.
         """
@@ -449,7 +453,14 @@ class TrajectoryModel(DynamicalVAE):
     def _follow(
         self, batch: Mapping[str, Tensor], latents: Tensor, known_mask: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor]:
-        """Return motions (S, T, D) that are on the given paths at known frames, and their corrections."""
+        """Return motions (S, T, D) that are on the given paths at known frames, and their corrections (S, T, D).
+
+        Args:
+            batch: first pose and trajectories, with one row.
+            latents: initial values of the latents of S motions.
+            known_mask: (T, D), 1 where a coordinate is given, otherwise 0.
+            **options: options of `dvae.motion.control.follow_paths`.
+        """
         data = self._extend_paths(self.read(batch), len(known_mask))
         known_mask = torch.cat(
             [known_mask, known_mask.new_zeros(data[GIVEN].shape[1] - len(known_mask), known_mask.shape[1])]
