@@ -295,7 +295,14 @@ def missing_latents(model: DynamicalVAE) -> dict[str, tuple[Parent, ...]]:
 def _start(
     model: DynamicalVAE, data: Mapping[str, Any], missing: bool, reach: int | None
 ) -> tuple[DynamicalVAE, dict[str, Correction]]:
-    """Return the model with initial corrections, and these corrections."""
+    """Return a copy of the model with initial corrections of its guide, and these corrections by latent.
+
+    Args:
+        model: model with its guide.
+        data: sequences that the guide will be fitted to.
+        missing: whether the guide also reads the latents from `missing_latents`.
+        reach: largest distance in steps of links between local latents; None for no limit.
+    """
     added = missing_latents(model) if missing else {}
     draws = _GuideDraws(model, data)
     corrections = {}
@@ -359,7 +366,12 @@ class _GuideDraws:
         return Correction(unit, torch.zeros_like(unit), torch.zeros_like(unit), self.links(factor, reach))
 
     def links(self, factor: Factor, reach: int | None) -> tuple[Link, ...]:
-        """Return links to the latents among the parents, with zero weights."""
+        """Return links with zero weights from a latent to each latent among its parents.
+
+        Args:
+            factor: factor of the guide.
+            reach: largest distance in steps between the latent and a local parent; None for no limit.
+        """
         _, size, _, width = self.values[factor.child].shape
         length = max(value.shape[2] for value in self.values.values())
         links = []
