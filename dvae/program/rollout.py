@@ -70,7 +70,7 @@ class ScheduledSampling:
         return replace(self, probability=level)
 
     def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
-        """Draw a mask (B, T, 1), True at frames that are replaced."""
+        """Draw a mask (B, T, 1), True at frames that the model's own means replace, for B sequences of T frames."""
         mask = torch.rand(batch, length, 1, device=device) < self.probability
         mask[:, : self.start] = False
         if self.blocks is not None:
@@ -128,7 +128,13 @@ class Hidden:
     fixed_frames: list[bool] | None = None
 
     def fill(self, value: Tensor, mean: Tensor, steps: int | slice = slice(None)) -> Tensor:
-        """Return the value (B, T, D) with the mean at these entries; for one step, both are (B, D)."""
+        """Return the value with the mean at these entries.
+
+        Args:
+            value: values of the variable, (B, T, D), or (B, D) for a single step.
+            mean: the model's means, of the same shape.
+            steps: steps of `value`, as an index or a slice of the T steps.
+        """
         if self.detached is not None:
             mean = torch.where(self.detached[:, steps], mean.detach(), mean)
         return torch.where(self.entries[:, steps], mean, value)
@@ -235,7 +241,7 @@ class Rollout:
         return self.conditional_distribution(name, draws)
 
     def conditional_distribution(self, name: str, draws: int = 1) -> TorchDistribution:
-        """Return the distribution of a variable given drawn states of the summed-out latents."""
+        """Return the distribution of a variable given drawn states of the summed-out latents; see `distribution`."""
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)

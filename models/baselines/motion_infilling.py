@@ -136,7 +136,7 @@ class MotionInfilling(TrajectoryMethod):
 
 
 def start(model: InfillingModel, train: Windows) -> None:
-    """Set the network's mean and scale from 1024 windows, as the model sees them."""
+    """Set the mean and scale of a model's network from 1024 training windows, in the model's view."""
     data = model.read(train.sample(1024, torch.default_generator))
     model.generator[WHOLE].network.units.fit(interpolate_missing(data[WHOLE], data.mask()))
 
@@ -145,8 +145,8 @@ def start(model: InfillingModel, train: Windows) -> None:
 class RandomGaps:
     """Windows with given trajectories, where a curriculum hides a gap in time or the paths of some joints.
 
-    For each entry, batches contain the value of the curriculum from which on it is hidden. Hidden entries therefore
-    remain hidden as the curriculum rises.
+    Batches contain a threshold for each entry. The entry is hidden if the curriculum is at least at this threshold, so
+    hidden entries remain hidden as the curriculum rises.
 
     A gap of width w and position u, in a window of length 1, extends from u (1 - w) to u + (1 - u) w. Gaps at different
     u together cover the whole window. With increasing w, a gap grows to both sides.

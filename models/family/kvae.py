@@ -338,12 +338,25 @@ class KalmanNetwork(Network):
         return a, b, c
 
     def seen(self, emission: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the information matrix G (..., N, N) and the potential g (..., N) that a (..., D) gives about z."""
+        """Return the information about z in a: a Gaussian likelihood exp(g'z - z'Gz / 2) as G and g.
+
+        Args:
+            emission: C, (..., D, N).
+            a: (..., D).
+
+        Returns:
+            Information matrix G (..., N, N) and potential g (..., N).
+        """
         weighted = (emission * torch.exp(-self.log_emission)[:, None]).mT
         return weighted @ emission, (weighted @ a[..., None].double())[..., 0]
 
     def parts_of(self, mean: Tensor, covariance: Tensor, emission: Tensor) -> tuple[Tensor, Tensor]:
-        """Return location (..., D) and whitening matrix (..., D * D) of a_t from the moments of z_t."""
+        """Return location (..., D) and flat whitening matrix (..., D * D) of a_t.
+
+        Args:
+            mean, covariance: moments of z_t, (..., N) and (..., N, N).
+            emission: C_t, (..., D, N).
+        """
         loc = (emission @ mean[..., None])[..., 0]
         spread = emission @ covariance @ emission.mT + self.log_emission.exp().diag()
         return loc, InverseCholesky.apply(spread).flatten(-2)

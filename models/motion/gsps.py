@@ -138,9 +138,14 @@ class GSPS(EnergyMethod):
         return {name: self._spread(name, value) for name, value in super().preset(skeleton).items()}
 
     def _spread(self, name: str, value: Any) -> Any:
-        """Return the preset of two parts adapted to these parts.
+        """Return the preset value of an option for these parts, computed from the preset for two parts.
 
-        The number of futures does not increase, unless each part would have fewer than two draws.
+        The result has the mean of the preset for every part. For "draws", the number of futures does not exceed the
+        preset's, unless each part would have fewer than two draws.
+
+        Args:
+            name: name of the option.
+            value: preset for two parts, or a single value, which is returned unchanged.
         """
         count = len(self.parts)
         if not isinstance(value, tuple) or count == len(value):

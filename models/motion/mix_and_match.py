@@ -214,7 +214,13 @@ class MixAndMatchModel(DynamicalVAE):
 
 
 def _unrotated_positions(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
-    """Return positions (B, T, 3 J') of poses (B, T, D), with the root at the origin and without rotation."""
+    """Return positions (B, T, 3 J') of poses, with the root at the origin and without the root's rotation.
+
+    Args:
+        quaternions: poses (B, T, D), quaternions of the joints after the root's position, if there is one.
+        lengths: bone lengths of the bodies, as in batches.
+        view: conversion between quaternions and positions.
+    """
     root, start = view.turning.index(view.skeleton.root), 3 * view.root
     identity = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
     first = torch.zeros_like(quaternions[..., :start])

@@ -221,7 +221,7 @@ class ModesModel(FutureModel):
         return Batch(repeat(data, len(modes))) | {MODE: codes, "group": group}
 
     def _one_hot(self, modes: Tensor, like: Tensor) -> Tensor:
-        """Return the one-hot codes (B, K) of the modes of each row."""
+        """Return one-hot codes (B, K) of modes (B,), with the type and device of `like`."""
         return torch.eye(self.modes, dtype=like.dtype, device=like.device).index_select(0, modes.to(like.device))
 
     def in_sets(self, batch: AnyBatch | None) -> Batch:
