@@ -90,7 +90,7 @@ def test_clips_as_long_as_a_segment_are_segments():
     data = SegmentData("simulated", replace(PEOPLE, clips=clips), "clips")
     assert [clip.frames for clip in data.segments] == [clip.frames for clip in clips if clip.frames > 9]
     assert data.fingerprint != replace(data, cut="gait").fingerprint
-    with pytest.raises(ValueError, match=r"no clip of 0\.3 to 3 s.*cut='gait' finds the gait cycles"):
+    with pytest.raises(ValueError, match=r"uses clips of 0\.3 to 3 s.*cut='gait' finds the gait cycles"):
         assert SegmentData("simulated", replace(PEOPLE, clips=clips[:1]), "clips").segments
 
 
