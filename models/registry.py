@@ -104,7 +104,15 @@ class Registry(UserDict[str, Any]):
 
 @cache
 def _literals(module: str, name: str) -> dict[str, str | None]:
-    """Return the texts that the body of a class and of its bases assign to attributes; None for a dataclass field."""
+    """Return the texts that a class and its bases assign to attributes, read from the source file.
+
+    Args:
+        module: name of the module, which is not imported.
+        name: name of the class.
+
+    Returns:
+        Text of each attribute, or None for a field of the dataclass; empty if the source file does not exist.
+    """
     package, *parts = module.split(".")
     spec = find_spec(package)  # finding the module itself would import its packages
     file = Path(spec.origin or "").parent.joinpath(*parts).with_suffix(".py") if spec is not None else Path()

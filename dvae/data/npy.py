@@ -68,7 +68,17 @@ def dtype_of(code: str) -> np.dtype:
 
 
 def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = "declares") -> None:
-    """Check that the shape matches the number of bytes; also refuse an empty array with very large dimensions."""
+    """Check that an array's shape matches its number of bytes.
+
+    Args:
+        dtype: type of the entries.
+        shape: shape of the array.
+        size: number of bytes of the entries.
+        verb: verb before the shape in errors.
+
+    Raises:
+        NpyError: if the number of bytes differs, or an empty array has very large dimensions.
+    """
     n_bytes, padded = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
     if len(shape) > 32 or n_bytes != size or padded > max(size, NOTHING):
         short = f" instead of {n_bytes:,}; it was cut short, so copy or write it again" if n_bytes > size else ""

@@ -221,7 +221,7 @@ class RandomMasking:
 
 
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
-    """Return means over some dimensions, ignoring NaN."""
+    """Return means of values over the dimensions `dims`, ignoring NaN."""
     means: Tensor = values.mean(dims)
     return values.nanmean(dims) if means.isnan().any() else means
 

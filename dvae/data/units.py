@@ -43,14 +43,23 @@ LEVELS = "subtract from each sequence its own mean, or fit in float64"
 def is_imprecise(summary: ColumnSummary, center: Any) -> np.ndarray:
     """Return whether each column varies by less than float32 resolves at its distance from a center, (C,).
 
-    It is False for constant columns.
+    The result is False for constant columns.
+
+    Args:
+        summary: statistics of the C columns.
+        center: value (C,) that is subtracted from each column in float64.
     """
     spread = np.sqrt(summary.variance)
     return (spread > ROUNDING * abs(summary.mean)) & (spread < RESOLVED * abs(summary.mean - center))  # type: ignore[no-any-return]
 
 
 def imprecise_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
-    """Return `is_imprecise` (N, D) for the coordinates of each sequence (N, T, D), read in blocks."""
+    """Return `is_imprecise` (N, D) for each coordinate of each sequence.
+
+    Args:
+        values: (N, T, D), in memory or mapped; read in blocks.
+        center: value (D,) that is subtracted from each coordinate in float64.
+    """
     masks = []
     for block in blocks(values):
         count, _, size = block.shape

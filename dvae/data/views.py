@@ -50,6 +50,11 @@ class View:
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         """Check that a model is compatible with this view.
 
+        Args:
+            sizes: dimension of every variable of the model.
+            context: names of the model's context.
+            generative: generative factorization.
+
         Raises:
             ValueError: if the model is incompatible; the message states the reason.
         """

@@ -188,7 +188,16 @@ class Reader:
         )
 
     def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:
-        """Pad the history (`views.History`) to all steps; the custom mask of its relation hides the padding."""
+        """Pad the history (`views.History`) with zeros to all T steps, in place.
+
+        Args:
+            factorization: factorization whose factors read the history. Their custom masks hide the padding.
+            values: values of the batch by name, changed in place.
+            length: T.
+
+        Raises:
+            ValueError: if a factor reads the history after its last step.
+        """
         name = self.view.history
         if name is None or name not in values or (past := values[name].shape[1]) >= length:
             return
@@ -209,7 +218,17 @@ class Reader:
     def _check_values(
         self, values: Mapping[str, Tensor], masks: Mapping[str, Tensor], lengths: Tensor | None, length: int
     ) -> None:
-        """Check that values are finite and in the support, and lengths valid, with one synchronisation of the GPU."""
+        """Check that values are finite and in the support, and lengths valid, with one synchronisation of the GPU.
+
+        Args:
+            values: values by name, with 0 or another finite value at missing entries.
+            masks: masks of observed entries by name; missing entries are not compared with the support.
+            lengths: (B,) valid steps of a ragged batch.
+            length: T, upper limit of the lengths.
+
+        Raises:
+            ValueError: if a value or length is invalid.
+        """
         not_finite = {name: ~torch.isfinite(value.sum()) for name, value in values.items()}  # a NaN survives the sum
         outside = {
             name: invalid
@@ -231,14 +250,21 @@ class Reader:
             if invalid.any():
                 distribution, index = self.distributions[name], invalid.nonzero()[0].tolist()
                 raise ValueError(
-                    f"{name} holds {values[name][tuple(index)].item():g} (sequence {index[0]}, coordinate {index[-1]}),"
+                    f"{name} has {values[name][tuple(index)].item():g} (sequence {index[0]}, coordinate {index[-1]}),"
                     f" but under {distribution.factor}, {distribution.head.label}, values are "
                     f"{_describe_support(distribution.support)}; give {name} another"
                     " distribution, correct such entries, or hide them by the 'mask' of the batch"
                 )
 
     def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:
-        """Return which observed entries lie outside the support, as a mask of the value; None if none can be."""
+        """Return a mask of observed entries outside the support; None if the distribution supports all real values.
+
+        Args:
+            name: name of the data variable.
+            value: (B, T, D) or (B, D).
+            mask: True where an entry was observed; None if all were.
+            lengths: (B,) valid steps of a ragged batch.
+        """
         distribution = self.distributions[name]
         if (support := distribution.support) is None:
             return None
@@ -269,10 +295,16 @@ def _lengths_message(lengths: Tensor, length: int) -> str:
 
 
 def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
-    """Return entries as tensors in their precision.
+    """Return the entries of a batch as tensors in the precision of the model.
 
-    Floating-point entries and those in `names` get the dtype, or float64 if they are in `wide`. Masks and counts, such
-    as lengths, keep their type.
+    Floating-point entries and entries in `names` get the dtype, or float64 if they are in `wide`. Masks and counts,
+    such as lengths, keep their type.
+
+    Args:
+        batch: arrays or tensors by name.
+        dtype: precision of the model.
+        names: names of the variables.
+        wide: names of the variables that are read in float64.
     """
     tensors = Batch()
     for name, value in batch.items():
@@ -369,10 +401,19 @@ def _describe_support(support: Any) -> str:
 
 
 def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tuple[int, int]:
-    """Return B and T as the values determine them, otherwise the given size and length."""
+    """Return B and T of a batch.
+
+    Args:
+        values: values of variables by name, which determine B.
+        length: T; None if the values determine it.
+        size: B; used only if there are no values.
+
+    Raises:
+        ValueError: if values differ in B or T, B or T is 0, or T cannot be inferred.
+    """
     sizes = {value.shape[0] for value in values.values()} or {size}
     if len(sizes) > 1:
-        raise ValueError(f"the batch holds different numbers of sequences: {shapes(values)}")
+        raise ValueError(f"all variables of a batch must have the same number of sequences, got {shapes(values)}")
     if sizes == {0}:
         raise ValueError(f"the batch holds no sequences: {shapes(values)}")
     local = {name: value for name, value in values.items() if value.dim() == 3}
@@ -381,7 +422,7 @@ def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tupl
         if not steps:
             raise ValueError("cannot infer the number of steps without a batch; pass length=")
         if len(steps) > 1:
-            raise ValueError(f"the batch holds different numbers of steps: {shapes(local)}")
+            raise ValueError(f"all local variables of a batch must have the same number of steps, got {shapes(local)}")
         length = max(steps)
     if length < 1:
         raise ValueError(f"length must be at least 1, got {length}")

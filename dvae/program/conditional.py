@@ -189,9 +189,14 @@ class Conditional(nn.Module):
         lengths: Tensor | None = None,
         groups: Groups | None = None,
     ) -> Parameters:
-        """Return the parameters at all steps, (B, T, D), or (B, D) for a static child.
+        """Return the parameters of the distribution at all steps, (B, T, D), or (B, D) for a static child.
 
-        Sequences of a group share them.
+        Args:
+            parents: values of the parents by name, (B, T, D) or (B, D), with presence masks and indicators if any.
+            batch: B.
+            length: T.
+            lengths: (B,) valid steps of a ragged batch.
+            groups: groups of sequences that share the child; features are averaged over each group.
         """
         if self.network is None:
             shape = (batch, length, 0) if self.factor.local else (batch, 0)
@@ -270,7 +275,7 @@ class Conditional(nn.Module):
         return self._add_offset(self.head.mean(parameters))
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Return values (..., D) of the child (`ConditionalDistribution.draw`)."""
+        """Return values (..., D) of the child computed from noise, as in `ConditionalDistribution.draw`."""
         return self._add_offset(self.head.draw(parameters, noise))
 
     @property
@@ -283,7 +288,14 @@ class Conditional(nn.Module):
         return value if offset is None else value + offset
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """Return the initial state of a loop over time that draws the parents missing from `given`."""
+        """Return the initial state of a loop over time that draws the parents missing from `given`.
+
+        Args:
+            given: values of the other parents by name, (B, T, D) or (B, D).
+            batch: B.
+            length: T.
+            lengths: (B,) valid steps of a ragged batch.
+        """
         if self.network is None:
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
@@ -295,9 +307,13 @@ class Conditional(nn.Module):
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
-        """Return the parameters (B, D) at step t and the next state.
+        """Return the parameters (B, D) at step t and the next state of a loop over time.
 
-        The call evaluates `count` steps at once, and t is the last of them.
+        Args:
+            state: result of `start` or of the previous step.
+            t: index of the step, from 0.
+            drawn: values (B, D) by step of the variables that the loop draws, by name.
+            count: number of steps that are evaluated at once, of which t is the last.
         """
         if self.network is None:
             return tuple(p[t] for p in state), state
@@ -316,7 +332,14 @@ class Conditional(nn.Module):
     def forward_chunk(
         self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
     ) -> tuple[Parameters, Any]:
-        """Return the parameters (B, N, D) at N steps from t on, with all their inputs known, and the next state."""
+        """Return the parameters (B, N, D) at N steps whose inputs are all known, and the next state.
+
+        Args:
+            state: result of `start` or of the previous step.
+            t: index of the first of these steps, from 0.
+            count: N.
+            drawn: values (B, D) by step of the variables that the loop draws, by name.
+        """
         if self.network is None:
             return tuple(torch.stack(p[t : t + count], dim=1) for p in state), state
         inner, inputs = self._standardise_draws(state, drawn)
@@ -337,7 +360,7 @@ class Conditional(nn.Module):
         return state.network, {**drawn, **standardised}
 
     def select(self, state: Any, rows: Tensor) -> Any:
-        """Return the state with these rows (N,) of its batch (`networks.loop.select`)."""
+        """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles."""
         if self.network is None:
             return select(state, rows)
         if not isinstance(state, Standardised):
@@ -354,7 +377,16 @@ class Conditional(nn.Module):
         return state
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
-        """Return draws (B, T, D) and their parameters by one fused loop; None if the factor is no Gaussian chain."""
+        """Return draws (B, T, D) and their parameters, computed by one fused loop for all steps.
+
+        Args:
+            state: result of `start`.
+            direction: 1 if the loop runs forward in time, -1 if it runs backward.
+            noise: standard normal noise (B, T, D) of the draws.
+
+        Returns:
+            Draws and parameters, or None if the factor is not a Gaussian chain.
+        """
         if torch.is_autocast_enabled(noise.device.type):  # the fused loop runs in one precision
             return None
         if self.factor.child in self.units:

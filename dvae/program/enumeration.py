@@ -280,7 +280,16 @@ class Enumeration:
         self._steps = sum(self._local.values(), none).expand(shape)
 
     def _logs(self, name: str, window: Window) -> Tensor:
-        """Return log densities or probabilities in all joint states, (B or 1, T, M, K^L, K), or (B or 1, M)."""
+        """Return the log density or log probability of a variable in every joint state of the discrete latents.
+
+        Args:
+            name: name of the variable.
+            window: summed-out latents that its factor reads.
+
+        Returns:
+            (B, T, M, K^L, K) for a local variable, or (B, M) for a static one; B is 1 if all sequences have the same
+            values.
+        """
         sums, run, local = self.sums, self.rollout, window.factor.local
         conditional, is_summed = run.conditionals[name], name in sums.sizes
         patterns, places = sums.placed(window, run.length, like(conditional).device)

@@ -97,7 +97,18 @@ def forecast(
 
 
 def _fixed_values(model: Any, values: Mapping[str, Tensor], data: Batch, size: int, horizon: int) -> dict[str, Tensor]:
-    """Return the fixed values in the model's representation; those of data variables start with the past."""
+    """Return the fixed values in the model's representation; values of data variables start with the past.
+
+    Args:
+        model: model that forecasts.
+        values: fixed values by name, futures (B, H, D) of data variables or values (B, D) of static latents.
+        data: batch of the past, as returned by `read`.
+        size: B.
+        horizon: H.
+
+    Raises:
+        ValueError: if a variable cannot be fixed, or a value has the wrong shape.
+    """
     free = {*model.observed, *(name for name in model.latents if not model.generative.local(name))}
     for name, value in values.items():
         if name not in free or free & set(model.observed) <= set(values):

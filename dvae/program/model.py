@@ -687,7 +687,10 @@ def _locality(factorization: Factorization) -> dict[str, bool]:
 
 
 def _note(factorization: Factorization, rollout: Rollout) -> Any:
-    """Return the `infer` entry of a site: bounds use it to choose analytic KL terms and to average draws."""
+    """Return the factorization and the run for a site's `infer` entry.
+
+    Bounds read them to choose analytic KL terms and to average over draws.
+    """
     return {"program": factorization, "run": rollout}
 
 

@@ -168,9 +168,12 @@ class Oracle:
         return torch.cat([values[name].flatten(1) for name in names], dim=1)
 
     def _count_mask(self, names: tuple[str, ...], run: Rollout | None, observed: bool = True) -> Tensor:
-        """Return a mask (R, N) of the stacked variables: 1 at valid entries, 0 at padding; R is 1 without padding.
+        """Return a mask (R, N) of stacked variables: 1 at valid entries, 0 at padding.
 
-        With `observed`, missing entries are 0 too.
+        Args:
+            names: names of the variables, in the order of stacking.
+            run: run over a batch of R sequences. R is 1 without a run, or if all its sequences are complete.
+            observed: whether missing entries are 0 too.
         """
         if run is None or not _is_partial(run):
             return torch.ones(1, sum(map(self._size, names)), dtype=torch.float64)
@@ -186,7 +189,14 @@ class Oracle:
     def _system(
         self, conditionals: Mapping[str, Any], names: tuple[str, ...], data: tuple[str, ...], run: Rollout | None = None
     ) -> _System:
-        """Return the conditionals as affine functions, from their locations at 0 and at every unit vector."""
+        """Return conditionals as one affine system, from their locations at 0 and at every unit vector.
+
+        Args:
+            conditionals: conditional of each variable by name.
+            names: names of the variables v of the system, in the order of stacking.
+            data: names of the variables d that the system reads.
+            run: run over a batch with missing entries or padding; None for complete sequences.
+        """
         columns = (*names, *data)
         valid, valid_own = (self._count_mask(each, run, observed=False) for each in (columns, names))
         rows, count = valid.shape
@@ -241,10 +251,16 @@ class Oracle:
         return means[0, 0], precision[0]
 
     def _mixture(self, run: Rollout | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return log probability (C,) and mean (R, C, N) of each state sequence, and their common precision (R, N, N).
+        """Return the joint of latents and data as a mixture of normals over C state sequences of discrete latents.
 
         The model replaces a missing entry by its mean, a function of its parents; the entry itself is an independent
         N(0, 1).
+
+        Args:
+            run: run over a batch; None for one complete sequence.
+
+        Returns:
+            Log probabilities (C,) and means (R, C, N) of the components, and their common precision (R, N, N).
         """
         model, names = self.model, (*self.model.latents, *self.model.observed)
         system = self._system(model.generator, names, model.summed, run)
@@ -271,7 +287,7 @@ class Oracle:
         return logs
 
     def _guide(self, run: Rollout | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return gain on the data, offset, and a root R of the covariance R R' of q(latents | data), for each row."""
+        """Return q(latents | data) = N(gain data + offset, root root') as gain, offset and root, for each sequence."""
         system = self._system(self.model.encoder, self.model.latents, self.model.observed, run)
         lhs = torch.eye(system.bias.shape[1], dtype=torch.float64) - system.weights
         right = torch.cat([system.data_weights, system.bias[..., None], torch.diag_embed(system.scale)], dim=-1)

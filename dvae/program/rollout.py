@@ -70,7 +70,7 @@ class ScheduledSampling:
         return replace(self, probability=level)
 
     def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
-        """Draw a mask (B, T, 1), True at frames that are replaced."""
+        """Draw a mask (B, T, 1), True at frames that the model's own means replace, for B sequences of T frames."""
         mask = torch.rand(batch, length, 1, device=device) < self.probability
         mask[:, : self.start] = False
         if self.blocks is not None:
@@ -128,7 +128,13 @@ class Hidden:
     fixed_frames: list[bool] | None = None
 
     def fill(self, value: Tensor, mean: Tensor, steps: int | slice = slice(None)) -> Tensor:
-        """Return the value (B, T, D) with the mean at these entries; for one step, both are (B, D)."""
+        """Return the value with the mean at these entries.
+
+        Args:
+            value: values of the variable, (B, T, D), or (B, D) for a single step.
+            mean: the model's means, of the same shape.
+            steps: steps of `value`, as an index or a slice of the T steps.
+        """
         if self.detached is not None:
             mean = torch.where(self.detached[:, steps], mean.detach(), mean)
         return torch.where(self.entries[:, steps], mean, value)
@@ -136,10 +142,10 @@ class Hidden:
 
 @dataclass
 class Rollout:
-    """A run of `factorization` over a batch.
+    """A run of a factorization over a batch: known values, and distributions and draws of the other variables.
 
     Args:
-        factorization: the factorization.
+        factorization: factorization to run, generative or of the guide.
         conditionals: dictionary from child to `Conditional`.
         batch, length: B and T.
         values: known values: data, context, statics (B, D) and, once they are known, latents (B, T, D).
@@ -235,7 +241,7 @@ class Rollout:
         return self.conditional_distribution(name, draws)
 
     def conditional_distribution(self, name: str, draws: int = 1) -> TorchDistribution:
-        """Return the distribution of a variable given drawn states of the summed-out latents."""
+        """Return the distribution of a variable given drawn states of the summed-out latents; see `distribution`."""
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
@@ -260,7 +266,15 @@ class Rollout:
         }
 
     def know(self, name: str, value: Tensor) -> None:
-        """Record the value of a site, which later sites read."""
+        """Record the value of a site, which later sites read.
+
+        Args:
+            name: name of the variable.
+            value: (B, T, D), or (B, D) of a static variable.
+
+        Raises:
+            ValueError: if variables in the same loop were drawn with another value.
+        """
         if name in self._draws and not _same(value, self._draws[name]):
             handed_out = self.values.keys() & self._draws.keys() & set(self._block[name].names)
             dependants = sorted(handed_out - {name})
@@ -288,11 +302,16 @@ class Rollout:
         return valid if mask is None else mask & valid
 
     def evaluate(self, name: str, value: Tensor) -> TorchDistribution:
-        """Return the conditionals of a local variable at all steps; batch shape (B, T, D), or (B, T)."""
+        """Return the conditional distributions of a local variable at all steps, batch shape (B, T, D) or (B, T).
+
+        Args:
+            name: name of the variable.
+            value: (B, T, D), values of the variable, whose past the factor may read.
+        """
         return self.conditionals[name].distribution(self.parameters(name, value))
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
-        """Return the parameters (B, T, ...) for `evaluate`, memoized for one value."""
+        """Return the parameters (B, T, ...) of `evaluate`; the result for the last value is kept."""
         if not self._is_evaluated(name, value):
             history = self.history(name)  # this may run a loop that evaluates the variable
             if not self._is_evaluated(name, value):
@@ -414,7 +433,13 @@ class Rollout:
     def _run(
         self, block: Block, replacements: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
     ) -> dict[str, Tensor]:
-        """Return the unknown variables of a block; with `hidden`, its data with the model's means at those entries."""
+        """Draw the unknown variables of a block, or fill in hidden entries of its data, (B, T, D) by name.
+
+        Args:
+            block: variables that are computed in one loop over time.
+            replacements: values that the block reads in place of known ones.
+            hidden: entries of the block's data to replace by the model's means; None to draw the unknown variables.
+        """
         known = self.values.keys() | self.states.keys()
         live = [name for name in block.names if (name not in known if hidden is None else name in hidden)]
         values = {**self.known, **(replacements or {})}
@@ -508,7 +533,13 @@ class Rollout:
     def _known_steps(
         self, live: list[str], hidden: Mapping[str, Hidden] | None, values: Mapping[str, Tensor]
     ) -> list[bool]:
-        """Return for each step whether all values of a loop are known for every sequence."""
+        """Return for each step whether all values of a loop are known for every sequence.
+
+        Args:
+            live: names of the variables that the loop computes.
+            hidden: hidden entries of data by name, as in `_run`.
+            values: known values by name, (B, T, D).
+        """
         if any(name not in values for name in live):
             return [False] * self.length
         end = min(values[name].shape[1] for name in live)
@@ -523,7 +554,7 @@ class Rollout:
         return is_known + [False] * (self.length - end)
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
-        """Return the known first values of a variable, with `value` at missing entries."""
+        """Return the known first values of a variable at some steps, with `value` at missing entries."""
         values = self.prefix[name][:, steps]
         return torch.where(self.observed[name][:, steps], values, value) if name in self.observed else values
 
@@ -658,6 +689,10 @@ def _runs(is_known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
     Forward in time, consecutive steps with known values are evaluated together with the step after them. The parameters
     of that step read only known values and earlier draws at the same step. Backward in time, each step is evaluated
     alone.
+
+    Args:
+        is_known: for each step, whether its values are known.
+        direction: 1 if the loop runs forward in time, -1 if it runs backward.
     """
     if direction < 0:
         yield from ((t, 1) for t in reversed(range(len(is_known))))
@@ -690,5 +725,5 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
 
 
 def _same(value: Tensor, drawn: Tensor) -> bool:
-    """Return whether a site's value is the draw: Pyro may return it detached."""
+    """Return whether a site's value equals the draw; tensors may differ, since Pyro may detach the draw."""
     return value is drawn or torch.equal(value, drawn)

@@ -209,12 +209,18 @@ def log_densities(trace: Any) -> dict[str, Tensor]:
 
 
 def total(logs: Mapping[str, Tensor]) -> Tensor:
-    """Return the sum over variables and steps, (B,)."""
+    """Return the sum (B,) of log densities (B, T) or (B,) over variables and steps."""
     return sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values())  # type: ignore[return-value]
 
 
 def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return log p(x, z) and log q(z | x) at these latents, (B,) each."""
+    """Return log p(x, z) and log q(z | x) at given latents, (B,) each.
+
+    Args:
+        model: model with its guide.
+        batch: batch as in `DynamicalVAE.model`.
+        latents: values of all latents by name, (B, T, D) or (B, D) each.
+    """
     traces = (
         poutine.trace(poutine.condition(program, data=dict(latents))).get_trace(batch)
         for program in (model.model, model.guide)

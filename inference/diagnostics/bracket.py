@@ -266,7 +266,7 @@ def bracket(
     Args:
         model: model with its guide.
         data: windows, x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
-        count: number of sequences to draw at random; None for all.
+        count: number of randomly chosen sequences to evaluate; None for all.
         particles: K, number of draws for the ELBOs and the IWAE bound, and number of particles of the FIVO bound.
         temperatures, chains: L and K of annealed importance sampling, as in `annealed_bound`.
         fitting: number of steps of the semi-amortized guides (`semi_amortized_guide`); 0 omits them and the parts of
@@ -404,9 +404,15 @@ class _Work:
     def bounds(
         self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seeds: Sequence[int], advance: Any
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the bounds (B,) by name, and effective chains (B,); with exact latents, also an upper bound.
+        """Return the bounds (B,) by name, and the effective number of chains (B,).
 
         The draws of all ELBOs have the same seed, so that their differences have less noise.
+
+        Args:
+            data: batch of B sequences.
+            latents: exact latents of simulated data, which also give an upper bound; None for real data.
+            seeds: seeds of evaluation, of fitting the semi-amortized guides, and of annealed importance sampling.
+            advance: function called after each part of the work, for the progress bar.
         """
         model, bounds = self.model, {}
         evaluation_seed, fitting_seed, annealing_seed = seeds

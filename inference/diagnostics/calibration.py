@@ -328,7 +328,15 @@ class _Points:
 
     @classmethod
     def of(cls, model: DynamicalVAE, context: Mapping[str, Tensor], count: int, length: int, steps: Tensor) -> Self:
-        """Return `count` new simulations."""
+        """Return points from new simulations.
+
+        Args:
+            model: model to simulate.
+            context: context variables (C, T, D) or (C, D) by name, empty if none.
+            count: M, number of simulations.
+            length: T of the simulated sequences.
+            steps: indices of the ranked steps of local latents.
+        """
         simulated = _simulate(model, context, count, length)
         return cls(_data(model, simulated), _coordinates(model, simulated, steps))
 
@@ -339,18 +347,18 @@ class _Points:
 
 
 def _scale(values: Tensor) -> Tensor:
-    """Return standard deviations of columns; 1 for constant columns."""
+    """Return the standard deviation of each column of values (N, Q); 1 for a constant column."""
     scale = values.std(0, correction=0)
     return torch.where(scale > 0, scale, 1.0)
 
 
 def _data(model: DynamicalVAE, batch: Mapping[str, Any]) -> Tensor:
-    """Return the data as (B, F)."""
+    """Return all data variables of a batch as flat vectors (B, F)."""
     return torch.cat([batch[name].flatten(1) for name in model.observed], 1)
 
 
 def _coordinates(model: DynamicalVAE, latents: Mapping[str, Tensor], steps: Tensor) -> Tensor:
-    """Return all latents at these steps as (B, Q)."""
+    """Return all latents, local ones at these steps only, as flat vectors (B, Q)."""
     local = model.generative.local
     return torch.cat(
         [(latents[name][:, steps] if local(name) else latents[name]).flatten(1) for name in model.latents], 1

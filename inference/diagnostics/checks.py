@@ -460,9 +460,13 @@ def _measure(
 def decode(
     model: DynamicalVAE, batch: Mapping[str, Tensor], latents: Mapping[str, Tensor], mean_emission: bool
 ) -> Tensor:
-    """Return x (B, T, D) of a free run given context and latents; other latents are drawn.
+    """Return x (B, T, D) of a free run given context and latents, in data space instead of the model's view.
 
-    x is in data space, not in the model's view. First frames that are context are kept.
+    Args:
+        model: model to run.
+        batch: batch with x, which determines B and T, and context. First frames of x that are context are kept.
+        latents: values of latents by name; all others are drawn from the model.
+        mean_emission: whether x are means of the emission instead of draws.
     """
     data = model.read(batch)
     context = {name: value for name, value in data.items() if name in model.context}

@@ -38,7 +38,12 @@ def split(flat: Tensor, like: Values) -> dict[str, Tensor]:
 
 
 def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
-    """Return names of the scalar entries of latents: "w[0]", "z_3[1]" (step from 1, coordinate from 0)."""
+    """Return names of the scalar entries of latents: "w[0]", "z_3[1]" (step from 1, coordinate from 0).
+
+    Args:
+        model: model with these latents.
+        steps: steps of the local latents, from 1.
+    """
     local = [f"_{t}" for t in steps]
     return tuple(
         f"{name}{step}[{d}]"

@@ -284,7 +284,7 @@ class _Search:
         return torch.stack([candidates[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
 
     def _draw(self, program: _Program) -> dict[str, Tensor]:
-        """Return the latents that a program draws."""
+        """Return the latents of the searched program that another program, such as a guide, draws, by name."""
         nodes: dict[str, Any] = poutine.trace(program).get_trace(self.batch).nodes
         return {name: nodes[name]["value"] for name in self.latents if name in nodes}
 
@@ -319,7 +319,13 @@ class _Search:
             return self._energy(self._renew(batch, values), values)
 
     def _curvature(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> tuple[Tensor, Tensor]:
-        """Return gradients (B, P) and second derivatives (B, P, P) of the energy, or of the part of these sites."""
+        """Return gradients (B, P) and second derivatives (B, P, P) of the energy with respect to the latents.
+
+        Args:
+            batch: batch of the program.
+            values: latents as flat vectors (B, P).
+            sites: names of the sites whose energy is used, such as the latents for the prior; None for all.
+        """
         values = values.clone().requires_grad_()
         with torch.enable_grad():
             energy = self._energy(batch, values, sites)
@@ -331,7 +337,13 @@ class _Search:
         return gradient.detach(), torch.stack(columns, -1)
 
     def _line_search(self, batch: Any, values: Tensor, step: Tensor) -> Tensor:
-        """Return the best of a full, half, quarter or eighth step, or no step if none lowers the energy."""
+        """Return latents (B, P) after the best of a full, half, quarter or eighth step; unchanged if none is better.
+
+        Args:
+            batch: batch of the program.
+            values: latents as flat vectors (B, P).
+            step: Newton step (B, P).
+        """
         shares = step.new_tensor([1.0, 0.5, 0.25, 0.125, 0.0])
         candidates = [values + share * step for share in shares]
         energies = torch.stack([self._measure(batch, each) for each in candidates]).nan_to_num(torch.inf)

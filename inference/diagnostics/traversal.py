@@ -139,7 +139,16 @@ def _check_path(model: DynamicalVAE, latent: str, free: Sequence[str]) -> None:
 
 
 def _scale(model: DynamicalVAE, data: dict[str, Tensor], latent: str, unit: str, draws: int) -> Tensor:
-    """Return standard deviations (D,) of a latent's coordinates, pooled over steps (and sequences, if posterior)."""
+    """Return standard deviations (D,) of a latent's coordinates over draws.
+
+    Args:
+        model: model with its guide.
+        data: batch as returned by `read`.
+        latent: name of the latent.
+        unit: "prior" for draws from the model, pooled over steps; "posterior" for draws from the guide given each
+            sequence, whose variances are averaged over sequences and steps.
+        draws: number of draws.
+    """
     if unit == "prior":
         size, length = data["x"].shape[:2]
         rows = torch.arange(draws) % size

@@ -149,7 +149,11 @@ class Comparison(Result):
         return sorted(self.rows, key=lambda name: -self[name]["IWAE bound"].mean)
 
     def difference(self, first: str, second: str, metric: str = "IWAE bound") -> Estimate:
-        """Return the paired difference of two models, first minus second; `estimates` describes its errors.
+        """Return the mean paired difference of two models, first minus second; module `estimates` describes its errors.
+
+        Args:
+            first, second: names of the models.
+            metric: name of the score, such as "IWAE bound" (nats per frame).
 
         Raises:
             KeyError: when a model was not compared, or one of the two has no such metric.

@@ -35,7 +35,14 @@ _ERRORS = ("sequences", "seeds", "total")
 
 
 def linearised(clip_means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted mean of clip means (..., C), a ratio of sums, and each clip's contribution to the error."""
+    """Return the weighted mean (...,) of clip means, and each clip's contribution (..., C) to its error.
+
+    The mean is a ratio of sums over clips, and its error is linearised.
+
+    Args:
+        clip_means: means (..., C) of C clips.
+        weights: weight (C,) of each clip, such as its number of windows.
+    """
     shares = weights / weights.sum()
     mean = (shares * clip_means).sum(-1)
     return mean, shares * (clip_means - mean[..., None])
@@ -114,6 +121,10 @@ class Estimate:
     def interval(self, level: float = 0.95, error: str = "total") -> tuple[float, float]:
         """Return the confidence interval of the mean by Student's t, from one of the errors; NaN if it is unknown.
 
+        Args:
+            level: probability of the interval.
+            error: name of the error: "sequences", "seeds" or "total".
+
         Raises:
             ValueError: when the level is not between 0 and 1, or `error` is not one of the three.
         """
@@ -121,6 +132,9 @@ class Estimate:
 
     def p_value(self, error: str = "total") -> float:
         """Return the two-sided p-value of a zero mean by Student's t, from one of the errors; NaN if it is unknown.
+
+        Args:
+            error: name of the error: "sequences", "seeds" or "total".
 
         Raises:
             ValueError: when `error` is not one of the three.

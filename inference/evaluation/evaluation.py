@@ -119,7 +119,11 @@ class Evaluation(Result):
         return {name: self._score(name, means) for name, means in self._row(method).clip_means.items()}
 
     def difference(self, first: str, second: str, metric: str) -> Score:
-        """Return the paired difference of two methods in a metric, first minus second, with its standard error.
+        """Return the mean paired difference of two methods in a metric, first minus second, with its standard error.
+
+        Args:
+            first, second: names of the methods.
+            metric: name of the score, such as "CRPS".
 
         Raises:
             KeyError: when a method was not evaluated, or one of the two has no such metric.
@@ -128,7 +132,11 @@ class Evaluation(Result):
         return self._score(metric, values - other)
 
     def ratio(self, first: str, second: str, metric: str) -> Score:
-        """Return the ratio of two methods' means in a metric, first by second, with its linearised standard error.
+        """Return the ratio of two methods' means in a metric, first divided by second, with its linearised error.
+
+        Args:
+            first, second: names of the methods.
+            metric: name of the score, such as "APD".
 
         Raises:
             KeyError: as `difference`.
@@ -202,6 +210,11 @@ class Evaluation(Result):
         on each other, so the envelope is for their effective number, estimated from their spread over clips
         (`estimates.effective_number`). It is an approximation, unless each clip contributes a single number. A curve
         that leaves the band at any point indicates that forecasts are not calibrated.
+
+        Args:
+            method: name of the method.
+            histogram: name of its histogram.
+            alpha: probability that the curve of calibrated forecasts leaves the band.
 
         Returns:
             Points between bins, the share of the PIT below each minus the point itself, and the lower and upper end of

@@ -149,7 +149,17 @@ def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
 
 
 def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
-    """Raise FloatingPointError for the first window whose entry in `finite` (B,) is False."""
+    """Raise an error if a result is not finite, which names the first such window.
+
+    Args:
+        name: name of the method.
+        what: name of the result, such as "bound".
+        finite: (B,), whether the result of each window is finite.
+        keys: (split, clip, first frame) of each window.
+
+    Raises:
+        FloatingPointError: when an entry of `finite` is False.
+    """
     if not finite.all():
         split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
         raise FloatingPointError(

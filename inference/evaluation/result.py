@@ -143,10 +143,10 @@ class Result(Displayed):
         return {}
 
     def check(self) -> None:
-        """Refuse fields that contradict each other, as in an altered file.
+        """Raise an error if fields contradict each other, as in an altered file.
 
         Raises:
-            ValueError: with the names of these fields.
+            ValueError: when fields contradict each other; the message names them.
         """
 
     @property

@@ -338,6 +338,10 @@ def at_most(size: int, what: str) -> Iterator[None]:
     A number usually takes two or four bytes in a file of weights. The limit is one number per byte plus a margin,
     because tensors that are shared or rebuilt count several times.
 
+    Args:
+        size: size of the file of weights in bytes.
+        what: subject of errors, such as the path of the run.
+
     Raises:
         CheckpointError: when the limit is exceeded.
     """

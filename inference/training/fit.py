@@ -377,6 +377,11 @@ def _observed(model: nn.Module, validation: Any) -> int | None:
 def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
     """Return the run directory, after checking that `fit` overwrites no run and resumes one on the same data.
 
+    Args:
+        out: path of the directory; None for no directory.
+        resume: whether to continue the run in the directory.
+        record: description of the run, for `config.json`, with the fingerprint of its training data.
+
     Raises:
         CheckpointError: when `out` contains a run although `resume` is False, no run although it is True, or a run on
             other data.

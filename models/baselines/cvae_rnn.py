@@ -4,8 +4,8 @@
 
 The stochastic baseline of TrajeVAE, with the same variables: y are the given trajectories, r the remaining joints, s
 the first pose. Bidirectional recurrent networks summarise y and r; their states are averaged over time. The decoder
-reads the summary of y, w, y_t and its own mean at t-1 (at first s) in place of x_{t-1}, in training too. Gradients flow
-through these means. Poses are absolute.
+reads the summary of y, w, y_t and, in place of x_{t-1}, its own mean at t-1, in training too. At the first step it
+reads s instead. Gradients flow through these means. Poses are absolute.
 
 Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, after the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. The
 positions of the perceptrons are our choice, which reproduces the paper's sizes and number of parameters (913,883 for
@@ -107,7 +107,7 @@ class Summaries:
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummariesNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return SummariesNetwork(self, inputs)
 
 
@@ -158,7 +158,7 @@ class Decoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return DecoderNetwork(self, inputs, size)
 
 

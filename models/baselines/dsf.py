@@ -47,9 +47,10 @@ class DSF(ModesMethod):
 
     Args:
         beta: weight of half the squared norm of the latents, mean over modes; the paper has no such term.
-        diversity_scale: s, in square metres; by default as in DLow.
-        quality: omega, quality of a latent within the radius.
-        radius: rho, share of N(0, I) within the radius.
+        diversity_scale: s, squared distance of two futures at which their similarity is 1 / e, in square metres; by
+            default as in DLow.
+        quality: omega, quality of a latent within the radius R.
+        radius: rho, probability under N(0, I) of a latent within the radius R, which determines R.
     """
 
     name = "dsf"

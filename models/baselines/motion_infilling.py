@@ -76,9 +76,9 @@ class MotionInfilling(TrajectoryMethod):
     Args:
         latent: always None; the method has no latents.
         maps: numbers of feature maps at each image size, starting with the full size.
-        keep: probability that a joint is given, in training, where no gap hides it.
-        gap: final mean width of the gaps in training, as a share of the window; 0 for neither gaps nor removed joints,
-            as in the training of other methods, which have a `keep` below 1.
+        keep: probability in training that a joint of a window is given, before gaps and removed joints.
+        gap: final mean width of the gaps in training, as a share of the window. With 0 there are neither gaps nor
+            removed joints; set `keep` below 1 to hide joints as in other methods.
         curriculum: share of training over which gaps widen, after its first twentieth; 0 for wide gaps from the start.
     """
 
@@ -136,7 +136,7 @@ class MotionInfilling(TrajectoryMethod):
 
 
 def start(model: InfillingModel, train: Windows) -> None:
-    """Set the network's mean and scale from 1024 windows, as the model sees them."""
+    """Set the mean and scale of a model's network from 1024 training windows, in the model's view."""
     data = model.read(train.sample(1024, torch.default_generator))
     model.generator[WHOLE].network.units.fit(interpolate_missing(data[WHOLE], data.mask()))
 
@@ -145,8 +145,8 @@ def start(model: InfillingModel, train: Windows) -> None:
 class RandomGaps:
     """Windows with given trajectories, where a curriculum hides a gap in time or the paths of some joints.
 
-    For each entry, batches contain the value of the curriculum from which on it is hidden. Hidden entries therefore
-    remain hidden as the curriculum rises.
+    Batches contain a threshold for each entry. The entry is hidden if the curriculum is at least at this threshold, so
+    hidden entries remain hidden as the curriculum rises.
 
     A gap of width w and position u, in a window of length 1, extends from u (1 - w) to u + (1 - u) w. Gaps at different
     u together cover the whole window. With increasing w, a gap grows to both sides.
@@ -193,7 +193,7 @@ class RandomGaps:
 
 
 class InfillingModel(TrajectoryModel):
-    """A model of one motion given its first pose and some trajectories; batches may hide parts of these."""
+    """A model that completes a motion from its first pose and some trajectories; batches may hide parts of them."""
 
     @property
     @override
@@ -219,7 +219,9 @@ class InfillingModel(TrajectoryModel):
 
 @dataclass(frozen=True)
 class Infiller:
-    """A sequence (B, T, D) from its first step s and y, with 0 where unknown, by convolutions over both axes.
+    """Network that completes a sequence (B, T, D) by convolutions over time and coordinates.
+
+    It reads the first step s and the given trajectories y, which are 0 where unknown.
 
     At each size, the image of all frames passes through two 3 x 3 convolutions with leaky ReLU. Pooling then halves it,
     rounding up, with at least two rows left. Any length is therefore possible.
@@ -231,7 +233,7 @@ class Infiller:
     maps: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> InfillerNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return InfillerNetwork(self, inputs, size)
 
 

@@ -188,7 +188,7 @@ class ChangeEncoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> ChangeEncoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return ChangeEncoderNetwork(self, inputs)
 
 
@@ -222,7 +222,7 @@ class StyleDecoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> StyleDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return StyleDecoderNetwork(self, inputs, size)
 
 
@@ -249,7 +249,7 @@ class StyleDecoderNetwork(FixedLengthNetwork):
         )
 
     def changed(self, style: Tensor, w: Tensor) -> Tensor:
-        """Return the new style (B, S)."""
+        """Return the new style (B, S), from the style of the past (B, S) and the latent w (B, D)."""
         inputs = torch.cat([normed(self.read(w)), style], -1)
         return normed(normed(self.out(normed(self.block(inputs)))) + style)
 

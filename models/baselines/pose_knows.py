@@ -59,7 +59,7 @@ class FutureFilter:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureFilterNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureFilterNetwork(self, inputs)
 
 

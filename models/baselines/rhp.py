@@ -49,7 +49,9 @@ class RHP(FutureMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.beta:
-            raise ValueError(f"beta is {self.beta}, but rhp's guide is its prior, so that the KL is 0; leave it out")
+            raise ValueError(
+                f"beta is {self.beta}, but rhp's guide is its prior, so that the KL is 0; leave `beta` at 0"
+            )
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -77,7 +79,7 @@ class PerturbedDecoder:
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> PerturbedDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return PerturbedDecoderNetwork(self, inputs, size)
 
 

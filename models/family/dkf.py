@@ -69,7 +69,7 @@ class GatedTransition(Network):
         return torch.cat([mean, functional.relu(proposal)], dim=-1)
 
     def _other_parents(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
-        """Return the parents other than z_{t-1}, (B, T, E)."""
+        """Return the parents other than z_{t-1}, concatenated to (B, T, E), for `batch` sequences of `length` steps."""
         empty = self.linear.weight.new_empty(batch, length, 0)
         return torch.cat(aligned([empty, *(parents[name] for name in self.others)]), -1)
 

@@ -285,17 +285,27 @@ class KalmanNetwork(Network):
 
     @torch.no_grad()
     def completed(self, a: Tensor, present: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Return a (B, T, D), with draws of p(a_t | all present a) at frames where `present` (B, T) is False."""
+        """Return a (B, T, D) with draws of p(a_t | all present a) at frames that are not encoded.
+
+        Args:
+            a: encoded frames (B, T, D).
+            present: (B, T), False at frames that are not encoded.
+            lengths: (B,) valid steps of a ragged batch.
+        """
         valid = None if lengths is None else valid_steps(lengths, a.shape[1]).t()
         chain, _, alpha = self.chain_of(a.transpose(0, 1), present.t(), valid)
         draws = self.emitted(chain.draw(torch.randn_like(chain.potential)), alpha).transpose(0, 1)
         return torch.where(present[..., None], a, draws.to(a.dtype))
 
     def emitted(self, z: Tensor, alpha: Tensor) -> Tensor:
-        """Return draws of a (T, B, D) given z_{1:T} (T, B, N), for missing frames.
+        """Return draws of a (T, B, D) given z_{1:T}, for missing frames.
 
         a_t is C_t z_t + N(0, R) and enters the mean of z_{t+1}. Matheron's rule corrects the unconditional draw by the
         residual of z_{t+1}.
+
+        Args:
+            z: (T, B, N).
+            alpha: weights of the matrices, (T, B, K).
         """
         transition, control, emission = self.mixed(alpha)
         noise, emission_noise = self.log_noise.exp(), self.log_emission.exp()
@@ -328,12 +338,25 @@ class KalmanNetwork(Network):
         return a, b, c
 
     def seen(self, emission: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the information matrix G (..., N, N) and the potential g (..., N) that a (..., D) gives about z."""
+        """Return the information about z in a: a Gaussian likelihood exp(g'z - z'Gz / 2) as G and g.
+
+        Args:
+            emission: C, (..., D, N).
+            a: (..., D).
+
+        Returns:
+            Information matrix G (..., N, N) and potential g (..., N).
+        """
         weighted = (emission * torch.exp(-self.log_emission)[:, None]).mT
         return weighted @ emission, (weighted @ a[..., None].double())[..., 0]
 
     def parts_of(self, mean: Tensor, covariance: Tensor, emission: Tensor) -> tuple[Tensor, Tensor]:
-        """Return location (..., D) and whitening matrix (..., D * D) of a_t from the moments of z_t."""
+        """Return location (..., D) and flat whitening matrix (..., D * D) of a_t.
+
+        Args:
+            mean, covariance: moments of z_t, (..., N) and (..., N, N).
+            emission: C_t, (..., D, N).
+        """
         loc = (emission @ mean[..., None])[..., 0]
         spread = emission @ covariance @ emission.mT + self.log_emission.exp().diag()
         return loc, InverseCholesky.apply(spread).flatten(-2)
@@ -352,7 +375,13 @@ class KalmanNetwork(Network):
         return features.to(self.A.dtype), state
 
     def ahead(self, state: Predicted, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Predicted:
-        """Return the prediction of step t from the prediction of step t-1 and from a_{t-1}."""
+        """Return the prediction of step t from the prediction of step t-1 and from a_{t-1}.
+
+        Args:
+            state: prediction of step t-1.
+            t: index of the step, from 0.
+            drawn: values (B, D) by step of the variables that a loop draws, by name; read if `state` has no given a.
+        """
         mean, covariance, emission = state.mean, state.covariance, state.emission
         values = drawn[self.inputs[0].name] if state.known is None else state.known
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)

@@ -81,7 +81,11 @@ class EnergyMethod(PoseMethod):
     heading: bool | None = None
 
     def start(self, model: EnergyModel, windows: Windows) -> None:
-        """Set the limits of the angles and the pose prior of a model.
+        """Estimate the angle limits of a model, and load or fit its pose prior.
+
+        Args:
+            model: model of this method, changed in place.
+            windows: training windows.
 
         Raises:
             ValueError: if the pose prior has another skeleton.
@@ -182,7 +186,12 @@ class EnergyModel(DynamicalVAE):
         return x if self.heading is None else self.heading.face(x)
 
     def positions(self, values: Mapping[str, Tensor], data: Batch) -> Batch:
-        """Return positions (..., B, T, D), rotated as the networks see them, from x or from all its parts."""
+        """Return positions (..., B, T, D), rotated as the networks see them.
+
+        Args:
+            values: x, or all parts of x by name, in the representation of the model.
+            data: batch as returned by `read`, with the bone lengths if the model reads directions of bones.
+        """
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
         return self.view.inverse(Batch(values) | lengths)
 

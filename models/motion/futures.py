@@ -201,6 +201,10 @@ class FedBackNetwork(Network):
         """Return the inputs known at each step, the pose before the first (B, D), and the first state (B, W).
 
         The inputs are (B, T, known), or (B, 1, known) if they are the same at all steps.
+
+        Args:
+            parents: values of the parents by name.
+            length: T.
         """
         raise NotImplementedError
 

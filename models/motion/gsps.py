@@ -138,9 +138,14 @@ class GSPS(EnergyMethod):
         return {name: self._spread(name, value) for name, value in super().preset(skeleton).items()}
 
     def _spread(self, name: str, value: Any) -> Any:
-        """Return the preset of two parts adapted to these parts.
+        """Return the preset value of an option for these parts, computed from the preset for two parts.
 
-        The number of futures does not increase, unless each part would have fewer than two draws.
+        The result has the mean of the preset for every part. For "draws", the number of futures does not exceed the
+        preset's, unless each part would have fewer than two draws.
+
+        Args:
+            name: name of the option.
+            value: preset for two parts, or a single value, which is returned unchanged.
         """
         count = len(self.parts)
         if not isinstance(value, tuple) or count == len(value):
@@ -228,7 +233,10 @@ class GSPSModel(EnergyModel):
         return super().guide(batch, **self._with_draws(batch, options))
 
     def _with_draws(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options, with several draws if the batch has whole windows, whose truth scores futures."""
+        """Return the options, with several draws if the batch has whole windows.
+
+        The energies compare these draws with the true future, which only whole windows contain.
+        """
         x = batch.get(WHOLE) if isinstance(batch, Mapping) else None
         is_complete = x is not None and x.shape[1] == self.length and options.get("length") is None
         return {**({"draws": self.draws} if is_complete else {}), **options}
@@ -348,7 +356,12 @@ class GSPSModel(EnergyModel):
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:
-    """Return the generative model of parts in this order; `observed` returns O for T steps."""
+    """Return the generative factorization of parts, each of which reads the parts before it.
+
+    Args:
+        parts: names of the parts, in the order of their prediction.
+        observed: function from the number of steps T to the number of observed steps O.
+    """
     text = " ".join(
         f"p({code}) p({name}_t | h_{{1:O}}, {''.join(f'{before}_{{1:T}}, ' for before in parts[:i])}{code})"
         for i, (code, name) in enumerate(zip(_codes(parts), parts, strict=True))

@@ -214,7 +214,13 @@ class MixAndMatchModel(DynamicalVAE):
 
 
 def _unrotated_positions(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
-    """Return positions (B, T, 3 J') of poses (B, T, D), with the root at the origin and without rotation."""
+    """Return positions (B, T, 3 J') of poses, with the root at the origin and without the root's rotation.
+
+    Args:
+        quaternions: poses (B, T, D), quaternions of the joints after the root's position, if there is one.
+        lengths: bone lengths of the bodies, as in batches.
+        view: conversion between quaternions and positions.
+    """
     root, start = view.turning.index(view.skeleton.root), 3 * view.root
     identity = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
     first = torch.zeros_like(quaternions[..., :start])
@@ -238,7 +244,7 @@ class FutureEncoder:
     noise: Noise | None
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureFilter(self.width).build(inputs, local, size) if local else FutureEncoderNetwork(self, inputs)
 
 
@@ -275,7 +281,7 @@ class FutureDecoder:
     velocity: bool
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureDecoderNetwork(self, inputs, size)
 
 

@@ -169,17 +169,25 @@ class MotionLatentModel(DynamicalVAE):
         return self.posterior(batch).mean  # type: ignore[no-any-return]
 
     def decode(self, latent: Tensor, shape: Tensor, frames: Tensor | None = None) -> Tensor:
-        """Return frames x (..., N, D), the means of chi, for latents (..., Z) on bodies (..., S), with gradients.
+        """Return decoded frames x (..., N, D), which are the means of chi, with gradients.
 
-        With `frames` (K,), only these frames are computed, (..., K, D).
+        Args:
+            latent: z, (..., Z).
+            shape: beta, shape parameters of the bodies, (..., S).
+            frames: (K,), indices of the frames to compute; the result is then (..., K, D). Default: all.
         """
         return self.decoder(latent, shape)(frames)
 
     def decoder(self, latent: Tensor, shape: Tensor) -> Callable[..., Tensor]:
-        """Return a decoder of latents (..., Z) on bodies (..., S); the part that all frames share is computed once.
+        """Return a function that decodes some frames; the computation that all frames share runs only once.
+
+        Args:
+            latent: z, (..., Z).
+            shape: beta, shape parameters of the bodies, (..., S).
 
         Returns:
-            A function of frames (K,), or None for all, and a slice of coordinates, by default all; see `decode`.
+            Function of frame indices (K,), None for all, and optionally a slice of the coordinates. It returns frames
+            as `decode` does.
         """
         network = self.generator[ROTATIONS].network
         parents = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
@@ -193,7 +201,12 @@ class MotionLatentModel(DynamicalVAE):
         return decode_frames
 
     def vertices(self, x: Tensor, shape: Tensor) -> Tensor:
-        """Return surfaces (..., N, V, 3), in metres, of frames (..., N, D) on bodies (..., S), with gradients."""
+        """Return surfaces (..., N, V, 3) in metres, with gradients.
+
+        Args:
+            x: frames (..., N, D).
+            shape: beta, shape parameters of the bodies, (..., S).
+        """
         return surfaces_of(self.timed, self.body, x, shape)
 
     @override

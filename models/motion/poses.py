@@ -17,7 +17,12 @@ from ..method import Method
 
 
 def table(options: str, rows: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
-    """Return the presets of each skeleton as {option: value}, from one text of option names and rows of values."""
+    """Return the presets of each skeleton as dictionaries from option to value.
+
+    Args:
+        options: names of the options, separated by spaces.
+        rows: dictionary from skeleton to the values of these options, in the same order.
+    """
     return {skeleton: dict(zip(options.split(), values, strict=True)) for skeleton, values in rows.items()}
 
 

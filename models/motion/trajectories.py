@@ -54,8 +54,9 @@ class TrajectoryMethod(PoseMethod):
         keep: probability that a joint is given, in training.
         rotate: whether to rotate every training window about the up axis by a uniform angle.
         heading: whether to rotate every window so that its first pose faces one way, and rotate the motion back. The
-            model is then exactly equivariant, and `rotate` has no effect. By default off for Human3.6M, as in the
-            paper, whose network has to learn it, and on for other skeletons with known left and right.
+            model is then exactly equivariant to rotations, and `rotate` has no effect. By default off for Human3.6M, as
+            in the paper, where the network learns this from rotated windows, and on for other skeletons with known left
+            and right.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
@@ -128,7 +129,7 @@ class LatentTrajectoryMethod(TrajectoryMethod):
 
     Args:
         beta: weight of the KL, relative to squared errors in square metres.
-        complement: whether the guide reads only the joints that are not given.
+        complement: whether the guide reads only the joints that are not given; otherwise it reads all joints.
     """
 
     trainings: ClassVar[Mapping[str, Training]] = {
@@ -273,7 +274,7 @@ class TrajectoryModel(DynamicalVAE):
         if self.frames is not None and horizon > self.frames:
             warnings.warn(
                 f"this model was fitted to motions of {self.frames} frames, and may predict {horizon} frames badly; "
-                "reduce the horizon, or fit the model under a protocol that predicts as many",
+                f"reduce the horizon, or fit the model under a protocol with a horizon of {horizon} frames",
                 stacklevel=3,  # torch.no_grad is between
             )
         length = data[GIVEN].shape[1]
@@ -299,6 +300,10 @@ class TrajectoryModel(DynamicalVAE):
 
     def _extend_paths(self, data: Batch, horizon: int) -> Batch:
         """Return the data with trajectories over all frames that the networks predict for a horizon.
+
+        Args:
+            data: batch as returned by `read`, with the first pose (B, D).
+            horizon: H, number of frames that are requested.
 
         Raises:
             ValueError: if trajectories end before the horizon or do not have the size of the poses.
@@ -398,8 +403,8 @@ class TrajectoryModel(DynamicalVAE):
             known_mask[:, joint] = is_known[:, None].double()
             if not targets[:, joint].any():
                 warnings.warn(
-                    f"the path of {self.skeleton.names[joint]} stays at the root of the first pose, and networks "
-                    "read it as no path; exact=True keeps the joint there",
+                    f"the path of {self.skeleton.names[joint]} stays at the root of the first pose, where its input "
+                    "is 0, so networks treat it as a joint without a path; exact=True keeps the joint there",
                     stacklevel=2,
                 )
         first = (pose - world).flatten()[None]
@@ -448,7 +453,14 @@ class TrajectoryModel(DynamicalVAE):
     def _follow(
         self, batch: Mapping[str, Tensor], latents: Tensor, known_mask: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor]:
-        """Return motions (S, T, D) that are on the given paths at known frames, and their corrections."""
+        """Return motions (S, T, D) that are on the given paths at known frames, and their corrections (S, T, D).
+
+        Args:
+            batch: first pose and trajectories, with one row.
+            latents: initial values of the latents of S motions.
+            known_mask: (T, D), 1 where a coordinate is given, otherwise 0.
+            **options: options of `dvae.motion.control.follow_paths`.
+        """
         data = self._extend_paths(self.read(batch), len(known_mask))
         known_mask = torch.cat(
             [known_mask, known_mask.new_zeros(data[GIVEN].shape[1] - len(known_mask), known_mask.shape[1])]

@@ -210,14 +210,14 @@ def changed(name, change):
     ("change", "message"),
     [
         (lambda members: members.pop("weights"), "it has no weights"),
-        (changed("v_template", lambda a: a + np.float32(np.nan)), "v_template holds numbers that are NaN"),
+        (changed("v_template", lambda a: a + np.float32(np.nan)), "v_template has values that are NaN"),
         (changed("shapedirs", lambda a: 1e30 * a), "beyond 1000"),
-        (changed("shapedirs", lambda a: a[..., :2]), "2 parameters of shape, not 8"),
+        (changed("shapedirs", lambda a: a[..., :2]), "2 shape parameters, so `shapes` must be from 1 to 2, got 8"),
         (changed("f", lambda a: a - 1), "refers to an index that does not exist"),
         (changed("f", lambda a: a.astype(float)), "expected whole numbers"),
-        (changed("weights", lambda a: 2 * a), "must be shares that add up to 1"),
+        (changed("weights", lambda a: 2 * a), "each row of weights must sum to 1"),
         (changed("J_regressor", lambda a: np.array({"sparse": 1})), "pickled objects"),
-        (changed("kintree_table", lambda a: a[:, ::-1]), "its tree is not SMPL's"),
+        (changed("kintree_table", lambda a: a[:, ::-1]), "kintree_table is not SMPL's joint tree"),
         (changed("kintree_table", lambda a: a[:, :5]), "expected whole numbers"),
     ],
 )
