@@ -111,7 +111,7 @@ def axis_names(metadata: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:
-    """Return the unit of every named column of x; empty if the windows have no column names."""
+    """Return a dictionary from column of x to unit of measurement; empty if the columns have no names."""
     columns: Mapping[str, str] = windows.description.get("columns", {})
     return columns
 

@@ -138,8 +138,8 @@ class DynamicalVAE(nn.Module):
         for name in self.shared:
             if name not in self.context or self.generative.local(name) or self.inference.local(name):
                 raise ValueError(
-                    f"{name} must be static context to be drawn once for all sequences: a parent without a "
-                    f"factor, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
+                    f"only static context can be drawn once for all sequences, and {name} is not: it must be a parent "
+                    f"without a factor, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
                 )
         self.grouped = tuple(grouped)
         self._check_grouped()

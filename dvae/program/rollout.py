@@ -61,7 +61,9 @@ class ScheduledSampling:
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1) or self.start < 0:
-            raise ValueError(f"expected a probability in [0, 1], at least one pass and a start from 0, got {self}")
+            raise ValueError(
+                f"expected a probability in [0, 1], at least one pass and a start of at least 0, got {self}"
+            )
         if self.blocks is not None and (len(self.blocks) != 2 or min(self.blocks) < 1):
             raise ValueError(f"blocks must be numbers of kept and of replaced steps, at least 1, got {self.blocks}")
 

@@ -209,7 +209,7 @@ class Ablation(Result):
 
     @property
     def _frame(self) -> str:
-        """Word for a time step, such as "frame", the unit of bounds; "" without fits."""
+        """Word for a time step in units of bounds, such as "frame" in nats per frame; "" without fits."""
         return axis_names(self.comparison.data)[1] if self.comparison is not None else ""
 
     @property

@@ -144,7 +144,7 @@ def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], li
             raise ValueError(f"each.{option} has a value twice: {reprlib.repr(values)}")
         count *= len(values)
     if count > limit:
-        raise ValueError(f"{count} more methods exceed the maximum of {MOST} in a grid; leave some values out")
+        raise ValueError(f"{count} more methods would exceed the maximum of {MOST} in a grid; leave some values out")
     methods = {}
     for values in product(*variations.values()):
         varied = dict(zip(variations, values, strict=True))

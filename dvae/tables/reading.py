@@ -57,8 +57,8 @@ LARGEST_HEADER = 2**20
 def read_frame(path: str | os.PathLike[str]) -> Any:
     """Read a CSV, TSV, Parquet or npz file as a pandas frame; cells of CSV and TSV are text, empty ones missing.
 
-    An npz contains an array (N, T, D), or (T, D) of one sequence, named "x" or as the only one, and optionally
-    "lengths" (N,). Its columns are x0, x1, …, "sequence" and "step".
+    An npz contains an array (N, T, D), or (T, D) for one sequence, and optionally "lengths" (N,). The array is named
+    "x", or it is the only one besides "lengths". Its columns are x0, x1, …, "sequence" and "step".
 
     Raises:
         FileNotFoundError: if the file does not exist.

@@ -118,7 +118,7 @@ class SequenceELBO(ELBO):
         return draws[0] if len(draws) == 1 else _mean(draws)
 
     def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
-        """Return minus the bound plus the energies, summed over the batch."""
+        """Return the energies minus the bound, summed over the batch."""
         draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
         return sum(sum(t.energies.values()) - t.bound for t in draws).sum() / self.num_particles  # type: ignore[return-value, union-attr]
 

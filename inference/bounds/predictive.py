@@ -71,7 +71,7 @@ def predictive_bound(
         if particles < 1 or not first <= observed < length:
             context_frames = model.view.past
             raise ValueError(
-                f"particles must be at least 1, and observed from {context_frames + first} to "
+                f"`particles` must be at least 1, and `observed` must be from {context_frames + first} to "
                 f"{context_frames + length - 1}; got particles={particles} and observed={context_frames + observed}"
             )
         log_det = torch.zeros(size, length) if data.log_det is None else data.log_det

@@ -92,10 +92,10 @@ class Correction:
     """Correction of a conditional of the guide at S steps (1 for a static latent), for B sequences.
 
     Args:
-        unit: standard deviations (B, S, D).
+        unit: standard deviations (B, S, D) of the guide before the correction.
         shift: shift (B, S, D) of the location, in units.
         stretch: shift (B, S, D) of the logarithm of the scale.
-        links: links to latents that are read.
+        links: linear terms by which the location depends on draws of other latents, one for each latent.
     """
 
     unit: Tensor

@@ -12,8 +12,8 @@ is the resulting pair:
 
     p(a_t | a_{<t}) p(x_t | a_t)        q(a_t | x_t)
 
-p(a_t | a_{<t}) is the prediction of the Kalman filter. Its KL divergence is analytic, whereas the paper draws z, and
-forecasts propagate the whole distribution of z_t. `smooth` returns the posterior of z. The guide reads only x_t,
+p(a_t | a_{<t}) is the prediction of the Kalman filter. Its KL divergence is analytic, and forecasts propagate the whole
+distribution of z_t; the paper draws z. `smooth` returns the posterior of z. The guide reads only x_t,
 whereas the posterior of a_t also depends on the past a_{<t} and on later frames.
 
 A frame without any observed entry is not encoded: its a_t is integrated out like z, and contributes nothing to filter

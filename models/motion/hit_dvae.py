@@ -302,7 +302,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             return super().objective()
         if self.diversity is None or self.kl_local is None or self.kl_static is None or self.samples is None:
             raise ValueError(
-                "the weights depend on the skeleton; call method.resolve_defaults(windows) first, or use "
+                "the weights of the loss depend on the skeleton; call method.resolve_defaults(windows) first, or use "
                 "loss='evidence' for data that are not poses"
             )
         weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}

@@ -178,7 +178,7 @@ class Body(nn.Module):
         """Return the mean squared distance over vertices between two motions of the same bodies, (..., T) in m².
 
         Vertices are linear in the joint transforms, so the error is a quadratic form in 4 J numbers, and vertices are
-        never computed. With P and P' the transforms of two poses and S the surface: |P S - P' S|² = tr (P - P') S S^T
+        never computed. With P and P' the transforms of two poses and V the surface: |P V - P' V|² = tr (P - P') V V^T
         (P - P')^T.
 
         Args:

@@ -215,7 +215,7 @@ class AngleModel(nn.Module):
 
         Args:
             batch: batch of `Angles`, with the observed frames of B windows.
-            horizon: number of times; ignored, because `angles` gives the times.
+            horizon: ignored; the times are those of the `Angles` that this object was built for.
             samples: S, number of futures of each window.
             options: further arguments of the model's `forecast`.
         """

@@ -45,15 +45,16 @@ class Cycles:
     """Definition of a gait cycle.
 
     Args:
-        threshold: maximum cost of a subsequence in radians, i.e. mean distance of the hips along the warping path. It
-            also bounds the distance between first and last pose. This excludes half cycles, which end with the other
-            foot in front.
+        threshold: maximum mean angle in radians between the hips of a cycle and those of the reference, after their
+            time warping. It also bounds the distance between first and last pose. This excludes half cycles, which
+            end with the other foot in front.
         shortest, longest: minimum and maximum duration in seconds.
         overlap: maximum overlap of two cycles with the same starting foot, as a fraction of the shorter one.
         rate: frames per second of the comparison.
         swing: minimum standard deviation of the angle between the thighs in radians; motion below it is no gait.
-        regular: minimum regularity of a clip that provides references, from 0 to 2. The regularity is the
-            autocorrelation of the angle between the thighs at a cycle, minus its autocorrelation at half a cycle.
+        regular: minimum regularity of a clip from which references are taken, from 0 to 2; 2 is a periodic motion. The
+            regularity is the autocorrelation of the angle between the thighs at a lag of one cycle, minus that at half
+            a cycle.
     """
 
     threshold: Amount = 0.25
@@ -294,7 +295,7 @@ def _resting(skeleton: Skeleton) -> torch.Tensor:
 def _legs(skeleton: Skeleton) -> list[list[int]]:
     """Return the indices of joints of the left and the right leg, from the child of the root to the hip and the knee.
 
-    The hip is the lowest joint at rest where the joints of this side begin.
+    Arm and leg of a side both begin at the trunk; the hip is the lowest of these first joints in the rest pose.
     """
     rest, legs = _resting(skeleton), []
     for leaving in skeleton.sides:
