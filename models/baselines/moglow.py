@@ -19,7 +19,8 @@ choices were not applicable or worked less well:
   dropout.
 * There is no control signal; covariates of a table are read as in other methods.
 * Location and scale before the flow also read h_t, and the location keeps a share of x_{t-1} (`residual`). In the paper
-  only couplings read the past, and the flow returns the pose, not its change. The baseline of TrajeVAE adds its draw to the last pose.
+  only couplings read the past, and the flow returns the pose, not its change. The baseline of TrajeVAE adds its draw
+  to the last pose.
 * A coupling multiplies by a factor between exp(-`bound`) and exp(`bound`), in the paper by sigmoid(k + 2) + 1e-6. Draws
   divide by this factor. With a bound of 2, one in nine draws left the range of the data and never returned (bandai2's
   tuning split, docs/results/tuning.md).

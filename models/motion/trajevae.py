@@ -58,8 +58,8 @@ class TrajeVAE(LatentTrajectoryMethod):
         heads_count: number of attention heads.
         layers: layers of each transformer.
         dropout: share of units dropped in training.
-        learned_prior: whether to learn the prior p(z_t | y_{1:T}, s); otherwise p(z) = N(0, I), and the decoder reads the
-            trajectories y.
+        learned_prior: whether to learn the prior p(z_t | y_{1:T}, s); otherwise p(z) = N(0, I), and the decoder reads
+            the trajectories y.
         cosine: whether to use the cosine transform; otherwise z has one value for each frame.
     """
 
