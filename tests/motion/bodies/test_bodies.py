@@ -211,7 +211,7 @@ def changed(name, change):
     [
         (lambda members: members.pop("weights"), "it has no weights"),
         (changed("v_template", lambda a: a + np.float32(np.nan)), "v_template has values that are NaN"),
-        (changed("shapedirs", lambda a: 1e30 * a), "beyond 1000"),
+        (changed("shapedirs", lambda a: 1e30 * a), "above 1000"),
         (changed("shapedirs", lambda a: a[..., :2]), "2 shape parameters, so `shapes` must be from 1 to 2, got 8"),
         (changed("f", lambda a: a - 1), "refers to an index that does not exist"),
         (changed("f", lambda a: a.astype(float)), "expected whole numbers"),
