@@ -45,8 +45,8 @@ def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
 def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: Tensor | None = None) -> Tensor:
     """Return Euclidean distances `(N, M)` between `(N, D)` and `(M, D)`.
 
-    With missing coordinates, the mean square over the common ones is scaled to all of them. Points without a common
-    coordinate are infinitely far apart.
+    If coordinates are missing, the mean squared difference over the coordinates that both points have is multiplied by
+    D. Points without a common coordinate are infinitely far apart.
 
     Args:
         first, second: points, with any value at a missing coordinate.
@@ -164,7 +164,7 @@ def nearest_neighbours(
 
 @dataclass(frozen=True)
 class References:
-    """Forecasters without a model. `references["mean"]` is the number of forecasts of "mean", and its `Forecaster`.
+    """Forecasters without a model. Indexing by name returns the number of forecasts per window, and the `Forecaster`.
 
     | name | forecasts | needs |
     |---|---|---|
@@ -174,7 +174,8 @@ class References:
     | climatology | K futures of training windows, drawn at random for each window | training windows |
     | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
 
-    Windows may rename some of them by `windows.references`, {new name: name}, which are then the default rows.
+    Windows may rename some references by `windows.references`, {new name: name}. The renamed ones are then the default
+    rows.
 
     All but the last two are point forecasts: their energy score is a distance, their CRPS an absolute error, and they
     have no intervals. Climatology is the distribution of futures without knowledge of the past.
@@ -222,7 +223,7 @@ class References:
 
     @property
     def usual(self) -> list[str]:
-        """Available default rows of an evaluation: the names in the windows, or else all rows."""
+        """Available default rows of an evaluation: from `windows.references`, or else all of `USUAL`."""
         return [name for name in self._names or USUAL if not self.missing_requirement(name)]
 
     @property

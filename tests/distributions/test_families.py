@@ -197,7 +197,7 @@ def test_an_event_in_a_product_counts_once_and_cannot_be_partly_missing():
     data = model.sample(4, 5)
     mask = torch.ones_like(data["x"], dtype=torch.bool)
     mask[0, :, [0, 2]] = False
-    with pytest.raises(ValueError, match="together"):
+    with pytest.raises(ValueError, match="one joint density for 2 of them"):
         model.log_joint({"x": data["x"], "mask": mask.index_fill(2, torch.tensor([2]), True)}, {"z": data["z"]})
     complete = model.log_joint({"x": data["x"]}, {"z": data["z"]})["x"]
     masked = model.log_joint({"x": data["x"], "mask": mask}, {"z": data["z"]})["x"]
