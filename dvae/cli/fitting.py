@@ -263,7 +263,8 @@ def sweep(
         model: options of all methods, in place of their defaults.
         training: options of the runs; `dvae show METHOD` prints the defaults of each method.
         source: data to fit to.
-        grid: TOML file of named equations and methods, each with its options and their values; see docs/how-to/sweeps_and_studies.md.
+        grid: TOML file of named equations and methods, each with its options and their values; see
+            docs/how-to/sweeps_and_studies.md.
         seeds: seeds of initial weights, batches and draws, one run for each; by default the seeds of the grid, or 0, 1
             and 2.
         latent: sizes of z, one run for each.

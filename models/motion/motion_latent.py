@@ -21,8 +21,8 @@ no detail:
 * GradNorm makes these gradients equal (asymmetry 0), because log-likelihoods have no zero as a reference for their
   decrease.
 
-The learning rate of the second phase and its share of the steps suit short runs (benchmarks/results/motion_latent_4d); the paper has 1e-4
-and 200 of 5200 epochs.
+The learning rate of the second phase and its share of the steps suit short runs
+(benchmarks/results/motion_latent_4d); the paper has 1e-4 and 200 of 5200 epochs.
 """
 
 from __future__ import annotations
