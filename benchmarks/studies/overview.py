@@ -15,7 +15,7 @@ import dvae
 from dvae.motion.drawing.plot import futures
 from dvae.motion.scoring.metrics import average_displacement_error
 
-from .pages import DOCS
+from .results import DOCS
 
 
 def main(out: Path = DOCS / "img" / "overview.png", steps: int = 6000, clips: int = 400) -> None:
