@@ -16,6 +16,7 @@ from sphinx.application import Sphinx  # noqa: E402
 from sphinx.transforms import SphinxTransform  # noqa: E402
 
 import dvae  # noqa: E402
+from benchmarks.studies import results  # noqa: E402
 from dvae.cli.app import COMMANDS  # noqa: E402
 
 project, author = "dvae", "The dvae authors"
@@ -27,6 +28,7 @@ html_theme = "furo"
 html_title = f"dvae {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_js_files = ["sort.js"]
 html_theme_options = {"navigation_with_keys": True}
 templates_path = ["_templates"]
 
@@ -42,12 +44,24 @@ for name in ("CONTRIBUTING", "CHANGELOG"):
 
 # The page of the command line is the help of its commands.
 help_of = {"COLUMNS": "110", "NO_COLOR": "1", "PYTHONPATH": str(ROOT)}
-parts = ["# Command line\n\nLook up the arguments of each command; `--help-all` lists all options of `fit` and `sweep`.\n"]
+parts = ["# Command line\n\nLook up the arguments of a command; `--help-all` lists all options of `fit` and `sweep`.\n"]
 for name in COMMANDS:
     program = [sys.executable, "-c", "import dvae.cli as c; c.main()", *name.split(), "--help"]
     printed = subprocess.run(program, env=os.environ | help_of, capture_output=True, text=True, check=True).stdout
     parts.append(f"\n## dvae {name}\n\n```text\n{printed.strip()}\n```\n")
 (ROOT / "docs" / "reference" / "command_line.md").write_text("".join(parts), encoding="utf-8")
+
+# The appendix has all tables of results, each subject below the text of its README.
+parts = [
+    "# All results\n\nClick on the head of a column to sort a table. `benchmarks/results` contains all tables as CSV.\n"
+]
+for readme in sorted(results.RESULTS.glob("*/README.md")):
+    parts.append("\n#" + readme.read_text(encoding="utf-8"))
+    for file in sorted(readme.parent.glob("*.csv")):
+        table = results.read(f"{readme.parent.name}/{file.stem}")
+        parts.append(f"\n### {readme.parent.name}/{file.stem}\n\n{table.note}\n\n")
+        parts.append(f"```{{table}}\n:class: sortable\n\n{table.markdown()}```\n")
+(ROOT / "docs" / "results" / "appendix.md").write_text("".join(parts), encoding="utf-8")
 
 # Notebooks run in a temporary folder with this tree's code, and again only after a change.
 os.environ.update(PYTHONPATH=str(ROOT), OMP_NUM_THREADS="1", PYTHONWARNINGS="ignore:IProgress not found")
@@ -66,7 +80,7 @@ napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 suppress_warnings = ["ref.python"]  # names of two classes
 
-# Docstrings are plain text with `code`, *emphasis*, examples and indented blocks; this converts them to reStructuredText.
+# Docstrings are plain text with `code`, *emphasis*, examples and indented blocks, converted here to reStructuredText.
 _MARKS = re.compile(
     r"`([^`]+)`(?=(\w)?)|(^ *\* |(?<![\w*])\*(?! )[^*]+(?<! )\*(?!\w))|([*|\\])|(_)(?!\w)", re.MULTILINE
 )
@@ -102,6 +116,7 @@ class LinkNames(SphinxTransform):
     default_priority = 5
 
     def apply(self, **_: object) -> None:
+        """Replace the names by links."""
         for literal in list(self.document.findall(nodes.literal)):
             name = literal.astext().partition("(")[0]
             if not re.fullmatch(r"dvae(\.\w+)+", name) or isinstance(literal.parent, nodes.reference | nodes.title):

@@ -45,7 +45,9 @@ def test_printed_results_are_those_in_comments(capsys, tmp_path, monkeypatch):
 COMMANDS = {
     f"{path.stem}: {line}": line
     for path in [*PAGES, ROOT / "README.md"]
-    for block in re.findall(r"^```console\n(.*?)^```|((?:^    dvae .*\n)+)", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    for block in re.findall(
+        r"^```console\n(.*?)^```|((?:^    dvae .*\n)+)", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
     for line in "".join(block).replace("\\\n", " ").splitlines()
     if line.strip().startswith("dvae ") and "…" not in line
 }
