@@ -118,8 +118,8 @@ class LinkNames(SphinxTransform):
     def apply(self, **_: object) -> None:
         """Replace the names by links."""
         for literal in list(self.document.findall(nodes.literal)):
-            name = literal.astext().partition("(")[0]
-            if not re.fullmatch(r"dvae(\.\w+)+", name) or isinstance(literal.parent, nodes.reference | nodes.title):
+            name, linked = literal.astext().partition("(")[0], nodes.reference | nodes.title | pending_xref
+            if not re.fullmatch(r"dvae(\.\w+)+", name) or isinstance(literal.parent, linked):
                 continue
             link = pending_xref("", refdomain="py", reftype="obj", reftarget=name, refexplicit=True, refwarn=False)
             literal.replace_self(link)
