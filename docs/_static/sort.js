@@ -1,24 +1,24 @@
-// Sorts tables of the class "sortable" by the first number of each cell; names, and cells without a number, by their text.
+// Sort tables of the class "sortable": names by their text, other columns by the first number of a cell; without one, last.
 document.addEventListener("DOMContentLoaded", () => {
-  const number = (cell) => Number(cell.textContent.replace(/(\d),(?=\d{3})/g, "$1").match(/-?\d*\.?\d+(e-?\d+)?/)?.[0] ?? NaN);
-  const compare = (a, b, column) => {
-    const [first, second] = [a.cells[column], b.cells[column]];
-    const difference = column ? number(first) - number(second) : NaN;
-    return Number.isNaN(difference) ? first.textContent.localeCompare(second.textContent) : difference;
-  };
+  const number = (text) => Number(text.replace(/(\d),(?=\d{3})/g, "$1").match(/-?\d*\.?\d+(e-?\d+)?/)?.[0] ?? NaN);
   for (const head of document.querySelectorAll("table.sortable th")) {
     const button = document.createElement("button");
     button.type = "button";
     button.append(...head.childNodes);
-    head.append(button);
     button.setAttribute("aria-label", `Sort by ${button.textContent.trim() || "name"}`);
+    head.append(button);
     button.addEventListener("click", () => {
-      const order = head.getAttribute("aria-sort") === "ascending" ? "descending" : "ascending";
+      const sign = head.getAttribute("aria-sort") === "ascending" ? -1 : 1;
+      const compare = (first, second) => {
+        const texts = [first, second].map((row) => row.cells[head.cellIndex].textContent);
+        const [x, y] = head.cellIndex ? texts.map(number) : [NaN, NaN];
+        if (Number.isNaN(x) && Number.isNaN(y)) return sign * texts[0].localeCompare(texts[1]);
+        return Number.isNaN(x) - Number.isNaN(y) || sign * (x - y);
+      };
       head.parentNode.querySelectorAll("th").forEach((other) => other.removeAttribute("aria-sort"));
-      head.setAttribute("aria-sort", order);
+      head.setAttribute("aria-sort", sign > 0 ? "ascending" : "descending");
       const body = head.closest("table").tBodies[0];
-      const rows = [...body.rows].sort((a, b) => compare(a, b, head.cellIndex));
-      body.append(...(order === "ascending" ? rows : rows.reverse()));
+      body.append(...[...body.rows].sort(compare));
     });
   }
 });
