@@ -1,13 +1,13 @@
 """Fill the tables of docs/results from benchmarks/results, as the file cards.toml says.
 
-    [hit_dvae.main]                     # between the marks of the table "main" in docs/results/hit_dvae.md
-    source = "index/bandai2-by-style"
-    rows = ["hit-dvae", "bom"]          # by the first column, in this order; without it, all rows;
-                                        # or { "HiT-DVAE" = "hit-dvae" }: name in the card = name in the source
-    where = { given = "2" }             # optional: only rows with these cells
-    columns = { "ADE (m) ↓" = "ADE" }   # header in the card = header in the source
+    [hit_dvae.main]                       # between the marks of the table "main" in docs/results/hit_dvae.md
+    source = "hit_dvae/scores"            # or several: a cell is from the first one with its row and column
+    rows = ["hit-dvae", "gsps"]           # by their first cells; without it, all rows
+    columns = { "ADE (m) ↓" = "ADE" }     # header in the card = header in the source, arrows apart
 
-A cell has one error, the total: of `score ± a ± b` it is the root of a² + b².
+Rows may be named: { "4 paths" = ["trajevae", "4"] } is the row that begins with these cells. A column may have a source
+of its own: { "CMU" = ["index/cmu8", "ADE"] }. A cell has one error, the total: of `score ± a ± b` it is the root of
+a² + b². A column has the fewest decimals of its cells.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import math
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import tyro
@@ -27,44 +26,65 @@ from .results import DOCS, Table, read
 CARDS = settings(__file__)
 
 
-def with_total(cell: str) -> str:
-    """Return a cell with the total of its errors, in the decimals of the score; unknown if one of them is."""
+def with_total(cell: str, decimals: int) -> str:
+    """Return a cell with at most so many decimals and the total of its errors; unknown if one of them is."""
     score, *errors = cell.split(" ± ")
-    if not errors:
-        return cell
-    unit = "%" * score.endswith("%")
-    if "–" in errors:
-        return f"{score} ± –"
-    total = math.hypot(*(float(error.removesuffix("%")) for error in errors))
-    decimals = len(score.removesuffix("%").partition(".")[2])
-    return f"{float(score.removesuffix('%')):.{decimals}f}{unit} ± {total:.{decimals}f}{unit}"
+    number = score.removesuffix("%")
+    unit = "%" * (number != score)
+    if len(number.partition(".")[2]) > decimals:
+        score = f"{float(number):.{decimals}f}{unit}"
+    if not errors or "–" in errors:
+        return " ± ".join([score, *errors[-1:]])
+    return f"{score} ± {math.hypot(*(float(error.removesuffix('%')) for error in errors)):.{decimals}f}{unit}"
+
+
+def aligned(cells: Sequence[str]) -> list[str]:
+    """Return the cells of a column with the decimals that all numbers have."""
+    numbers = [re.fullmatch(r"-?\d*\.(\d+)%?", cell.partition(" ± ")[0]) for cell in cells]
+    decimals = min((len(number[1]) for number in numbers if number), default=0)
+    return [with_total(cell, decimals) if number else cell for cell, number in zip(cells, numbers, strict=True)]
+
+
+def found(source: str, row: Sequence[str], column: str) -> str | None:
+    """Return the cell of a source; None if it has no such row or no such column.
+
+    Raises:
+        ValueError: several rows begin with these cells.
+    """
+    table = read(source)
+    names = [name.rstrip(" ↓↑") for name in table.header]
+    rows = [cells for cells in table.rows if cells[: len(row)] == [*row]]
+    if len(rows) > 1:
+        raise ValueError(f"{source} has {len(rows)} rows {', '.join(row)}; add their next cells")
+    return rows[0][names.index(column)] if rows and column in names else None
 
 
 def card(
-    source: str,
-    columns: Mapping[str, str],
-    rows: Sequence[str] | Mapping[str, str] = (),
-    where: Mapping[str, str] = MappingProxyType({}),
+    columns: Mapping[str, str | Sequence[str]],
+    rows: Sequence[str] | Mapping[str, str | Sequence[str]] = (),
+    source: str | Sequence[str] = (),
 ) -> Table:
     """Return a table of a card.
 
     Raises:
-        ValueError: the source has no such row or column, or several such rows.
+        ValueError: no source has a row or a column.
     """
-    table = read(source)
-    if missing := {*columns.values(), *where} - {*table.header}:
-        raise ValueError(f"{source} has no columns {sorted(missing)}; columns: {', '.join(table.header[1:])}")
-    lines = [dict(zip(table.header, row, strict=True)) for row in table.rows]
-    lines = [line for line in lines if all(line[name] == value for name, value in where.items())]
-    names = [line[table.header[0]] for line in lines]
-    cells = []
-    labels = rows if isinstance(rows, Mapping) else {row: row for row in rows or names}
-    for label, row in labels.items():
-        if names.count(row) != 1:
-            raise ValueError(f"{source} has {names.count(row)} rows {row!r}, expected one; rows: {', '.join(names)}")
-        line = lines[names.index(row)]
-        cells.append([label, *(with_total(line[name]) for name in columns.values())])
-    return Table(["", *columns], cells)
+    sources = [source] if isinstance(source, str) else source
+    rows = rows or [line[0] for line in read(sources[0]).rows]
+    named = rows if isinstance(rows, Mapping) else {row: row for row in rows}
+    made = []
+    for where in columns.values():
+        tables, column = (sources, where) if isinstance(where, str) else ([where[0]], where[1])
+        cells = [
+            [found(table, [row] if isinstance(row, str) else row, column) for table in tables] for row in named.values()
+        ]
+        made.append([next((cell for cell in each if cell is not None), "") for each in cells])
+    lines = dict(zip(named, zip(*made, strict=True), strict=True))
+    for what, lists in ("row", lines), ("column", dict(zip(columns, made, strict=True))):
+        if missing := [name for name, cells in lists.items() if not any(cells)]:
+            raise ValueError(f"no source has the {what} {', '.join(missing)}")
+    shown = zip(*([cell or "–" for cell in aligned(cells)] for cells in made), strict=True)
+    return Table(["", *columns], [[name, *cells] for name, cells in zip(named, shown, strict=True)])
 
 
 def filled(page: str, tables: Mapping[str, Any]) -> str:

@@ -10,32 +10,35 @@ WORDS = {"index": 800, "speed": 400}
 
 
 @pytest.mark.parametrize(
-    ("cell", "shown"),
+    ("cells", "shown"),
     [
-        ("0.240 ± 0.003 ± 0.004", "0.240 ± 0.005"),
-        ("-.28 ± .12", "-0.28 ± 0.12"),
-        ("26.9% ± 4.5%", "26.9% ± 4.5%"),
-        ("4.3 ± 0.7 ± –", "4.3 ± –"),
-        ("1,834", "1,834"),
-        ("z 0.20, 3", "z 0.20, 3"),
-        ("–", "–"),
+        (["0.240 ± 0.003 ± 0.004", "0.5 ± 0.26"], ["0.2 ± 0.0", "0.5 ± 0.3"]),
+        (["-.28 ± .12", "0"], ["-.28 ± 0.12", "0"]),
+        (["26.9% ± 4.5%"], ["26.9% ± 4.5%"]),
+        (["4.3 ± 0.7 ± –", "–"], ["4.3 ± –", "–"]),
+        (["1,834", "z 0.20, 3", "at most 1.2"], ["1,834", "z 0.20, 3", "at most 1.2"]),
     ],
 )
-def test_a_cell_has_the_total_error(cell, shown):
-    assert cards.with_total(cell) == shown
+def test_cells_have_the_total_error_and_the_same_decimals(cells, shown):
+    assert cards.aligned(cells) == shown
 
 
 def test_a_card_has_the_named_rows_and_columns():
-    columns = {"ADE (m) ↓": "ADE"}
-    table = cards.card("trajevae/scores", columns, {"ours": "trajevae"}, {"given": "2"})
-    assert table.header == ["", "ADE (m) ↓"]
-    ((name, cell),) = table.rows
-    assert name == "ours"
-    assert cell.count("±") == 1
-    with pytest.raises(ValueError, match="has 5 rows 'trajevae', expected one"):
-        cards.card("trajevae/scores", columns, ["trajevae"])
-    with pytest.raises(ValueError, match=r"has no columns \['ADF'\]; columns: .*ADE"):
-        cards.card("trajevae/scores", {"ADF": "ADF"})
+    """A row is named by its first cells, a column by its name without an arrow."""
+    rows = {"two paths": ["trajevae", "2"], "neighbours": "nearest neighbours"}
+    columns = {"ADE (m) ↓": "ADE", "KL": ["family/teacher-forced", "ELBO"]}
+    with pytest.raises(ValueError, match="no source has the column KL"):
+        cards.card(columns, rows, "trajevae/scores")
+    columns["KL"] = ["family/free-running", "energy score"]
+    table = cards.card(columns, rows | {"dkf": "dkf"}, ["family/free-running", "trajevae/scores"])
+    assert table.header == ["", "ADE (m) ↓", "KL"]
+    assert [row[0] for row in table.rows] == ["two paths", "neighbours", "dkf"]
+    assert [row[1].count("±") for row in table.rows] == [1] * 3
+    assert [row[2] for row in table.rows[:2]] == ["–", "–"]
+    with pytest.raises(ValueError, match="no source has the row cvae"):
+        cards.card(columns, ["cvae", "dkf"], "family/free-running")
+    with pytest.raises(ValueError, match="trajevae/scores has 5 rows trajevae; add their next cells"):
+        cards.card(columns, ["trajevae"], "trajevae/scores")
 
 
 @pytest.mark.parametrize("page", cards.CARDS)
